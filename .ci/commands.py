@@ -25,18 +25,19 @@ HEAD = """\
 
 <!-- Made by `python .ci/commands.py` from the commands' own help; do not edit. -->
 
-Results are on stdout, talk and progress on stderr. `--json` gives one object on stdout, with a
-`version`, and nothing else there. No command writes over a file without `--overwrite`. Errors
-are one line with a hint.
+Results are on stdout; messages and progress on stderr. `--json` prints one object with a
+`version` on stdout instead of text. No command replaces a file without `--overwrite`. An error
+is one line with a hint. A misspelled command or option gets a suggestion.
 
 | exit status | meaning |
 |---|---|
 | 0 | done |
 | 1 | failed |
-| 2 | wrong usage |
-| 3 | finished, but something was lost or left unsolved, and it says what |
+| 2 | usage error |
+| 3 | finished with losses or unsolved parts, which are listed |
 
-`NO_COLOR` is honoured. Completion for bash: `eval "$(_LOCATK_COMPLETE=bash_source locatk)"`
+Terminals show colours unless `NO_COLOR` is set. Completion for bash:
+`eval "$(_LOCATK_COMPLETE=bash_source locatk)"`
 (also `zsh_source`, `fish_source`).
 """
 

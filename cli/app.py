@@ -1,7 +1,7 @@
-"""The `locatk` command: a group that loads a command's module when it is called.
+"""The `locatk` command: a group that imports the module of a command when it is called.
 
-``locatk --help`` prints the table below and imports none of the modules, so that it
-opens at once; tests/cli/test_app.py holds that, and that the two agree.
+``locatk --help`` prints the table below and imports none of the modules, so that it starts
+quickly.
 """
 
 from __future__ import annotations
@@ -31,22 +31,23 @@ COMMANDS = {
     "simulate": ("locatk.cli.simulate", "Make a session with known truth, without hardware."),
     "decode": ("locatk.cli.decode", "Decode the raw bytes of a recording again."),
     "recover": ("locatk.cli.recover", "Salvage a damaged recording."),
-    "info": ("locatk.cli.info.command", "Say what is in a session, a solution or an artifact."),
-    "calibrate": ("locatk.cli.calibrate", "Make a better artifact from recordings."),
+    "info": ("locatk.cli.info.command", "Describe a session, a solution or an artifact."),
+    "calibrate": ("locatk.cli.calibrate", "Calibrate an artifact from recordings."),
     "solve": ("locatk.cli.solve.command", "Solve recorded sessions into poses."),
     "eval": ("locatk.cli.eval.command", "Compare poses with the truth."),
     "report": ("locatk.cli.report", "Show solutions on one page that opens anywhere."),
     "export": ("locatk.cli.export", "Write poses for other tools."),
-    "demo": ("locatk.cli.demo.command", "Simulate, solve and evaluate, to see that all works."),
+    "demo": ("locatk.cli.demo.command", "Simulate, solve and evaluate, without hardware."),
     "bench": ("locatk.cli.bench", "Measure what the project promises, on published data."),
 }
-"""Name of a command to its module and short help. The module holds it as ``command``."""
+"""Module and short help of each command. The module holds it as ``command``."""
 
-TERMINATED = 143
+TERMINATED_STATUS = 143
+"""Exit status after SIGTERM: 128 and the number of the signal (POSIX shells)."""
 
 
 class App(LazyGroup):
-    """Group of :data:`COMMANDS`, whose errors are reported as those of locatk."""
+    """Group of :data:`COMMANDS` that reports errors in the format of locatk."""
 
     def main(
         self,
@@ -56,7 +57,7 @@ class App(LazyGroup):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        """As click's, with every error reported by :mod:`locatk.cli.failures`."""
+        """Run a command and exit with its status; :mod:`locatk.cli.failures` reports errors."""
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, **extra)
         console.reset()
@@ -89,9 +90,9 @@ def _show_version(ctx: click.Context, param: click.Parameter, value: bool) -> No
     help="Show the version and exit.",
 )
 def app() -> None:
-    """Localization that needs no satellite, no motion capture and no expensive sensor.
+    """Localization without satellites, motion capture or expensive sensors.
 
-    Record or simulate a session, solve it into poses, compare them with the truth.
+    Record or simulate a session, solve it into poses, and compare them with the truth.
 
     \b
     Examples:
@@ -103,11 +104,11 @@ def app() -> None:
 
 
 def main() -> None:
-    """Entry point of the `locatk` script."""
+    """Run the `locatk` script."""
     # With protobuf 6, each schema of foxglove warns that it was generated for protobuf 5.
     warnings.filterwarnings("ignore", message="Protobuf gencode version", category=UserWarning)
-    # Matrices are small: threads for them only wait for each other, and for other processes.
+    # The matrices are small: more threads would only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # As an exception, so that files in the making are removed.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    # The signal raises an exception, so that unfinished files are removed.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED_STATUS))
     app(prog_name="locatk")

@@ -1,16 +1,19 @@
-"""What the command says: results on stdout, talk and progress on stderr.
+"""Output of commands: results on stdout; messages and progress on stderr.
 
-Talk obeys ``-q`` and ``-v``. Colour appears on a terminal only (click strips it
-elsewhere), and not where ``NO_COLOR`` is set.
+Messages obey ``-q`` and ``-v``. Colour appears only on a terminal (click removes it otherwise), and
+not if ``NO_COLOR`` is set. Results fit :data:`TEXT_COLUMNS`; messages are one line each, so that
+programs can filter them.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import os
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -21,10 +24,16 @@ import click
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 
+TEXT_COLUMNS = 80
+"""Width of results in characters, as of a terminal."""
+
+MIN_TEXT_COLUMNS = 16
+"""Narrowest column of wrapped text in characters."""
+
 
 @dataclass
 class _State:
-    """How much this run says; reset by :func:`reset` at its start."""
+    """Verbosity of the command that runs."""
 
     verbosity: int = 0
     json: bool = False
@@ -34,69 +43,68 @@ _state = _State()
 
 
 def reset() -> None:
-    """Forget the ``-q``, ``-v`` and ``--json`` of an earlier run in this process."""
+    """Reset the effect of ``-q``, ``-v`` and ``--json`` of an earlier run in this process."""
     _state.verbosity = 0
     _state.json = False
 
 
 def set_verbosity(level: int) -> None:
-    """-1 for quiet, 0 as usual, 1 for more."""
+    """Set the verbosity: -1 for ``-q``, 0, or 1 for ``-v``."""
     _state.verbosity = level
 
 
 def set_json(on: bool) -> None:
-    """Say that stdout belongs to one JSON object."""
+    """Reserve stdout for JSON."""
     _state.json = on
 
 
 def verbose() -> bool:
-    """Whether ``-v`` was given."""
+    """Return whether ``-v`` was given."""
     return _state.verbosity > 0
 
 
 def talks() -> bool:
-    """Whether talk is wanted: ``-q`` was not given."""
+    """Return whether messages are printed: ``-q`` was not given."""
     return _state.verbosity >= 0
 
 
 def colour(text: str, name: str) -> str:
-    """``text`` in a colour, unless ``NO_COLOR`` is set (https://no-color.org)."""
+    """Return ``text`` in a colour, unless ``NO_COLOR`` is set (https://no-color.org)."""
     return text if os.environ.get("NO_COLOR") else click.style(text, fg=name)
 
 
 def say(text: str) -> None:
-    """Talk that ``-q`` silences."""
-    if _state.verbosity >= 0:
+    """Print a message, unless ``-q`` was given."""
+    if talks():
         click.echo(text, err=True)
 
 
 def detail(text: str) -> None:
-    """Talk that only ``-v`` brings out."""
+    """Print a message if ``-v`` was given."""
     if verbose():
         click.echo(text, err=True)
 
 
 def warn(text: str) -> None:
-    """Something the user should know of the result; ``-q`` silences it."""
-    if _state.verbosity >= 0:
+    """Print a warning about the result, unless ``-q`` was given."""
+    if talks():
         click.echo(colour("Warning:", "yellow") + f" {text}", err=True)
 
 
 def result(text: str) -> None:
-    """A result for people, on stdout; nothing where ``--json`` owns stdout."""
+    """Print a result as text on stdout, unless ``--json`` was given."""
     if not _state.json:
         click.echo(text)
 
 
 def emit_json(value: Any) -> None:
-    """Write ``value`` as one line of JSON; numpy values become plain, NaN becomes null."""
+    """Print ``value`` as one line of JSON; numpy values become plain, nan becomes null."""
     click.echo(json.dumps(plain(value), allow_nan=False))
 
 
 def plain(value: Any) -> Any:
-    """``value`` with only what JSON knows: arrays and numpy scalars as lists and
-    numbers, anything not finite as None."""
-    if hasattr(value, "tolist"):  # numpy, without importing it
+    """Return ``value`` in types of JSON: arrays as lists, numbers that are not finite as None."""
+    if hasattr(value, "tolist"):  # An array or number of numpy, which is not imported here.
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
@@ -109,69 +117,169 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Aligned columns: numbers to the right, text to the left, two spaces between."""
-    cells = [["" if cell is None else str(cell) for cell in row] for row in rows]
-    columns = list(zip(header, *cells, strict=True))
-    widths = [max(map(len, column)) for column in columns]
-    right = [len(column) > 1 and all(map(_numeric, column[1:])) for column in columns]
+def table(
+    header: Sequence[str], rows: Iterable[Sequence[object]], *, max_width: int = TEXT_COLUMNS
+) -> str:
+    """Format aligned columns: numbers to the right, text to the left, two spaces between.
 
-    def line(row: Sequence[str]) -> str:
-        aligned = (
-            cell.rjust(width) if to_right else cell.ljust(width)
-            for cell, width, to_right in zip(row, widths, right, strict=True)
-        )
-        return "  ".join(aligned).rstrip()
-
-    return "\n".join(line(row) for row in [list(header), *cells])
-
-
-def labelled(rows: Sequence[tuple[str, str]]) -> str:
-    """Format pairs of a label and a text as aligned lines, two spaces between them."""
-    width = max(len(label) for label, _ in rows)
-    return "\n".join(f"{label:<{width}}  {text}" for label, text in rows)
-
-
-def _numeric(cell: str) -> bool:
-    return cell in ("", "-") or cell.lstrip("<>=~+- ")[:1].isdigit()
-
-
-class _Counted(Sized, Iterable[T_co], Protocol[T_co]):
-    """What can be walked and says how long it is, like a list."""
-
-
-def progress(items: _Counted[T], label: str) -> AbstractContextManager[Iterable[T]]:
-    """``with progress(items, "Solving") as bar: for item in bar`` shows a bar.
-
-    On stderr, only on a terminal, and neither with ``-q`` nor with ``--json``, nor for
-    a single item.
+    A table that is wider than ``max_width`` gets its titles wrapped, then the text of its last
+    column. If it is still too wide, the columns continue in further tables that repeat the first
+    column.
     """
-    if len(items) < 2 or _state.json or _state.verbosity < 0 or not sys.stderr.isatty():
+    cells = [["" if cell is None else str(cell) for cell in row] for row in rows]
+    columns = [list(column) for column in zip(header, *cells, strict=True)]
+    titles = _wrap_titles(columns, max_width)
+    widths = [
+        max(map(len, (*lines, *column[1:]))) for lines, column in zip(titles, columns, strict=True)
+    ]
+    blocks, block = [], [0]
+    for index in range(1, len(columns)):
+        total = sum(widths[i] + 2 for i in (*block, index)) - 2
+        is_last_text = index == len(columns) - 1 and not _is_numeric(columns[index])
+        room = max_width - (total - widths[index])
+        if total > max_width and is_last_text and room >= _longest_word(columns[index]):
+            widths[index] = room
+        elif total > max_width and len(block) > 1:
+            blocks.append(block)
+            block = [0]
+        block.append(index)
+    blocks.append(block)
+    return "\n\n".join(
+        _format_block([titles[i] for i in block], [columns[i] for i in block],
+                      [widths[i] for i in block])
+        for block in blocks
+    )  # fmt: skip
+
+
+def _longest_word(texts: Iterable[str]) -> int:
+    """Return the number of characters of the longest word."""
+    return max((len(word) for text in texts for word in text.split()), default=0)
+
+
+def _wrap_titles(columns: Sequence[Sequence[str]], max_width: int) -> list[list[str]]:
+    """Return the lines of each title; the widest titles are wrapped until the table fits."""
+    bodies = [max(map(len, column[1:]), default=0) for column in columns]
+    shortest = [
+        max(body, *map(len, column[0].split(" ")))
+        for body, column in zip(bodies, columns, strict=True)
+    ]
+    widths = [max(body, len(column[0])) for body, column in zip(bodies, columns, strict=True)]
+    while sum(widths) + 2 * (len(widths) - 1) > max_width:
+        slack = [width - least for width, least in zip(widths, shortest, strict=True)]
+        widest = max(range(len(slack)), key=slack.__getitem__)
+        if slack[widest] <= 0:
+            break
+        widths[widest] -= 1
+    return [
+        textwrap.wrap(column[0], width) or [""] if width else [""]
+        for column, width in zip(columns, widths, strict=True)
+    ]
+
+
+def _format_block(
+    titles: Sequence[Sequence[str]], columns: Sequence[Sequence[str]], widths: Sequence[int]
+) -> str:
+    """Format columns whose titles are lines; a cell that is too long continues below."""
+    right = [_is_numeric(column) for column in columns]
+    height = max(map(len, titles))
+    lines = [
+        [title[row - height] if row >= height - len(title) else "" for title in titles]
+        for row in range(height)
+    ]
+    for cells in zip(*(column[1:] for column in columns), strict=True):
+        parts = [
+            _wrap_words(cell, width) if len(cell) > width else [cell]
+            for cell, width in zip(cells, widths, strict=True)
+        ]
+        lines += [list(row) for row in itertools.zip_longest(*parts, fillvalue="")]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if to_right else cell.ljust(width)
+            for cell, width, to_right in zip(line, widths, right, strict=True)
+        ).rstrip()
+        for line in lines
+    )
+
+
+def _wrap_words(text: str, width: int) -> list[str]:
+    """Wrap text between words; a longer word, such as a path, stays whole."""
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False) or [""]
+
+
+def wrapped(text: str, *, indent: int = 2) -> str:
+    """Wrap a line at :data:`TEXT_COLUMNS`; the following lines are indented."""
+    lines = textwrap.wrap(
+        text,
+        TEXT_COLUMNS,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return "\n".join(lines)
+
+
+def labelled(rows: Sequence[tuple[str, str]], *, indent: int = 0) -> str:
+    """Format pairs of a label and a text as aligned lines; long texts are wrapped."""
+    margin = indent + max((len(label) for label, _ in rows), default=0) + 2
+    lines = []
+    for label, text in rows:
+        start = " " * indent + label
+        parts = _wrap_words(text, max(MIN_TEXT_COLUMNS, TEXT_COLUMNS - margin))
+        lines += [(start if n == 0 else "").ljust(margin) + part for n, part in enumerate(parts)]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _is_numeric(column: Sequence[str]) -> bool:
+    """Return whether all cells below the title of a column begin with a number."""
+    return len(column) > 1 and all(
+        cell in ("", "-") or cell.lstrip("<>=~+- ")[:1].isdigit() for cell in column[1:]
+    )
+
+
+class _SizedIterable(Sized, Iterable[T_co], Protocol[T_co]):
+    """Iterable of known length."""
+
+
+def _shows_progress() -> bool:
+    return not _state.json and talks() and sys.stderr.isatty()
+
+
+def progress(items: _SizedIterable[T], label: str) -> AbstractContextManager[Iterable[T]]:
+    """Show a progress bar: ``with progress(items, "Solving") as bar: for item in bar``.
+
+    The bar appears for several items on a terminal, without ``-q`` and ``--json``.
+    """
+    if len(items) < 2 or not _shows_progress():
         return contextlib.nullcontext(items)
     return click.progressbar(items, label=label, file=sys.stderr)
 
 
 @contextlib.contextmanager
 def steps(count: int, label: str) -> Iterator[Callable[[], None]]:
-    """A progress bar whose steps are calls, for work that does not walk a list itself."""
+    """Show a progress bar that advances with each call of the function in the context."""
     with progress(range(count), label) as bar:
-        left = iter(bar)
-        next(left, None)
+        remaining = iter(bar)
+        next(remaining, None)
 
-        def done() -> None:
-            next(left, None)
+        def advance() -> None:
+            next(remaining, None)
 
-        yield done
+        yield advance
 
 
 @contextlib.contextmanager
 def working(label: str) -> Iterator[None]:
-    """Say on a terminal what is going on while one long call runs; wiped afterwards."""
-    shown = not _state.json and _state.verbosity >= 0 and sys.stderr.isatty()
+    """Show a label on a terminal while one long call runs."""
+    shown = _shows_progress()
     if shown:
         click.echo(f"{label} ...", err=True, nl=False)
     try:
         yield
     finally:
         if shown:
-            click.echo("\r" + " " * (len(label) + 4) + "\r", err=True, nl=False)
+            erase_line()
+
+
+def erase_line() -> None:
+    """Erase the last line of a terminal."""
+    click.echo("\r\x1b[K", err=True, nl=False)

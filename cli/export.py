@@ -1,4 +1,4 @@
-"""``locatk export``: poses, and stations, for other tools."""
+"""``locatk export``: poses and stations in the formats of other tools."""
 
 from __future__ import annotations
 
@@ -9,30 +9,46 @@ from typing import TYPE_CHECKING
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.command import Command, section
 
 if TYPE_CHECKING:
     from locatk.core.lighthouse.scene import Scene
     from locatk.core.trajectory import Trajectory
 
 FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
-"""Of poses."""
+"""Formats of poses."""
 
 CONFIG = "crazyflie-config"
-"""The format of stations."""
+"""Format of Lighthouse stations."""
 
 STDOUT = Path("-")
 
 
-@click.command(short_help="Write poses for other tools.")
+@click.command(cls=Command, short_help="Write poses for other tools.")
 @options.input_argument("solution")
-@click.option("--format", "format_name", type=click.Choice((*FORMATS, CONFIG)), required=True)
-@options.output(
-    "File to write; for `tum` and `kitti` with several devices, the folder for them; `-` writes "
-    "`csv` or `tum` to stdout."
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice((*FORMATS, CONFIG)),
+    required=True,
+    help="Format of the output.",
 )
-@click.option("--device", "devices", multiple=True, metavar="NAME", help="Only this; repeatable.")
-@click.option("--covariance", is_flag=True, help="In `ros2`, poses with covariance as well.")
+@options.output(
+    "File to write; a folder for `tum` and `kitti` with several devices; `-` writes `csv` or "
+    "`tum` to stdout."
+)
 @options.overwrite
+@section(
+    "Content",
+    click.option(
+        "--device",
+        "devices",
+        multiple=True,
+        metavar="NAME",
+        help="Device to export; repeatable.  [default: all]",
+    ),
+    click.option("--covariance", is_flag=True, help="ros2: also write poses with covariance."),
+)
 @options.as_json
 @options.verbosity
 def command(
@@ -46,19 +62,20 @@ def command(
 ) -> None:
     """Write the poses of SOLUTION, or its Lighthouse stations, in the format of other tools.
 
-    SOLUTION is what `locatk solve` has written, or a session, whose reference poses are
-    taken. Of crazyflie-config it may be a scene (scene.toml), too.
+    SOLUTION is a solution of `locatk solve`, or a session with truth, which is then exported.
+    For crazyflie-config it may also be a scene (scene.toml).
 
     \b
-    tum      time and pose, one device a file, for evo and others
-    kitti    3 x 4 matrices, one device a file; times in a file beside it
-    csv      time_s, device, x_m, y_m, z_m, qx, qy, qz, qw, sigma_x_m, sigma_y_m,
-             sigma_z_m, sigma_heading_rad; a sigma that is not known is empty
-    parquet  the same, exact times, frames, full covariances; needs locatk[parquet]
+    tum      time and pose, one file per device, for evo and others
+    kitti    3 x 4 matrices, one file per device; times in a second file
+    csv      time_s, device, x_m, y_m, z_m, qx, qy, qz, qw, sigma_x_m,
+             sigma_y_m, sigma_z_m, sigma_heading_rad; unknown sigmas are empty
+    parquet  as csv, with exact times, frames and full covariances; needs
+             locatk[parquet]
     ros2     PoseStamped and TFMessage in MCAP, for ros2 bag, RViz and evo
     crazyflie-config
-             poses and calibrations of stations, in the YAML that Bitcraze's
-             client and library write into a Crazyflie
+             poses and calibrations of stations as YAML, which the client and
+             library of Bitcraze write into a Crazyflie
 
     \b
     Examples:
@@ -74,28 +91,30 @@ def command(
     from locatk.formats.sessions.solutions import read_trajectories
 
     if covariance and format_name != "ros2":
-        raise click.UsageError("--covariance is for --format ros2; csv and parquet always have it.")
+        raise click.UsageError(
+            "--covariance is for --format ros2; csv and parquet always contain it."
+        )
     if output == STDOUT and (as_json or format_name not in exports.TEXTS):
-        what = "--json" if as_json else f"--format {format_name}"
-        raise click.UsageError(f"{what} does not go with -o -, which is for csv and tum.")
+        option = "--json" if as_json else f"--format {format_name}"
+        raise click.UsageError(f"{option} cannot be combined with -o -, which is for csv and tum.")
     if format_name == CONFIG:
         if devices:
-            raise click.UsageError(f"--device is for poses; {CONFIG} holds stations.")
-        stations(solution, output, overwrite=overwrite, as_json=as_json)
+            raise click.UsageError(f"--device is for poses; {CONFIG} contains stations.")
+        export_stations(solution, output, overwrite=overwrite, as_json=as_json)
         return
-    found = chosen(read_trajectories(solution), devices, solution)
-    poses = sum(map(len, found))
-    if format_name != "parquet":  # where they are null
-        found = [exports.finite_poses(each) for each in found]
-    lost = poses - sum(map(len, found))
+    tracks = select_devices(read_trajectories(solution), devices, solution)
+    poses = sum(map(len, tracks))
+    if format_name != "parquet":  # Parquet has null for values that are not numbers.
+        tracks = [exports.finite_poses(track) for track in tracks]
+    lost = poses - sum(map(len, tracks))
     if lost == poses:
         raise InputError(f"none of the {poses} poses is a number", file=solution)
     if output == STDOUT:
-        click.echo(text(found, format_name), nl=False)
-        tell(lost)
+        click.echo(render(tracks, format_name), nl=False)
+        check_loss(lost)
         return
 
-    planned = exports.plan_files(found, format_name, output)
+    planned = exports.plan_files(tracks, format_name, output)
     if planned[0].path != output:
         options.make_folder(output)
     for path in (path for part in planned for path in part.files):
@@ -106,9 +125,9 @@ def command(
         console.result(f"Wrote {part.path}: {sum(map(len, part.trajectories))} poses")
     if format_name == "kitti":
         name = planned[0].times if len(planned) == 1 else f"{output}/*.times.txt"
-        console.say(f"Lines of kitti have no times: these are in {name}")
+        console.say(f"KITTI files have no times: the times are in {name}")
     if format_name == "ros2" and output.suffix != ".mcap":
-        console.warn(f"{output} does not end in .mcap, by which ros2 bag and evo know it")
+        console.warn(f"{output} does not end in .mcap, which ros2 bag and evo require")
     if as_json:
         files = [
             {"path": part.path, "device": each.device, "poses": len(each), "times": part.times}
@@ -116,16 +135,16 @@ def command(
             for each in part.trajectories
         ]
         console.emit_json({"version": 1, "input": solution, "format": format_name, "files": files})
-    tell(lost)
+    check_loss(lost)
 
 
-def stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> None:
-    """Write the stations of a scene, of a session or of a solution."""
+def export_stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> None:
+    """Write the stations of a scene, a session or a solution."""
     from locatk.core.errors import error_context
     from locatk.formats.exporters import crazyflie
 
     options.guard_output(output, overwrite=overwrite, inputs=[source])
-    scene = scene_of(source)
+    scene = read_any_scene(source)
     with error_context(source):
         crazyflie.write_config(output, scene, overwrite=overwrite)
     channels = [station.channel for station in scene.stations]
@@ -136,8 +155,8 @@ def stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> N
         console.emit_json({"version": 1, "input": source, "format": CONFIG, "files": files})
 
 
-def scene_of(source: Path) -> Scene:
-    """The scene in a file of its own, or attached to a session or a solution."""
+def read_any_scene(source: Path) -> Scene:
+    """Read a scene, or the scene in a session or a solution."""
     from locatk.core.errors import InputError
     from locatk.formats.artifacts import scene as artifacts
     from locatk.formats.sessions.reader import Session
@@ -147,44 +166,46 @@ def scene_of(source: Path) -> Scene:
     scene = artifacts.attached_scene(Session.open(source))
     if scene is None:
         raise InputError(
-            "no lighthouse scene is attached",
+            "the file has no lighthouse scene",
             file=source,
             hint="Give a solution of `locatk solve`, or a scene (scene.toml)",
         )
     return scene
 
 
-def tell(lost: int) -> None:
-    """Say what was left out, by the exit status too."""
+def check_loss(lost: int) -> None:
+    """Raise Incomplete if poses were left out."""
     if lost:
         poses = "1 pose that is not a number" if lost == 1 else f"{lost} poses that are not numbers"
         raise failures.Incomplete(f"left out {poses}")
 
 
-def chosen(found: list[Trajectory], devices: tuple[str, ...], solution: Path) -> list[Trajectory]:
-    """Those of these devices, or all where none is named."""
+def select_devices(
+    tracks: list[Trajectory], devices: tuple[str, ...], solution: Path
+) -> list[Trajectory]:
+    """Return the trajectories of these devices, or all if none is named."""
     from locatk.core.errors import InputError
 
-    names = [trajectory.device for trajectory in found]
+    names = [track.device for track in tracks]
     for device in devices:
         if device not in names:
             raise InputError(
-                f"no device {device!r}", file=solution, hint=f"There are {', '.join(names)}"
+                f"no device {device!r}", file=solution, hint=f"The devices are {', '.join(names)}"
             )
-    return [each for each in found if not devices or each.device in devices]
+    return [track for track in tracks if not devices or track.device in devices]
 
 
-def text(found: list[Trajectory], format_name: str) -> bytes:
-    """The file as it would be written."""
+def render(tracks: list[Trajectory], format_name: str) -> bytes:
+    """Return the content of the output file."""
     from locatk.core.errors import InputError
     from locatk.formats.exporters import export as exports
 
-    if format_name in exports.ENDINGS and len(found) > 1:
+    if format_name in exports.ENDINGS and len(tracks) > 1:
         raise InputError(
-            f"{len(found)} devices, and {format_name} holds one",
+            f"{len(tracks)} devices, but a {format_name} file has one",
             hint="Name one with --device, or a folder with -o",
         )
     with TemporaryDirectory(prefix="locatk-export-") as folder:
         path = Path(folder) / "poses"
-        exports.write(exports.OutputFile(path, tuple(found)), format_name)
+        exports.write(exports.OutputFile(path, tuple(tracks)), format_name)
         return path.read_bytes()

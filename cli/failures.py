@@ -1,13 +1,13 @@
-"""The one place where an exception becomes a line on stderr and an exit status.
+"""Conversion of exceptions to one line on stderr and an exit status; the only place of it.
 
-== =============================================================
+== ==================================================
 0  done
 1  failed
-2  wrong usage
-3  finished, but something was lost or left unsolved
-== =============================================================
+2  usage error
+3  finished with losses or unsolved parts
+== ==================================================
 
-130 is an interrupt, as shells have it.
+An interrupt gives 130, as in shells.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ import click
 from locatk.cli import console
 from locatk.core.errors import LocatkError
 
-INTERRUPTED = 130
+INTERRUPTED_STATUS = 130
+"""Exit status of a command that Ctrl-C ended: 128 and the number of SIGINT (POSIX shells)."""
 
 _OS_HINTS = {
     errno.EACCES: "Check the permissions of the file and of its folder",
@@ -38,7 +39,7 @@ _OS_HINTS = {
 
 
 class Incomplete(click.ClickException):
-    """The command finished, but something was lost or left unsolved; says what."""
+    """Command that finished with losses or unsolved parts; the message names them."""
 
     exit_code = 3
 
@@ -60,10 +61,10 @@ def finish_with_warnings(warnings: Sequence[str]) -> None:
 
 
 def report(error: BaseException) -> int:
-    """Print ``error`` as one line on stderr and return the exit status it means."""
+    """Print ``error`` as one line on stderr and return its exit status."""
     if isinstance(error, click.Abort):
         click.echo("Aborted", err=True)
-        return INTERRUPTED
+        return INTERRUPTED_STATUS
     if isinstance(error, Incomplete):
         click.echo(_line("Incomplete", "yellow", error.format_message(), None), err=True)
         return error.exit_code
@@ -72,56 +73,52 @@ def report(error: BaseException) -> int:
         return error.exit_code
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "locatk"
-        _error(error.format_message(), f"`{path} --help` shows how to use it")
+        _print_error(error.format_message(), f"See `{path} --help`")
         return error.exit_code
     if isinstance(error, click.ClickException):
-        _error(error.format_message(), None)
+        _print_error(error.format_message(), None)
         return error.exit_code
 
     if console.verbose():
         click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
     if isinstance(error, LocatkError):
-        _error(str(error), error.hint)
+        _print_error(str(error), error.hint)
         return error.exit_status
     if isinstance(error, OSError) and error.errno is not None:
-        what = os.strerror(error.errno)
-        _error(f"{what}{_place(error)}", _OS_HINTS.get(error.errno))
+        file = f" in {os.fsdecode(error.filename)}" if error.filename else ""
+        _print_error(os.strerror(error.errno) + file, _OS_HINTS.get(error.errno))
         return 1
     if isinstance(error, MemoryError):
-        _error("not enough memory", "Solve fewer or shorter sessions at once")
+        _print_error("not enough memory", "Solve shorter sessions, or fewer at a time")
         return 1
-    _error(
+    _print_error(
         f"internal error, {type(error).__name__}: {error}",
-        "Please report it, with the traceback that -v shows",
+        "Please report it, with the traceback from -v",
     )
     return 1
 
 
 def describe(error: LocatkError) -> str:
-    """``error`` with its hint, as one line without the leading ``Error:``."""
+    """Return an error with its hint, as one line without the leading ``Error:``."""
     return _sentences(str(error), error.hint)
 
 
-def _error(what: str, hint: str | None) -> None:
-    click.echo(_line("Error", "red", what, hint), err=True)
+def _print_error(problem: str, hint: str | None) -> None:
+    click.echo(_line("Error", "red", problem, hint), err=True)
 
 
-def _line(word: str, colour: str, what: str, hint: str | None) -> str:
-    return console.colour(f"{word}:", colour) + " " + _sentences(what, hint)
+def _line(word: str, colour: str, problem: str, hint: str | None) -> str:
+    return console.colour(f"{word}:", colour) + " " + _sentences(problem, hint)
 
 
-def _sentences(what: str, hint: str | None) -> str:
-    text = _sentence(what)
+def _sentences(problem: str, hint: str | None) -> str:
+    text = _sentence(problem)
     if hint:
         text += " Hint: " + _sentence(hint[0].upper() + hint[1:])
     return text
 
 
 def _sentence(text: str) -> str:
-    """``text`` on one line with a full stop."""
+    """Return ``text`` on one line with a full stop."""
     text = " ".join(text.split())
     return text if text.endswith((".", "!", "?")) else text + "."
-
-
-def _place(error: OSError) -> str:
-    return f" in {os.fsdecode(error.filename)}" if error.filename else ""

@@ -1,4 +1,4 @@
-"""Options that several commands share: one spelling and one meaning everywhere."""
+"""Options that several commands share, with one spelling and one meaning."""
 
 from __future__ import annotations
 
@@ -18,18 +18,13 @@ PATH = click.Path(path_type=Path)
 
 
 def _existing(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
-    """Callback: every path given must be there."""
+    """Check that every given path exists."""
     must_exist(value if isinstance(value, tuple) else (value,))
     return value
 
 
 def must_exist(paths: Sequence[Path | None]) -> None:
-    """Refuse paths that are not there.
-
-    Raises
-    ------
-    MissingDataError
-    """
+    """Raise MissingDataError if a path does not exist."""
     for path in paths:
         if path is not None and not path.exists():
             raise MissingDataError(
@@ -38,14 +33,14 @@ def must_exist(paths: Sequence[Path | None]) -> None:
 
 
 def input_argument(name: str, *, many: bool = False) -> Callable[[F], F]:
-    """Argument that names one file, or one or more, which must be there."""
+    """Return an argument that names an existing file, or one or more with ``many``."""
     return click.argument(
         name, type=PATH, nargs=-1 if many else 1, required=True, callback=_existing
     )
 
 
 def input_option(*names: str, help: str, many: bool = False, **more: Any) -> Callable[[F], F]:
-    """Option that names a file (repeatable where ``many``) which must be there."""
+    """Return an option that names an existing file; repeatable with ``many``."""
     return click.option(*names, type=PATH, multiple=many, callback=_existing, help=help, **more)
 
 
@@ -53,11 +48,11 @@ sessions = input_argument("sessions", many=True)
 
 
 def output(help: str, *, required: bool = True) -> Callable[[F], F]:
-    """``-o/--output``."""
+    """Return the option ``-o/--output``."""
     return click.option("-o", "--output", type=PATH, required=required, help=help)
 
 
-overwrite = click.option("--overwrite", is_flag=True, help="Replace the output if it is there.")
+overwrite = click.option("--overwrite", is_flag=True, help="Replace the output if it exists.")
 
 
 def _json(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
@@ -65,10 +60,10 @@ def _json(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
     return value
 
 
-def json_flag(what: str) -> Callable[[F], F]:
-    """`--json` of a command that says ``what`` on stdout."""
-    told = f"{what} on stdout, and nothing else there."
-    return click.option("--json", "as_json", is_flag=True, help=told, callback=_json)
+def json_flag(content: str) -> Callable[[F], F]:
+    """Return the option ``--json`` of a command that prints ``content``."""
+    help = f"{content} on stdout instead of text."
+    return click.option("--json", "as_json", is_flag=True, help=help, callback=_json)
 
 
 as_json = json_flag("One JSON object")
@@ -77,36 +72,36 @@ method = click.option(
     "--method",
     type=click.Choice(("bundle", "field", "joint", "lattice", "paper")),
     default=None,
-    help="Algorithm: `paper` is the published one as written; the better one is `bundle` of "
-    "lighthouse, `joint` of polaris, `lattice` of dots, `field` of landmarks.  "
-    "[default: the system's better one]",
+    help="Algorithm: `paper` is the published one; the default is more accurate (`bundle` of "
+    "lighthouse, `joint` of polaris, `lattice` of dots, `field` of landmarks).",
 )
 
 artifact = input_option(
     "--artifact",
-    help="Solved artifact (scene, tag, sheet, map) to use instead of the session's.",
+    metavar="FILE",
+    help="Scene, tags, manifest or map (.toml) to use instead of the session's.",
 )
 
 
 def number(*names: str, default: Any, help: str, **more: Any) -> Callable[[Any], Any]:
-    """An option with a default, of the default's type where none is given."""
+    """Return an option with a default, which also determines the type."""
     more.setdefault("type", type(default))
     return click.option(*names, default=default, show_default=True, help=help, **more)
 
 
 def verbosity(command: F) -> F:
-    """``-q/--quiet`` and ``-v/--verbose``; they act by themselves."""
+    """Add ``-q/--quiet`` and ``-v/--verbose``, which set the verbosity of the console."""
 
     def callback(level: int) -> Callable[[click.Context, click.Parameter, bool], None]:
-        def act(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+        def set_level(ctx: click.Context, param: click.Parameter, value: bool) -> None:
             if value:
                 console.set_verbosity(level)
 
-        return act
+        return set_level
 
     for short, name, level, text in (
-        ("-v", "--verbose", 1, "Say more, and show tracebacks."),
-        ("-q", "--quiet", -1, "Say nothing but results and errors."),
+        ("-v", "--verbose", 1, "Print more messages, and tracebacks of errors."),
+        ("-q", "--quiet", -1, "Print only results and errors."),
     ):
         command = click.option(
             short,
@@ -126,10 +121,10 @@ def guard_output(path: Path, *, overwrite: bool, inputs: Sequence[Path] = ()) ->
     Raises
     ------
     OutputExistsError
-        Where ``path`` is one of ``inputs`` (even with ``--overwrite``), is there and
-        ``overwrite`` is False, or is no file.
+        ``path`` is one of ``inputs`` (even with ``--overwrite``), exists and ``overwrite`` is
+        false, or is not a file.
     MissingDataError
-        Where its folder is not there.
+        Its folder does not exist.
     """
     from locatk.formats.output import check_output
 
@@ -141,21 +136,21 @@ def guard_output(path: Path, *, overwrite: bool, inputs: Sequence[Path] = ()) ->
 
 
 def make_folder(path: Path) -> None:
-    """Make the folder for several outputs; it may be there.
+    """Create the folder for several outputs if it does not exist.
 
     Raises
     ------
     OutputExistsError
-        Where ``path`` is a file.
+        ``path`` is a file.
     """
     if path.exists() and not path.is_dir():
         raise OutputExistsError(
-            "there are several outputs, and -o is a file", file=path, hint="Name a folder with -o"
+            "there are several outputs, but -o is a file", file=path, hint="Name a folder with -o"
         )
     path.mkdir(parents=True, exist_ok=True)
 
 
 def load(target: str) -> Any:
-    """What ``"package.module:name"`` points to, imported now."""
+    """Import and return the object ``"package.module:name"``."""
     module, _, name = target.partition(":")
     return getattr(importlib.import_module(module), name)

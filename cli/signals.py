@@ -1,4 +1,4 @@
-"""Commands that run until they are told to stop, and then finish what they do."""
+"""Orderly end of commands that run until a signal stops them."""
 
 from __future__ import annotations
 
@@ -9,39 +9,40 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-KINDS = ("SIGINT", "SIGTERM", "SIGHUP")
-"""Ctrl-C, the end of a service, a terminal that was closed."""
+STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+"""Signals of Ctrl-C, of a stopped service, and of a closed terminal."""
 
-AGAIN_S = 1.0
+REPEAT_DELAY_S = 1.0
+"""Time after which another Ctrl-C interrupts the command [s]; earlier ones are duplicates."""
 
 
 @contextlib.contextmanager
 def asked_to_stop(stop: Callable[[], None]) -> Iterator[None]:
-    """Let the first of these signals call ``stop``.
+    """Call ``stop`` at the first of :data:`STOP_SIGNALS` in the context.
 
-    Others may follow at once: a terminal that is closed sends SIGHUP twice, and wrappers
-    send on what the group has got already. They change nothing; only a Ctrl-C that comes
-    :data:`AGAIN_S` later is as always. Signals that are ignored (nohup) stay so.
+    Signals may arrive in groups: a closed terminal sends SIGHUP twice, and wrappers forward
+    signals that the process group has received already. They have no effect; only a Ctrl-C after
+    :data:`REPEAT_DELAY_S` acts as usual. Ignored signals (nohup) stay ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    first: list[float] = []
-    kinds = [getattr(signal, name) for name in KINDS if hasattr(signal, name)]
-    before = {kind: signal.getsignal(kind) for kind in kinds}
-    before = {kind: usual for kind, usual in before.items() if usual != signal.SIG_IGN}
+    first_time_s: list[float] = []
+    numbers = [getattr(signal, name) for name in STOP_SIGNALS if hasattr(signal, name)]
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    handlers = {number: old for number, old in handlers.items() if old != signal.SIG_IGN}
 
-    def note(number: int, frame: FrameType | None) -> None:
-        if not first:
-            first.append(time.monotonic())
+    def handle(number: int, frame: FrameType | None) -> None:
+        if not first_time_s:
+            first_time_s.append(time.monotonic())
             stop()
-        elif number == signal.SIGINT and time.monotonic() - first[0] > AGAIN_S:
+        elif number == signal.SIGINT and time.monotonic() - first_time_s[0] > REPEAT_DELAY_S:
             signal.default_int_handler(number, frame)
 
-    for kind in before:
-        signal.signal(kind, note)
+    for number in handlers:
+        signal.signal(number, handle)
     try:
         yield
     finally:
-        for kind, usual in before.items():
-            signal.signal(kind, usual)
+        for number, old in handlers.items():
+            signal.signal(number, old)

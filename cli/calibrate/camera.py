@@ -1,4 +1,4 @@
-"""``locatk calibrate camera``: frames of the pattern say through which lens they were taken."""
+"""``locatk calibrate camera``: focal length, centre and lens from frames of the pattern."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.command import Command, section
 from locatk.core.errors import InputError, LocatkError
 
 if TYPE_CHECKING:
@@ -18,21 +19,24 @@ if TYPE_CHECKING:
     from locatk.formats.sessions.reader import Session
 
 
-@click.command(short_help="Fit focal length, centre and lens of a camera.")
+@click.command("camera", cls=Command, short_help="Fit focal length, centre and lens of a camera.")
 @options.input_argument("session")
 @options.output("Camera to write (.toml).")
-@options.artifact
-@click.option("--device", metavar="NAME", help="Which camera, where the session has several.")
-@click.option(
-    "--focal-px",
-    type=click.FloatRange(min=0.0, min_open=True),
-    metavar="PX",
-    help="Focal length to keep.  [default: what the frames tell]",
-)
 @options.overwrite
+@section(
+    "Input",
+    options.artifact,
+    click.option("--device", metavar="NAME", help="Camera to use, if the session has several."),
+    click.option(
+        "--focal-px",
+        type=click.FloatRange(min=0.0, min_open=True),
+        metavar="PX",
+        help="Known focal length.  [default: estimated from the frames]",
+    ),
+)
 @options.as_json
 @options.verbosity
-def camera(
+def command(
     session: Path,
     output: Path,
     artifact: Path | None,
@@ -43,13 +47,13 @@ def camera(
 ) -> None:
     """Fit the camera of SESSION to the dots in its frames.
 
-    Any frames of the pattern tell the centre and the bend of the lens; take at least 5,
-    better 50, at several places of the sheet and turned in several directions. The focal
-    length is told by frames that are tilted, some of them by 5 degrees or more. Poses on
-    the sheet do not depend on it: where it is not told, a usual one is written, and the
-    exit status is 3 unless --focal-px was given.
+    Centre and distortion are estimated from any frames of the pattern: at least 5, better
+    50, at different positions and headings on the sheet. The focal length requires tilted
+    frames, some of them by 5 degrees or more. Poses on the sheet do not depend on it: if it
+    cannot be estimated, a typical one is written, and the exit status is 3 unless --focal-px
+    was given.
 
-    The camera goes to `locatk solve --camera`, or into later sessions with
+    Use the camera with `locatk solve --camera`, or in later sessions with
     `locatk import --camera`.
 
     \b
@@ -70,11 +74,11 @@ def camera(
     frames = _frames(opened, device)
     manifest = sheets.read_manifest(artifact) if artifact else _manifest(opened)
     known = CalibrateOptions(focal_px, observations.read_camera(opened))
-    with console.working("Looking at frames"):
+    with console.working("Calibrating"):
         try:
             report = calibrate(frames, manifest, known)
         except LocatkError as error:
-            if error.file is None:  # the core knows arrays, not files
+            if error.file is None:  # Solvers work on arrays and do not know the file.
                 error.file = str(session)
             raise
     sheets.write_camera(output, report.camera, overwrite=overwrite)
@@ -85,7 +89,7 @@ def camera(
         console.emit_json(_entry(session, output, frames.device, report))
     if report.focal_from == "usual":
         raise failures.Incomplete(
-            "The focal length is not known: give it with --focal-px, or add frames that are "
+            "the focal length cannot be estimated: give it with --focal-px, or add frames that are "
             "tilted by 5 degrees or more"
         )
 
@@ -113,34 +117,34 @@ def _manifest(session: Session) -> Manifest:
     manifest = observations.read_manifest(session)
     if manifest is None:
         raise InputError(
-            "no manifest of the sheet",
+            "the session has no manifest of the sheet",
             file=session.path,
             hint="Import the frames with --sheet, or give the manifest as --artifact",
         )
     return manifest
 
 
-FROM = {"given": "--focal-px", "camera": "the session's camera", "usual": "a guess"}
-"""What people are told of a focal length that the frames do not tell."""
+FOCAL_SOURCES = {"given": "--focal-px", "camera": "the session's camera", "usual": "typical value"}
+"""Origin of a focal length that was not estimated from the frames."""
 
 
 def _text(session: Path, output: Path, report: CameraReport) -> str:
-    """The camera for people: a table, and how well it explains the frames."""
+    """Format the camera as a table, and the residuals of the dots."""
     found = report.camera
     rows = [("focal length", f"{found.focal_px:.2f} px", _known(report.sigma_focal_px),
-             FROM.get(report.focal_from, report.focal_from))]  # fmt: skip
+             FOCAL_SOURCES.get(report.focal_from, report.focal_from))]  # fmt: skip
     for axis, at, sigma in zip("xy", found.centre_px, report.sigma_centre_px, strict=True):
         rows.append((f"centre {axis}", f"{at:.3f} px", _known(sigma), report.centre_from))
     rows.append(("radial", f"{found.radial:.5f}", _known(report.sigma_radial), "frames"))
     lines = [
         f"{session} -> {output}: {report.used} of {report.seen} frames, {report.dots} dots",
-        console.table(("camera", "value", "sigma", "from"), rows),
-        f"dots miss by {report.rms_before_px:.3g} px (rms) without a lens, by "
-        f"{report.rms_px:.3g} px with this one; it draws the corners in by "
-        f"{100 * report.distortion:.2g} %",
+        console.table(("camera", "value", "sigma", "source"), rows),
+        f"residual of the dots: {report.rms_before_px:.3g} px (rms) without distortion, "
+        f"{report.rms_px:.3g} px with it",
+        f"distortion of the corners: {100 * report.distortion:.2g} %",
     ]
     if math.isfinite(report.largest_tilt_rad):
-        lines.append(f"tilted by up to {math.degrees(report.largest_tilt_rad):.1f} degrees")
+        lines.append(f"largest tilt: {math.degrees(report.largest_tilt_rad):.1f} deg")
     skipped = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in report.skipped.items())
     lines.append(f"skipped: {skipped or 'nothing'}")
     return "\n".join(lines)
@@ -151,7 +155,7 @@ def _known(sigma: float) -> str:
 
 
 def _entry(session: Path, output: Path, device: str, report: CameraReport) -> dict[str, Any]:
-    """The one object of ``--json``; docs/formats.md."""
+    """Return the object of ``--json`` (docs/formats.md)."""
     found = report.camera
     return {
         "version": 1,

@@ -1,4 +1,4 @@
-"""``locatk calibrate map``: recordings of robots say how a floor was really laid."""
+"""``locatk calibrate map``: landmarks of a floor as built, from recordings of robots."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.calibrate import recordings
+from locatk.cli.command import Command, section
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,37 +18,38 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.calibration.landmarks import CalibratedLandmark
     from locatk.core.landmarks.map.floor import FloorMap
 
-MOST_LANDMARKS = 40
-"""Of more than these, only flagged landmarks are listed for people."""
+MAX_LANDMARKS = 40
+"""Number of landmarks listed as text; of more, only those with a flag are listed."""
 
 
-@click.command("map", short_help="Fit how the landmarks of a floor really lie.")
+@click.command("map", cls=Command, short_help="Fit the landmarks of a floor as built.")
 @options.sessions
 @options.output("Map to write (.toml), with the landmarks as built.")
-@options.artifact
 @options.overwrite
+@section("Input", options.artifact)
 @options.as_json
 @options.verbosity
-def map_(
+def command(
     sessions: tuple[Path, ...],
     output: Path,
     artifact: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Fit centre, heading and bar strengths of each landmark that robots in SESSIONS visited.
+    """Fit centre, heading and bar strengths of the landmarks that robots in SESSIONS visited.
 
-    All recordings are solved together, so that each landmark should be visited several times,
-    in several directions, and recordings should have landmarks in common. Bars that are
-    flipped, weak or missing are flagged, and landmarks that are displaced (by 5 mm) or turned
-    (by 3 degrees). `locatk solve --artifact` then counts with how they lie. The map comes from
-    --artifact, or from the first session.
+    All recordings are solved together. Visit each landmark several times in different
+    directions, and visit some landmarks in several recordings. Bars are flagged if they are
+    flipped, weak or missing, and landmarks if they are displaced (by 5 mm) or rotated (by 3
+    degrees). `locatk solve --artifact` uses the landmarks as built. The map is that of
+    --artifact, or of the first session.
 
-    Robots see how landmarks lie to one another, not where the floor lies: most of them are
-    taken to lie as designed. So it is with strength: the typical bar has 1.
+    Recordings determine landmarks relative to each other. The position of the floor follows
+    from the majority of the landmarks, which are assumed to be as designed; the typical bar
+    has strength 1.
 
-    Flags are what this command is for, and no failure. The exit status is 3 where a recording
-    or a visit was not used: not localised on the map, or in disagreement with the others.
+    Flags are results, not failures. The exit status is 3 if a recording or a visit was not
+    used, because it was not localised on the map or contradicts the others.
 
     \b
     Examples:
@@ -62,10 +64,10 @@ def map_(
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
     floor = maps.read_map(artifact) if artifact else _attached(sessions[0])
     drives, left_out = _drives(sessions, floor, artifact is None)
-    with console.working("Solving all together"):
+    with console.working("Solving"):
         report = calibrate(floor, drives, left_out)
     maps.write_map(output, report.floor, overwrite=overwrite)
-    recordings.tell(_text(output, report), report.notes, report.left_out)
+    recordings.print_result(_text(output, report), report.notes, report.left_out)
     if as_json:
         console.emit_json(_entry(sessions, output, report))
     recordings.check_all_used(
@@ -79,16 +81,18 @@ def _attached(path: Path) -> FloorMap:
 
     floor = observations.read_map(Session.open(path))
     if floor is None:
-        raise InputError("no map", file=path, hint="Give it with --artifact map.toml")
+        raise InputError(
+            "the session has no map", file=path, hint="Give it with --artifact map.toml"
+        )
     return floor
 
 
 def _drives(
-    sessions: tuple[Path, ...], floor: FloorMap, same: bool
+    sessions: tuple[Path, ...], floor: FloorMap, is_checked: bool
 ) -> tuple[list[CalibrationDrive], dict[str, str]]:
-    """The robots of all sessions, and what cannot be used: name to why.
+    """Read the robots of all sessions; return them, and why others cannot be used, by name.
 
-    With ``same``, each session must hold the design of ``floor``.
+    With ``is_checked``, each session must have the design of ``floor``.
     """
     from locatk.core.landmarks.calibration import floor as calibrate
     from locatk.formats.sessions import observations
@@ -96,11 +100,11 @@ def _drives(
 
     drives: list[CalibrationDrive] = []
     left_out: dict[str, str] = {}
-    with recordings.walk(sessions, "Reading") as bar:
+    with recordings.iterate(sessions, "Reading") as bar:
         for path in bar:
-            with recordings.sparing(path, left_out, alone=len(sessions) == 1):
+            with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
                 session = Session.open(path)
-                if same:
+                if is_checked:
                     _check_same(floor, _attached(path), path)
                 odometry = {track.device: track for track in observations.read_odometry(session)}
                 samples = observations.read_halls(session)
@@ -117,17 +121,17 @@ def _drives(
 def _check_same(floor: FloorMap, other: FloorMap, path: Path) -> None:
     import numpy as np
 
-    same = np.array_equal(floor.codes, other.codes) and floor.geometry == other.geometry
-    if not same or (floor.pitch_m, floor.origin_m) != (other.pitch_m, other.origin_m):
+    is_same = np.array_equal(floor.codes, other.codes) and floor.geometry == other.geometry
+    if not is_same or (floor.pitch_m, floor.origin_m) != (other.pitch_m, other.origin_m):
         raise InputError(
-            "another map than in the first session",
+            "the map differs from that of the first session",
             file=path,
             hint="Calibrate sessions of one floor, or give its map with --artifact",
         )
 
 
 def _letters(landmark: CalibratedLandmark) -> str:
-    """Its bars as they lie, `-` where there is none."""
+    """Return the poles of the bars as built, `-` for a missing bar."""
     from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
 
     return "".join(
@@ -137,66 +141,69 @@ def _letters(landmark: CalibratedLandmark) -> str:
 
 
 def _text(output: Path, report: FloorCalibrationReport) -> str:
-    """The landmarks for people: a table, and what it is to be told of the others."""
-    told = [one for one in report.landmarks if not one.refused]
-    flagged = [one for one in told if one.built.flags]
-    listed = told if len(told) <= MOST_LANDMARKS else flagged
+    """Format a table of landmarks, and list those without a result."""
+    fitted = [landmark for landmark in report.landmarks if not landmark.refused]
+    flagged = [landmark for landmark in fitted if landmark.built.flags]
+    listed = fitted if len(fitted) <= MAX_LANDMARKS else flagged
     rows = [
         (
-            f"{one.cell[0]},{one.cell[1]}",
-            one.built.visits,
-            f"{1e3 * one.built.x_m:+.2f}",
-            f"{1e3 * one.built.y_m:+.2f}",
-            f"{1e3 * math.hypot(*one.built.sigma[:2]):.2f}",
-            f"{math.degrees(one.built.heading_rad):+.2f}",
-            _letters(one),
-            *(f"{abs(value):.2f}" for value in one.built.strength),
-            " ".join(one.built.flags),
+            f"{landmark.cell[0]},{landmark.cell[1]}",
+            landmark.built.visits,
+            f"{1e3 * landmark.built.x_m:+.2f}",
+            f"{1e3 * landmark.built.y_m:+.2f}",
+            f"{1e3 * math.hypot(*landmark.built.sigma[:2]):.2f}",
+            f"{math.degrees(landmark.built.heading_rad):+.2f}",
+            _letters(landmark),
+            " ".join(f"{abs(value):.2f}" for value in landmark.built.strength),
+            " ".join(landmark.built.flags),
         )
-        for one in listed
+        for landmark in listed
     ]
-    header = ("landmark", "visits", "dx", "dy", "sigma [mm]", "turn [deg]", "bars",
-              *("0", "1", "2", "3"), "flags")  # fmt: skip
+    header = (
+        *("cell", "visits", "dx", "dy", "sigma [mm]", "angle [deg]"),
+        *("bars", "strength", "flags"),
+    )
     lines = [
-        f"{len(told)} landmarks as built against their design, {len(flagged)} flagged"
+        f"{len(fitted)} landmarks as built against their design, {len(flagged)} flagged"
         + (":" if listed else ""),
         *([console.table(header, rows)] if rows else []),
     ]
-    if len(listed) < len(told):
-        lines.append(f"{len(told) - len(listed)} more without a flag; --json lists them all")
+    if len(listed) < len(fitted):
+        lines.append(f"{len(fitted) - len(listed)} more without a flag: see --json")
     lines += [
-        f"seen, but not told: {one.cell[0]},{one.cell[1]}, {one.refused}"
-        for one in report.landmarks
-        if one.refused
+        f"visited, but not fitted: {landmark.cell[0]},{landmark.cell[1]}, {landmark.refused}"
+        for landmark in report.landmarks
+        if landmark.refused
     ]
     if report.unvisited:
         cells = [f"{row},{column}" for row, column in report.unvisited]
-        more = f" and {len(cells) - MOST_LANDMARKS} more" if len(cells) > MOST_LANDMARKS else ""
-        lines.append(f"never visited: {' '.join(cells[:MOST_LANDMARKS])}{more}")
+        more = f" and {len(cells) - MAX_LANDMARKS} more" if len(cells) > MAX_LANDMARKS else ""
+        unvisited = f"never visited: {' '.join(cells[:MAX_LANDMARKS])}{more}"
+        lines.append(console.wrapped(unvisited))
     return "\n".join([*lines, f"Wrote {output}"])
 
 
 def _entry(
     sessions: tuple[Path, ...], output: Path, report: FloorCalibrationReport
 ) -> dict[str, Any]:
-    """The one object of ``--json``; docs/formats.md."""
+    """Return the object of ``--json`` (docs/formats.md)."""
     landmarks = [
         {
-            "cell": one.cell,
-            "visits": one.built.visits,
-            "x_m": one.built.x_m,
-            "y_m": one.built.y_m,
-            "heading_rad": one.built.heading_rad,
-            "strength": one.built.strength,
-            "sigma_x_m": one.built.sigma[0],
-            "sigma_y_m": one.built.sigma[1],
-            "sigma_heading_rad": one.built.sigma[2],
-            "sigma_strength": one.built.sigma[3:],
-            "laid": _letters(one),
-            "flags": one.built.flags,
-            "refused": one.refused,
+            "cell": landmark.cell,
+            "visits": landmark.built.visits,
+            "x_m": landmark.built.x_m,
+            "y_m": landmark.built.y_m,
+            "heading_rad": landmark.built.heading_rad,
+            "strength": landmark.built.strength,
+            "sigma_x_m": landmark.built.sigma[0],
+            "sigma_y_m": landmark.built.sigma[1],
+            "sigma_heading_rad": landmark.built.sigma[2],
+            "sigma_strength": landmark.built.sigma[3:],
+            "laid": _letters(landmark),
+            "flags": landmark.built.flags,
+            "refused": landmark.refused,
         }
-        for one in report.landmarks
+        for landmark in report.landmarks
     ]
     return {
         "version": 1,

@@ -1,4 +1,4 @@
-"""``locatk calibrate printer``: a scan of the test sheet says how the printer prints."""
+"""``locatk calibrate printer``: dots and scale of a printer, from a scan of the test sheet."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.command import Command, section
 from locatk.core.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
@@ -16,44 +17,57 @@ if TYPE_CHECKING:
     from locatk.core.dots.sheet import Manifest
 
 RULER_MM = 100.0
-LENGTH = click.FloatRange(50.0, 150.0)
+"""Length of both rulers on the test sheet [mm]."""
+
+MEASURED_LENGTH = click.FloatRange(50.0, 150.0)
 
 
-@click.command(short_help="Find the best dots of a printer, and its true scale.")
+@click.command("printer", cls=Command, short_help="Find the best dots and the scale of a printer.")
 @options.input_argument("scan")
-@options.output("What was found, as TOML.", required=False)
-@click.option(
-    "--scan-dpi",
-    type=click.FloatRange(50.0, 20_000.0),
-    metavar="DPI",
-    help="Resolution of the scan.  [default: what the file says]",
-)
-@click.option(
-    "--measured-x",
-    type=LENGTH,
-    metavar="MM",
-    help="Length of the sheet's lower ruler, measured on the paper: instead of a scan's scale.",
-)
-@click.option("--measured-y", type=LENGTH, metavar="MM", help="Length of the left ruler, likewise.")
-@click.option(
-    "--pitch",
-    "pitch_mm",
-    type=click.FloatRange(min=0.0, min_open=True),
-    metavar="MM",
-    help="Recommend a dot for this pitch.  [default: the pitch is chosen, too]",
-)
-@options.input_option(
-    "--manifest",
-    "manifests",
-    many=True,
-    metavar="SHEET.toml",
-    help="Manifest of sheets from this printer, into which the scale is written; repeatable. "
-    "Needs --overwrite.",
-)
+@options.output("Calibration to write (.toml).", required=False)
 @options.overwrite
+@section(
+    "Scale",
+    click.option(
+        "--scan-dpi",
+        type=click.FloatRange(50.0, 20_000.0),
+        metavar="DPI",
+        help="Resolution of the scan.  [default: as in the file]",
+    ),
+    click.option(
+        "--measured-x",
+        type=MEASURED_LENGTH,
+        metavar="MM",
+        help="Measured length of the lower ruler on the paper, instead of the scale of a scan.",
+    ),
+    click.option(
+        "--measured-y",
+        type=MEASURED_LENGTH,
+        metavar="MM",
+        help="Measured length of the left ruler on the paper.",
+    ),
+)
+@section(
+    "Advanced",
+    click.option(
+        "--pitch",
+        "pitch_mm",
+        type=click.FloatRange(min=0.0, min_open=True),
+        metavar="MM",
+        help="Recommend a dot for this pitch.  [default: also recommend a pitch]",
+    ),
+    options.input_option(
+        "--manifest",
+        "manifests",
+        many=True,
+        metavar="SHEET.toml",
+        help="Manifest of sheets from this printer to update with the scale; repeatable. Needs "
+        "--overwrite.",
+    ),
+)
 @options.as_json
 @options.verbosity
-def printer(
+def command(
     scan: Path,
     output: Path | None,
     scan_dpi: float | None,
@@ -64,16 +78,17 @@ def printer(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Score each field of a printed test sheet in SCAN, and measure the printer's scale.
+    """Score the fields of a printed test sheet in SCAN, and measure the scale of the printer.
 
-    Recommended is, of the fields with the fewest wrong or missing dots and at least 70 % of
-    the best margin, the one whose pitch is nearest to 0.508 mm and of these the one with
-    the best margin. The margin is how much darker the right one of a dot's four spots is
-    than any other, in parts of full black, for all but the worst hundredth of the dots.
+    The candidates for recommendation are the fields with the fewest wrong or missing dots and
+    at least 70 % of the best margin. Of these, the field with the pitch nearest to 0.508 mm is
+    recommended, then the one with the best margin. The margin of a dot is the difference in
+    darkness between its position and the darkest of the other three possible positions, as a
+    fraction of full black; 99 % of the dots have the margin of the field or more.
 
-    The scale (printed over nominal length) comes from a flat scan whose resolution is
-    known, as exact as the scanner; or from the two rulers, which you measure by hand. A
-    photo tells the best dot, but no scale.
+    The scale (printed over nominal length) is determined from a flat scan of known resolution,
+    with the accuracy of the scanner, or from the two rulers, measured by hand. A photo shows
+    the best dot, but not the scale.
 
     \b
     Examples:
@@ -88,20 +103,20 @@ def printer(
     from locatk.formats.printing.scans import read_scan
 
     if (measured_x is None) != (measured_y is None):
-        raise click.UsageError("--measured-x and --measured-y go together.")
+        raise click.UsageError("Give both --measured-x and --measured-y.")
     if measured_x is not None and scan_dpi is not None:
         raise click.UsageError("The scale comes from --scan-dpi or from the rulers, not both.")
     if output is not None:
         options.guard_output(output, overwrite=overwrite, inputs=[scan, *manifests])
-    held = [(path, read_manifest(path)) for path in manifests]
-    for path, _ in held:
+    updated = [(path, read_manifest(path)) for path in manifests]
+    for path, _ in updated:
         options.guard_output(path, overwrite=overwrite, inputs=[scan])
 
     with console.working("Reading the test sheet"):
         picture = read_scan(scan)
-        said = (scan_dpi, scan_dpi) if scan_dpi is not None else picture.dpi
+        dpi = (scan_dpi, scan_dpi) if scan_dpi is not None else picture.dpi
         try:
-            report = calibrate(picture.image, said, pitch_mm=pitch_mm)
+            report = calibrate(picture.image, dpi, pitch_mm=pitch_mm)
         except (DegenerateError, InputError) as error:
             raise type(error)(error.message, file=scan, hint=error.hint) from None
     scale: tuple[float, float] | None = report.scale
@@ -112,21 +127,21 @@ def printer(
     elif report.doubt is not None:
         console.warn(f"{report.doubt[0].upper()}{report.doubt[1:]}: the scale is not known.")
         scale = None
-    if scale is None and held:
+    if scale is None and updated:
         raise InputError("the scale is not known", file=scan, hint=_HOW_TO_SCALE)
 
     if output is not None:
         files.write_printer(output, report, scale, overwrite=overwrite)
-    for path, manifest in held:
+    for path, manifest in updated:
         if scale is not None:
             write_manifest(path, files.with_printer_scale(manifest, scale), overwrite=True)
     console.result(_text(report, scale))
-    _tell(report, output, held, scale)
+    _print_remarks(report, output, updated, scale)
     if as_json:
         console.emit_json(_entry(scan, output, report, scale, manifests))
     if report.recommended is None:
         raise failures.Incomplete(
-            "No field is good enough to be recommended: print with more dpi or larger dots"
+            "no field is good enough to be recommended: print with more dpi or larger dots"
         )
 
 
@@ -137,50 +152,54 @@ _HOW_TO_SCALE = (
 
 
 def _text(report: PrinterReport, scale: tuple[float, float] | None) -> str:
-    """The table of scores, the recommended field and the scale, for people."""
+    """Format the table of scores, the recommended field and the scale."""
     sheet, best = report.sheet, report.recommended
     lines = [f"Test sheet {sheet.paper}, {sheet.dpi} dpi, {sheet.codec}", ""]
-    header = ("field", "dot", "pitch", "found", "right", "bits", "margin", "scatter", "gain", "")
+    header = (
+        *("field", "dot [um]", "pitch [mm]", "found", "correct", "wrong bits"),
+        *("margin", "scatter", "gain", ""),
+    )
     lines += [console.table(header, [_row(field, report) for field in report.fields]), ""]
     if best is not None:
-        lines.append(
+        lines += [
             f"Best: {best.name}, dots of {1000 * best.dot_mm:.0f} um at {best.pitch_mm:.3f} mm; "
-            f"print with --dpi {sheet.dpi} --pitch {best.pitch_mm:.4f} --dot {best.dot_mm:.4f}"
-        )
+            "print with",
+            f"  --dpi {sheet.dpi} --pitch {best.pitch_mm:.4f} --dot {best.dot_mm:.4f}",
+        ]
     if scale is not None:
         x, y = scale
-        lines.append(f"Scale: x {x:.5f}, y {y:.5f} ({_off(x)} and {_off(y)} in 100 mm)")
+        lines.append(f"Scale: x {x:.5f}, y {y:.5f} ({_deviation(x)} and {_deviation(y)} in 100 mm)")
     return "\n".join(lines)
 
 
-def _off(scale: float) -> str:
+def _deviation(scale: float) -> str:
     return f"{RULER_MM * (scale - 1):+.2f} mm"
 
 
 def _row(field: FieldScore, report: PrinterReport) -> tuple[str, ...]:
-    what = (field.name, f"{1000 * field.dot_mm:.0f} um", f"{field.pitch_mm:.3f} mm")
+    design = (field.name, f"{1000 * field.dot_mm:.0f}", f"{field.pitch_mm:.3f}")
     blank = ("-",) * 4
     if not field.judged:
-        return (*what, "-", "-", *blank, "picture too coarse")
-    seen = (f"{100 * field.found:.1f} %", f"{100 * field.right:.1f} %")
+        return (*design, "-", "-", *blank, "picture too coarse")
+    detected = (f"{100 * field.found:.1f} %", f"{100 * field.right:.1f} %")
     if not field.read:
-        return (*what, *seen, *blank, "cannot be read")
+        return (*design, *detected, *blank, "cannot be read")
     scores = (
         str(field.wrong_bits),
         f"{field.margin:.3f}",
         f"{field.scatter:.4f}",
         f"{field.gain:.2f}",
     )
-    return (*what, *seen, *scores, "<- best" if field is report.recommended else "")
+    return (*design, *detected, *scores, "<- best" if field is report.recommended else "")
 
 
-def _tell(
+def _print_remarks(
     report: PrinterReport,
     output: Path | None,
-    held: list[tuple[Path, Manifest]],
+    updated: list[tuple[Path, Manifest]],
     scale: tuple[float, float] | None,
 ) -> None:
-    """What people ought to know besides."""
+    """Print warnings and the written files."""
     coarse = sum(not field.judged for field in report.fields)
     if coarse:
         console.warn(f"The picture is too coarse for {coarse} fields: scan with more dpi.")
@@ -188,10 +207,10 @@ def _tell(
         console.say(f"The scale is not known. {_HOW_TO_SCALE}.")
     if output is not None:
         console.say(f"Wrote {output}.")
-    for path, manifest in held:
+    for path, manifest in updated:
         width, height = manifest.sheets[0].page_mm
-        turned = "; it is landscape, so x and y change places" if width > height else ""
-        console.say(f"Wrote the scale into {path}{turned}.")
+        swapped = "; x and y are exchanged, because it is landscape" if width > height else ""
+        console.say(f"Wrote the scale into {path}{swapped}.")
 
 
 def _entry(

@@ -1,4 +1,4 @@
-"""Several recordings that one artifact is calibrated from: those of no use are left out."""
+"""Calibration from several recordings: progress, unusable recordings, text."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from locatk.core.errors import LocatkError
 
 
 @contextlib.contextmanager
-def walk(sessions: Sequence[Path], label: str) -> Iterator[Iterable[Path]]:
-    """Show how far the sessions are read, also where there is only one."""
+def iterate(sessions: Sequence[Path], label: str) -> Iterator[Iterable[Path]]:
+    """Iterate over sessions with a progress bar, or with a label for a single one."""
     wait = console.working(label) if len(sessions) == 1 else contextlib.nullcontext()
     with wait, console.progress(sessions, label) as bar:
         yield bar
 
 
 @contextlib.contextmanager
-def sparing(path: Path, left_out: dict[str, str], *, alone: bool) -> Iterator[None]:
-    """Leave a session out that cannot be used, and say why; raise where it is the only one."""
+def skipping_unusable(path: Path, left_out: dict[str, str], *, alone: bool) -> Iterator[None]:
+    """Enter an error into ``left_out``; raise it if the session is the only one."""
     try:
         yield
     except LocatkError as error:
         if alone:
-            error.file = error.file or str(path)  # a solver knows arrays, not files
+            error.file = error.file or str(path)  # Solvers work on arrays.
             raise
         left_out[str(path)] = error.message
 
 
-def tell(text: str, notes: Iterable[str], left_out: Mapping[str, str]) -> None:
-    """A calibration for people, and what it did not use."""
+def print_result(text: str, notes: Iterable[str], left_out: Mapping[str, str]) -> None:
+    """Print a calibration, its notes, and the recordings that were not used."""
     console.result(text)
     for note in notes:
         console.say(note)
-    for name, why in left_out.items():
-        console.warn(f"{name}: {why}")
+    for name, reason in left_out.items():
+        console.warn(f"{name}: {reason}")
 
 
-def check_all_used(left_out: Mapping[str, str], one: str, several: str) -> None:
-    """End with the status of something lost where anything is left out."""
+def check_all_used(left_out: Mapping[str, str], singular: str, plural: str) -> None:
+    """Raise Incomplete if recordings were left out."""
     if left_out:
         count = len(left_out)
-        raise failures.Incomplete(f"{count} {one if count == 1 else several} not used")
+        raise failures.Incomplete(f"{count} {singular if count == 1 else plural} not used")

@@ -1,4 +1,4 @@
-"""``locatk calibrate tag``: passes over a tag say how its magnets really lie."""
+"""``locatk calibrate tag``: magnets of tags as built, from passes over them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.calibrate import recordings
+from locatk.cli.command import Command, section
 from locatk.cli.solve.command import speed_option
 from locatk.core.errors import InputError
 
@@ -18,15 +19,14 @@ if TYPE_CHECKING:
     from locatk.core.polaris.tag import Tags
 
 
-@click.command(short_help="Fit how the magnets of a tag really lie.")
+@click.command("tag", cls=Command, short_help="Fit the magnets of tags as built.")
 @options.sessions
 @options.output("Tags to write (.toml), with the magnets as built.")
-@options.artifact
-@speed_option
 @options.overwrite
+@section("Input", options.artifact, speed_option)
 @options.as_json
 @options.verbosity
-def tag(
+def command(
     sessions: tuple[Path, ...],
     output: Path,
     artifact: Path | None,
@@ -34,15 +34,15 @@ def tag(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Fit places and angles of the magnets to the passes in SESSIONS.
+    """Fit positions and angles of the magnets to the passes in SESSIONS.
 
-    Each tag that was read in two passes or more gets its magnets as built; ten passes, in
-    several directions, are better. Magnets set by hand are off by some degrees, the same in
-    every pass: `locatk solve --artifact` then counts with where they are. The tags come from
-    --artifact, or from the first session.
+    A tag needs at least two passes in which it was read; ten passes in different directions
+    are better. Magnets that were placed by hand are rotated by some degrees, which is the same
+    in every pass: `locatk solve --artifact` uses the magnets as built. The tags are those of
+    --artifact, or of the first session.
 
-    The exit status is 3 where a pass was not used: not read, the only one over its tag, or
-    in disagreement with the others.
+    The exit status is 3 if a pass was not used, because the tag was not read, because it is the
+    only pass over its tag, or because it contradicts the others.
 
     \b
     Examples:
@@ -59,7 +59,7 @@ def tag(
     passes, left_out = _passes(sessions, tags, speed, artifact is None)
     report = calibrate(tags, passes, left_out)
     files.write_tags(output, report.tags, overwrite=overwrite)
-    recordings.tell(_text(output, report), report.notes, report.left_out)
+    recordings.print_result(_text(output, report), report.notes, report.left_out)
     if as_json:
         console.emit_json(_entry(sessions, output, report))
     recordings.check_all_used(report.left_out, "pass was", "passes were")
@@ -71,16 +71,18 @@ def _attached(path: Path) -> Tags:
 
     tags = observations.read_tags(Session.open(path))
     if tags is None:
-        raise InputError("no tags", file=path, hint="Give them with --artifact tag.toml")
+        raise InputError(
+            "the session has no tags", file=path, hint="Give them with --artifact tag.toml"
+        )
     return tags
 
 
 def _passes(
-    sessions: tuple[Path, ...], tags: Tags, speed: float | None, same: bool
+    sessions: tuple[Path, ...], tags: Tags, speed: float | None, is_checked: bool
 ) -> tuple[list[TagPass], dict[str, str]]:
-    """The passes of all sessions, and what is none: name to why.
+    """Read the passes of all sessions; return them, and why others cannot be used, by name.
 
-    With ``same``, each session must hold the design of ``tags``.
+    With ``is_checked``, each session must have the design of ``tags``.
     """
     from dataclasses import replace
 
@@ -89,32 +91,32 @@ def _passes(
     from locatk.formats.sessions import observations
     from locatk.formats.sessions.reader import Session
 
-    # What an earlier calibration says must not come back as if it had been seen.
+    # The result of an earlier calibration must not enter as if it had been observed.
     design = replace(tags, built={}, site={})
-    wanted = polaris.SolveOptions(method="joint", speed_mps=speed)
+    solve_options = polaris.SolveOptions(method="joint", speed_mps=speed)
     passes: list[TagPass] = []
     left_out: dict[str, str] = {}
-    with recordings.walk(sessions, "Solving") as bar:
+    with recordings.iterate(sessions, "Solving") as bar:
         for path in bar:
             solution = None
-            with recordings.sparing(path, left_out, alone=len(sessions) == 1):
+            with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
                 session = Session.open(path)
-                if same:
+                if is_checked:
                     _check_same(tags, _attached(path), path)
                 samples = observations.read_magnetometers(session)
                 odometry = observations.read_odometry(session)
-                solution = polaris.solve(samples, design, wanted, odometry=odometry)
+                solution = polaris.solve(samples, design, solve_options, odometry=odometry)
             if solution is None:
                 continue
             if not solution.detections:
-                left_out[str(path)] = "no tag was seen"
+                left_out[str(path)] = "no tag was detected"
             for detection in solution.detections:
                 name = f"{path} at {detection.time_s:.3f} s"
-                found = tag_pass(design, detection, name)
-                if isinstance(found, str):
-                    left_out[name] = found
+                result = tag_pass(design, detection, name)
+                if isinstance(result, str):
+                    left_out[name] = result
                 else:
-                    passes.append(found)
+                    passes.append(result)
     return passes, left_out
 
 
@@ -123,33 +125,33 @@ def _check_same(tags: Tags, other: Tags, path: Path) -> None:
     for name in design:
         if getattr(tags, name) != getattr(other, name):
             raise InputError(
-                f"tags of another {name.removesuffix('_m')} than in the first session",
+                f"the {name.removesuffix('_m')} of the tags differs from that of the first session",
                 file=path,
-                hint="Calibrate tags of one design, or give theirs with --artifact",
+                hint="Calibrate tags of one design, or give it with --artifact",
             )
 
 
 def _text(output: Path, report: TagCalibrationReport) -> str:
-    """The magnets for people: a table for each tag."""
+    """Format a table of magnets for each tag."""
     from locatk.core.polaris.codec import layout_of
 
     lines = []
-    for found in report.calibrated:
-        cells = layout_of(report.tags, found.tag_id).cells
+    for calibrated in report.calibrated:
+        cells = layout_of(report.tags, calibrated.tag_id).cells
         rows = [
             (
                 f"{column},{row}",
-                *(f"{1e3 * x:+.2f}" for x in found.built.offset_m[n]),
-                f"{1e3 * found.scatter_m[n]:.2f}",
-                f"{math.degrees(found.built.angle_rad[n]):+.2f}",
-                f"{math.degrees(found.scatter_rad[n]):.2f}",
-                found.passes[n],
+                *(f"{1e3 * x:+.2f}" for x in calibrated.built.offset_m[n]),
+                f"{1e3 * calibrated.scatter_m[n]:.2f}",
+                f"{math.degrees(calibrated.built.angle_rad[n]):+.2f}",
+                f"{math.degrees(calibrated.scatter_rad[n]):.2f}",
+                calibrated.passes[n],
             )
             for n, (column, row) in enumerate(cells)
         ]
         header = ("cell", "x", "y", "scatter [mm]", "angle", "scatter [deg]", "passes")
         lines += [
-            f"tag {found.tag_id} from {len(found.used)} passes, as built against its design:",
+            f"tag {calibrated.tag_id}, {len(calibrated.used)} passes, difference from its design:",
             console.table(header, rows),
         ]
     return "\n".join([*lines, f"Wrote {output}"])
@@ -158,31 +160,31 @@ def _text(output: Path, report: TagCalibrationReport) -> str:
 def _entry(
     sessions: tuple[Path, ...], output: Path, report: TagCalibrationReport
 ) -> dict[str, Any]:
-    """The one object of ``--json``; docs/formats.md."""
+    """Return the object of ``--json`` (docs/formats.md)."""
     from locatk.core.polaris.codec import layout_of
 
     tags = []
-    for found in report.calibrated:
-        layout = layout_of(report.tags, found.tag_id)
+    for calibrated in report.calibrated:
+        layout = layout_of(report.tags, calibrated.tag_id)
         magnets = [
             {
                 "cell": cell,
                 "symbol": symbol,
-                "offset_m": found.built.offset_m[n],
-                "angle_rad": found.built.angle_rad[n],
-                "scatter_m": found.scatter_m[n],
-                "scatter_rad": found.scatter_rad[n],
-                "passes": found.passes[n],
+                "offset_m": calibrated.built.offset_m[n],
+                "angle_rad": calibrated.built.angle_rad[n],
+                "scatter_m": calibrated.scatter_m[n],
+                "scatter_rad": calibrated.scatter_rad[n],
+                "passes": calibrated.passes[n],
             }
             for n, (cell, symbol) in enumerate(zip(layout.cells, layout.symbols, strict=True))
         ]
         tags.append(
             {
-                "id": found.tag_id,
-                "used": found.used,
-                "disagree": found.disagree,
-                "stretch": found.stretch,
-                "sigma_stretch": found.sigma_stretch,
+                "id": calibrated.tag_id,
+                "used": calibrated.used,
+                "disagree": calibrated.disagree,
+                "stretch": calibrated.stretch,
+                "sigma_stretch": calibrated.sigma_stretch,
                 "magnets": magnets,
             }
         )

@@ -1,4 +1,4 @@
-"""``locatk demo``: the whole way once, on simulated data."""
+"""``locatk demo``: simulate, solve, evaluate and report, for each system."""
 
 from __future__ import annotations
 
@@ -12,26 +12,39 @@ from typing import Any
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command, section
 
 SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
 
 REPORT = "report.html"
 
 
-@click.command(short_help="Simulate, solve and evaluate, to see that all works.")
+@click.command(cls=Command, short_help="Simulate, solve and evaluate, without hardware.")
 @click.argument("systems", nargs=-1, metavar="[SYSTEM]...", type=click.Choice(SYSTEMS))
 @options.output(
     f"Report to write (.html).  [default: {REPORT}, in the folder of --keep if given]",
     required=False,
 )
-@click.option(
-    "--keep",
-    type=options.PATH,
-    metavar="DIR",
-    help="Leave sessions, solutions, pictures and what to print in DIR.",
-)
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @options.overwrite
+@section(
+    "Output",
+    click.option(
+        "--keep",
+        type=options.PATH,
+        metavar="DIR",
+        help="Keep sessions, solutions, pictures and the sheets to print in DIR.",
+    ),
+)
+@section(
+    "Advanced",
+    click.option(
+        "--seed",
+        type=click.IntRange(0),
+        default=1,
+        show_default=True,
+        help="Seed of all random numbers.",
+    ),
+)
 @options.as_json
 @options.verbosity
 def command(
@@ -44,11 +57,13 @@ def command(
 ) -> None:
     """Simulate a session of each SYSTEM, solve it, compare it with the truth, and report.
 
-    Two robots drive under two Lighthouse stations whose places are unknown; a camera
-    drives over a printed A4 sheet of dots, of which some are missing and some are dust; a
-    bar of magnetometers drives over three tags of magnets that were laid by hand, iron bits
-    among them; a robot with four hall sensors finds where it is on a floor of landmarks, of
-    which one lacks a bar. No hardware and no network are needed.
+    \b
+    lighthouse  two robots under two stations at unknown positions
+    dots        a camera over a printed A4 sheet with missing dots and dust
+    polaris     a bar of magnetometers over three hand-made tags, among iron debris
+    landmarks   a robot with four hall sensors on a floor, on which a bar is missing
+
+    No hardware and no network are needed.
 
     \b
     Examples:
@@ -71,11 +86,13 @@ def command(
     folder: AbstractContextManager[str | Path] = (
         TemporaryDirectory(prefix="locatk-demo-") if keep is None else nullcontext(keep)
     )
-    with folder as place:
-        ways = [whole_way(Path(place), name, seed, keep is not None, overwrite) for name in chosen]
+    with folder as root:
+        results = [
+            run_system(Path(root), name, seed, keep is not None, overwrite) for name in chosen
+        ]
         with console.working("Reporting"):
-            write_report(report, [subject for _, subject in ways], overwrite=overwrite)
-    rows = [row for row, _ in ways]
+            write_report(report, [subject for _, subject in results], overwrite=overwrite)
+    rows = [row for row, _ in results]
     took_s = time.perf_counter() - start
 
     files = [] if keep is None else [item for name in chosen for item in kept(keep, name)]
@@ -91,10 +108,7 @@ def command(
         )
         return
     console.result(table(rows))
-    console.say(
-        "error: mean distance from the truth, in the frame of the markers, the sheet, the site or "
-        "the map"
-    )
+    console.say("error: mean distance from the truth, without alignment")
     console.result(f"Wrote {report} in {took_s:.0f} s: open it in a browser")
     if files:
         width = max(len(str(path)) for path, _ in files)
@@ -103,7 +117,7 @@ def command(
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """One line a system."""
+    """Format a row for each system."""
 
     def mm(metres: float | None) -> str:
         return "-" if metres is None else f"{1e3 * metres:.2g}"
@@ -124,7 +138,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def kept(folder: Path, system: str) -> list[tuple[Path, str]]:
-    """What ``--keep`` leaves of a system, and for each file what to try next."""
+    """Return the files of a system that ``--keep`` leaves, each with a command to try next."""
     from locatk.cli.demo.sessions import PRINTED
 
     session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
@@ -142,16 +156,14 @@ def _quoted(path: Path) -> str:
     return shlex.quote(str(path))
 
 
-def whole_way(
-    folder: Path, system: str, seed: int, pictured: bool, overwrite: bool
+def run_system(
+    folder: Path, system: str, seed: int, is_plotted: bool, overwrite: bool
 ) -> tuple[dict[str, Any], Any]:
-    """Simulate, solve and evaluate one system in ``folder``: its row of the table, and what
-    the report tells of it."""
+    """Simulate, solve and evaluate one system; return its row of the table, and its report."""
     from locatk.cli.demo.sessions import MAKERS, SPEED_MPS
-    from locatk.cli.solve.jobs import command_line
-    from locatk.cli.systems import Request, solve_session
     from locatk.core.evaluation import evaluate, pair_devices
-    from locatk.formats.pipeline.provenance import source_facts
+    from locatk.formats.pipeline import SolveRequest, solve_session
+    from locatk.formats.pipeline.provenance import command_line, source_facts
     from locatk.formats.plots.solution import plot_solution
     from locatk.formats.plots.time_axis import origin_ns
     from locatk.formats.report import subjects
@@ -161,15 +173,15 @@ def whole_way(
     with console.working(f"Simulating {system}"):
         truths = MAKERS[system](folder, seed, overwrite)
     with console.working(f"Solving {system}"):
-        solved = solve_session(session, Request())
+        solved = solve_session(session, SolveRequest())
         speed = SPEED_MPS if system == "polaris" else None
-        paper = solve_session(session, Request(method="paper", speed=speed))
-        facts = {**source_facts(session), "command": command_line(session.name, Request())}
+        paper = solve_session(session, SolveRequest(method="paper", speed=speed))
+        facts = {**source_facts(session), "command": command_line(session.name, SolveRequest())}
         solutions.write_solution(
             solution, solved.solution, source=session, facts=facts, overwrite=overwrite
         )
     subject = subjects.load(solution, session=session)
-    if pictured:
+    if is_plotted:
         with console.working(f"Drawing {system}"):
             plot_solution(
                 folder / f"{system}.png",

@@ -1,4 +1,4 @@
-"""The sessions of ``locatk demo``: one of each system, with truth, and what is to be printed."""
+"""Sessions of ``locatk demo``: one per system, with truth, and the sheets to print."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ if TYPE_CHECKING:
     from locatk.core.trajectory import Trajectory
 
 SPEED_MPS = 0.1
-"""Of the robot over the tags; the published algorithm has to be told."""
+"""Speed of the robot over the tags [m/s], which the published algorithm requires."""
 
 PRINTED = {
     "dots": "dots-sheet.pdf",
     "polaris": "polaris-tags.pdf",
     "landmarks": "landmarks-pack.pdf",
 }
-"""Name of the file to print, for the systems that have one."""
+"""Name of the file to print, if the system has one."""
 
 Maker = Callable[[Path, int, bool], "tuple[Trajectory, ...]"]
-"""Folder, seed and whether to overwrite to truth, with `<system>.mcap` written there."""
+"""Function of folder, seed and overwrite that writes `<system>.mcap` and returns the truth."""
 
 
 def lighthouse(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    """Simulate two robots under two stations."""
     from locatk.core.lighthouse.simulation import SimulationOptions, simulate
     from locatk.formats.sessions import observations
 
@@ -42,6 +43,7 @@ def lighthouse(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ..
 
 
 def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    """Simulate a camera over a sheet, and draw the sheet."""
     from math import radians
 
     from locatk.core.dots.simulation import session as simulate
@@ -49,7 +51,7 @@ def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     from locatk.formats.printing import pattern
     from locatk.formats.sessions import frames
 
-    wanted = simulate.SimulationOptions(
+    options = simulate.SimulationOptions(
         frames=200,
         rate_hz=25.0,
         speed_mps=0.25,
@@ -61,7 +63,7 @@ def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
         vignette=0.3,
         seed=seed,
     )
-    simulated = simulate.simulate(None, wanted)
+    simulated = simulate.simulate(None, options)
     frames.write_session(
         folder / "dots.mcap",
         [simulated.frames],
@@ -76,6 +78,7 @@ def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
 
 
 def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    """Simulate a magnetometer array over three tags, and draw the tags."""
     from math import radians
 
     from locatk.core.polaris.codec import layout_of
@@ -90,8 +93,8 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
     tags = Tags(
         codec="polaris-released",
         site={
-            number: PlanarPose(0.5 * k, 0.02 * k, radians(turn))
-            for k, (number, turn) in enumerate(zip(ids, (0.0, 90.0, 200.0), strict=True))
+            number: PlanarPose(0.5 * k, 0.02 * k, radians(heading))
+            for k, (number, heading) in enumerate(zip(ids, (0.0, 90.0, 200.0), strict=True))
         },
     )
     simulated = simulate.simulate(
@@ -123,6 +126,7 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
 
 
 def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+    """Simulate a robot over a floor, and draw the installation pack."""
     from locatk.core.landmarks.design.generation import DesignOptions, design_map
     from locatk.core.landmarks.drawing.pack import draw_installation_pack
     from locatk.core.landmarks.simulation import session as simulate
@@ -131,14 +135,14 @@ def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...
     from locatk.formats.sessions import field_samples
 
     floor = design_map(DesignOptions(rows=6, columns=8, seed=seed))
-    wanted = simulate.SimulationOptions(
+    options = simulate.SimulationOptions(
         start=(0.3, 0.3, 0.4),
         landmarks=9,
         spins=9,
         faults=simulate.Faults(missing=(((2, 2), 1),)),
         seed=seed,
     )
-    simulated = simulate.simulate(floor, wanted)
+    simulated = simulate.simulate(floor, options)
     field_samples.write_halls(
         folder / "landmarks.mcap",
         simulated.samples,
@@ -147,9 +151,9 @@ def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...
         odometry=simulated.odometry,
         overwrite=overwrite,
     )
-    made = draw_installation_pack(floor, (210.0, 297.0), paper_name="A4")
+    pack = draw_installation_pack(floor, (210.0, 297.0), paper_name="A4")
     with atomic_write(folder / PRINTED["landmarks"], overwrite=overwrite) as stream:
-        stream.write(render_pages(made.pages, "locatk demo"))
+        stream.write(render_pages(pack.pages, "locatk demo"))
     return simulated.truth
 
 

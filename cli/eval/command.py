@@ -1,4 +1,4 @@
-"""``locatk eval``: poses against the truth."""
+"""``locatk eval``: errors of poses with respect to the truth."""
 
 from __future__ import annotations
 
@@ -9,27 +9,33 @@ from typing import Any
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command, section
 from locatk.core.errors import InputError
 
 ALIGNMENTS = ("none", "se2", "se3", "sim2", "sim3", "yaw", "origin")
-"""Copy of :data:`locatk.core.evaluation.ALIGNMENTS`, which imports numpy (a test compares them)."""
+"""Copy of :data:`locatk.core.evaluation.ALIGNMENTS`, which imports numpy."""
+
+
+MAX_OFFSET_S = 4e9
+"""Largest time offset [s], 127 years: more than between any two clocks that count from 1970."""
 
 
 class Offset(click.ParamType):
-    """Seconds, or `auto`."""
+    """Number of seconds, or `auto`."""
 
     name = "seconds"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
+        """Return seconds, or "auto"."""
         if value == "auto":
             return "auto"
         try:
             seconds = float(value)
         except ValueError:
             seconds = math.nan
-        if abs(seconds) < 4e9:
+        if abs(seconds) < MAX_OFFSET_S:
             return seconds
         self.fail(f"{value!r} is neither a number of seconds nor `auto`.", param, ctx)
 
@@ -39,9 +45,9 @@ align_option = click.option(
     type=click.Choice(ALIGNMENTS),
     default="none",
     show_default=True,
-    help="Fitted from estimate to truth on the scored poses, for all devices together: in the "
-    "plane (se2), in space (se3), with scale (sim2, sim3), about z (yaw), or the first pose laid "
-    "on its truth (origin).",
+    help="Transformation of the estimate that is fitted to the truth, one for all devices: in the "
+    "plane (se2), in space (se3), with scale (sim2, sim3), about z (yaw), or by the first pose "
+    "(origin).",
 )
 
 offset_option = click.option(
@@ -50,12 +56,12 @@ offset_option = click.option(
     default=0.0,
     show_default=True,
     metavar="SECONDS|auto",
-    help="Added to the stamps of the estimate; `auto` estimates it on a part that is not scored, "
-    "from clocks that may be years apart.",
+    help="Time to add to the stamps of the estimate; `auto` estimates it on a part that is then "
+    "not scored, even if the clocks are years apart.",
 )
 
 
-@click.command(short_help="Compare poses with the truth.")
+@click.command(cls=Command, short_help="Compare poses with the truth.")
 @options.input_argument("estimate")
 @options.input_option(
     "--truth",
@@ -63,49 +69,59 @@ offset_option = click.option(
     metavar="FILE",
     help="Session with truth, another solution, or a TUM, KITTI or CSV file.",
 )
-@align_option
-@offset_option
-@click.option(
-    "--match",
-    type=click.Choice(("auto", "interpolate", "nearest")),
-    default="auto",
-    show_default=True,
-    help="Truth between its neighbours in time, or the nearest as evo takes it; `auto` is "
-    "`nearest` for two TUM or KITTI files.",
-)
-@click.option(
-    "--max-diff",
-    type=click.FloatRange(0, min_open=True),
-    default=0.01,
-    show_default=True,
-    metavar="SECONDS",
-    help="With `nearest`: how far apart in time.",
-)
-@click.option(
-    "--max-gap",
-    type=click.FloatRange(0, min_open=True),
-    default=0.5,
-    show_default=True,
-    metavar="SECONDS",
-    help="Longest gap in the truth that is interpolated over, and for which coverage counts a "
-    "time as known; KITTI has rows instead.",
-)
-@click.option(
-    "--delta",
-    default="1f",
-    show_default=True,
-    metavar="N(f|m|deg|s)",
-    help="Distance of the poses of a relative error: poses, metres, degrees or seconds.",
-)
 @click.option(
     "--pair",
     "names",
     multiple=True,
     metavar="NAME=NAME",
-    help="What a device of the estimate is called in the truth; may be given again.",
+    help="Name of a device in the estimate, and its name in the truth; repeatable.",
 )
-@click.option("--all-pairs", is_flag=True, help="Relative errors from each pose on.")
-@options.as_json
+@section("Alignment", align_option, offset_option)
+@section(
+    "Association",
+    click.option(
+        "--match",
+        type=click.Choice(("auto", "interpolate", "nearest")),
+        default="auto",
+        show_default=True,
+        help="Interpolate the truth, or take the pose nearest in time as evo does; `auto` is "
+        "`nearest` for two TUM or KITTI files.",
+    ),
+    click.option(
+        "--max-diff",
+        type=click.FloatRange(0, min_open=True),
+        default=0.01,
+        show_default=True,
+        metavar="SECONDS",
+        help="Largest time difference of `nearest`.",
+    ),
+    click.option(
+        "--max-gap",
+        type=click.FloatRange(0, min_open=True),
+        default=0.5,
+        show_default=True,
+        metavar="SECONDS",
+        help="Longest gap in the truth that is interpolated and counted as covered. The unit of "
+        "KITTI files is rows.",
+    ),
+)
+@section(
+    "Relative error",
+    click.option(
+        "--delta",
+        default="1f",
+        show_default=True,
+        metavar="N(f|m|deg|s)",
+        help="Distance between the poses of a relative error: poses (f), metres, degrees or "
+        "seconds.",
+    ),
+    click.option("--all-pairs", is_flag=True, help="Start a relative error at each pose."),
+)
+@section(
+    "Output",
+    click.option("--full", is_flag=True, help="Print all statistics and assumptions."),
+    options.as_json,
+)
 @options.verbosity
 def command(
     estimate: Path,
@@ -118,83 +134,94 @@ def command(
     delta: str,
     names: tuple[str, ...],
     all_pairs: bool,
+    full: bool,
     as_json: bool,
 ) -> None:
-    """Compare the poses of ESTIMATE with a reference, device by device.
+    """Compare the poses of ESTIMATE with a reference, for each device.
 
-    ESTIMATE is a solution (.mcap), a TUM, KITTI or CSV file, or the truth of a session. The
-    absolute error (APE) is the distance of a pose from the truth, the relative one (RPE) what is
-    wrong in the motion from one pose to the next; both have a part in metres and one in degrees.
-    Consistency is whether the covariances of the estimate fit its errors.
+    ESTIMATE is a solution (.mcap), a TUM, KITTI or CSV file, or a session with truth. The
+    absolute pose error (APE) is the difference between a pose and the truth, the relative pose
+    error (RPE) the error of the motion from one pose to the next; both have a part in
+    millimetres or metres and one in degrees. Coverage is the fraction of the time of the truth
+    with a pose. --full adds drift, the consistency of the covariances with the errors, and the
+    other statistics.
 
     \b
     Examples:
       locatk eval solved.mcap --truth run.mcap
+      locatk eval solved.mcap --truth run.mcap --full
       locatk eval solved.mcap --truth grid.mcap --align sim3 --json
       locatk eval solved.mcap --truth camera.tum --offset auto
       locatk eval slam.tum --truth mocap.tum --align se3 --delta 1m
-      locatk eval solved.mcap --truth mocap.csv --pair robot-785b=red --pair robot-dffa=blue
+      locatk eval solved.mcap --truth mocap.csv --pair 785b=red --pair dffa=blue
     """
     from locatk.cli.eval import text as eval_text
     from locatk.core.evaluation import Delta, EvaluationOptions, evaluate, pair_devices
     from locatk.formats.importers import trajectories as files
 
-    pose_distance = Delta.parse(delta)
-    mine = files.open_file(estimate)
+    rpe_delta = Delta.parse(delta)
+    estimated = files.open_file(estimate)
     true = files.open_file(truth, role="truth")
-    files.check_kinds(mine, true)
-    if not mine.solved:
+    files.check_kinds(estimated, true)
+    if not estimated.solved:
         if estimate.samefile(truth):
             raise InputError(
                 "no solved poses", file=estimate, hint="Solve it first: `locatk solve`"
             )
-        console.warn(f"{estimate} holds no solved poses: its truth is taken as the estimate")
-    told = called(names)
-    pairs, alone = pair_devices(mine.trajectories, true.trajectories, told)
+        console.warn(f"{estimate} has no solved poses: its truth is used as the estimate")
+    true_names = parse_pairs(names)
+    pairs, unpaired = pair_devices(estimated.trajectories, true.trajectories, true_names)
     if not pairs:
-        here, there = (
-            ", ".join(each.device for each in side.trajectories) for side in (mine, true)
+        estimated_devices, true_devices = (
+            ", ".join(each.device for each in side.trajectories) for side in (estimated, true)
         )
         raise InputError(
             f"no device of the estimate is in {truth}",
             file=estimate,
-            hint=f"Say by --pair NAME=NAME which of {here} is which of {there}",
+            hint=f"Name the pairs by --pair NAME=NAME: one of {estimated_devices}, and one of "
+            f"{true_devices}",
         )
-    named = not {mine.kind, true.kind} & set(files.EVO_KINDS)  # these name no device
-    for ours, theirs in pairs:
-        if named and theirs.device != ours.device and ours.device not in told:
-            console.say(f"{ours.device} is compared with {theirs.device}, the only one there")
-    if alone:
-        console.warn(f"no truth for {', '.join(alone)}")
-    as_evo = mine.kind in files.EVO_KINDS and true.kind in files.EVO_KINDS
+    # TUM and KITTI files do not name their device.
+    has_names = not {estimated.kind, true.kind} & set(files.EVO_KINDS)
+    for track, reference in pairs:
+        device = track.device
+        if has_names and reference.device != device and device not in true_names:
+            console.say(f"{device} is compared with {reference.device}, the only other device")
+    if unpaired:
+        console.warn(f"no truth for {', '.join(unpaired)}")
     if match == "auto":
-        match = "nearest" if as_evo else "interpolate"
-    evaluation_options = EvaluationOptions(
-        align=align,
-        offset_s=offset,  # type: ignore[arg-type]
-        match=match,
-        max_diff_s=max_diff,
-        # Rows of KITTI are stamped by the second.
-        max_gap_s=max(1.0, max_gap) if mine.kind == "kitti" else max_gap,
-        delta=pose_distance,
-        all_pairs=all_pairs,
+        is_evo = estimated.kind in files.EVO_KINDS and true.kind in files.EVO_KINDS
+        match = "nearest" if is_evo else "interpolate"
+    evaluation = evaluate(
+        pairs,
+        EvaluationOptions(
+            align=align,
+            offset_s=offset,  # type: ignore[arg-type]
+            match=match,
+            max_diff_s=max_diff,
+            # Rows of KITTI are stamped by the second.
+            max_gap_s=max(1.0, max_gap) if estimated.kind == "kitti" else max_gap,
+            delta=rpe_delta,
+            all_pairs=all_pairs,
+        ),
     )
-    found = evaluate(pairs, evaluation_options)
-    if found.time_offset.coarse_method == "first stamps":
-        console.warn("the motions are too unlike to set the clocks by: the first stamps were used")
-    if found.time_offset.alternatives:
-        console.warn("the drive repeats itself, and the motion fits several offsets: give --offset")
+    if evaluation.time_offset.coarse_method == "first stamps":
+        console.warn(
+            "the motions differ too much to estimate the time offset: the first stamps were matched"
+        )
+    if evaluation.time_offset.alternatives:
+        console.warn("the motion is periodic and fits several time offsets: give --offset")
     if as_json:
-        facts = {"version": 1, "estimate": estimate, "truth": truth, **found.as_dict()}
+        facts = {"version": 1, "estimate": estimate, "truth": truth, **evaluation.as_dict()}
         console.emit_json(facts)
     else:
-        console.result(eval_text.text(found))
+        console.result(eval_text.text(evaluation, full=full))
 
 
-def called(names: tuple[str, ...]) -> dict[str, str]:
-    """Names in the estimate to names in the truth, from `NAME=NAME`."""
+def parse_pairs(names: tuple[str, ...]) -> dict[str, str]:
+    """Return names in the estimate and names in the truth, from `NAME=NAME`."""
     pairs = [name.partition("=") for name in names]
-    for name, (mine, _, true) in zip(names, pairs, strict=True):
-        if not mine or not true:
+    for name, (estimated, _, true) in zip(names, pairs, strict=True):
+        if not estimated or not true:
             raise click.BadParameter(f"{name!r} is not NAME=NAME.", param_hint="--pair")
-    return {mine: true for mine, _, true in pairs}
+    return {estimated: true for estimated, _, true in pairs}

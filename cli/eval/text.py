@@ -1,7 +1,8 @@
-"""What ``locatk eval`` tells people: tables of errors, and a line for each assumption."""
+"""Text of ``locatk eval``: a verdict, tables of errors, and the assumptions behind them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from locatk.cli import console
@@ -9,105 +10,180 @@ from locatk.cli import console
 if TYPE_CHECKING:
     from locatk.core.evaluation import Evaluation, Statistics
 
-STATISTICS = ("rmse", "mean", "median", "p95", "max", "std", "min", "sse")
+SUMMARY = ("rmse", "mean", "median", "p95", "max")
+"""Statistics that are shown by default."""
 
-KINDS = (
+STATISTICS = (*SUMMARY, "std", "min", "sse")
+
+ERRORS = (
     ("ape_translation", "APE", True),
     ("ape_rotation", "APE", False),
     ("rpe_translation", "RPE", True),
     ("rpe_rotation", "RPE", False),
 )
+"""Attribute of an evaluation, name, and whether it is a length (otherwise an angle)."""
+
+ASSOCIATIONS = {
+    "interpolate": "truth interpolated to the poses",
+    "nearest": "nearest in time",
+}
 
 
-def text(found: Evaluation) -> str:
-    """The evaluation for people; lengths in mm where they are small."""
-    metres = found.max >= 1.0
-    unit, factor = ("m", 1.0) if metres else ("mm", 1e3)
-    several = len(found.devices) > 1
-    scopes: list[tuple[str, dict[str, Statistics | None]]] = []
-    if several:
-        every = {name: getattr(found, name) for name, _, _ in KINDS}
-        scopes.append(("all", every))
-    scopes += [(name, found.device_statistics(i)) for i, name in enumerate(found.devices)]
-    rows = [
-        _row(name, f"{short} [{unit}]", figures, factor)
-        if length
-        else _row(name, f"{short} [deg]", figures, 1.0)
-        for name, told in scopes
-        for kind, short, length in KINDS
-        if (figures := told[kind]) is not None
-    ]
-    header = ("device", "error", "n", *STATISTICS[:-1], "sse [unit²]")
-    return "\n".join([_verdict(found, unit, factor), console.table(header, rows), *_lines(found)])
+def text(evaluation: Evaluation, *, full: bool = False) -> str:
+    """Format an evaluation; lengths are in mm if all of them are below 1 m.
 
-
-def _verdict(found: Evaluation, unit: str, factor: float) -> str:
-    """Whether it is good, in one line."""
-    middle, most = (f"{number(factor * value)} {unit}" for value in (found.median, found.p95))
-    if found.n == 1:
-        return f"The one pose with truth lies {middle} from it."
-    return f"Half of {found.n} poses lie within {middle} of the truth, 95 % within {most}."
-
-
-def _row(device: str, label: str, figures: Statistics, factor: float) -> tuple[object, ...]:
-    numbers = (
-        number(getattr(figures, name) * (factor**2 if name == "sse" else factor))
-        for name in STATISTICS
+    By default: verdict, APE, RPE, coverage, alignment, and a time offset if there is one.
+    """
+    unit, factor = ("m", 1.0) if evaluation.max >= 1.0 else ("mm", 1e3)
+    scopes = _scopes(evaluation)
+    table = _full_table if full else _summary_table
+    lines = _all_lines(evaluation) if full else _short_lines(evaluation)
+    return "\n".join(
+        [
+            _verdict(evaluation, unit, factor),
+            table(scopes, unit, factor),
+            *map(console.wrapped, lines),
+        ]
     )
-    return (device, label, figures.n, *numbers)
+
+
+def _scopes(evaluation: Evaluation) -> list[tuple[str, dict[str, Statistics | None]]]:
+    """Return the statistics of all devices together, if there are several, and of each."""
+    from locatk.core.natural_order import natural_key
+
+    names = evaluation.devices
+    order = sorted(range(len(names)), key=lambda index: natural_key(names[index]))
+    scopes = [(names[index], evaluation.device_statistics(index)) for index in order]
+    if len(names) > 1:
+        scopes.insert(0, ("all", {name: getattr(evaluation, name) for name, _, _ in ERRORS}))
+    return scopes
+
+
+def _verdict(evaluation: Evaluation, unit: str, factor: float) -> str:
+    """Return the error of most poses in a sentence."""
+    median, p95 = (f"{number(factor * e)} {unit}" for e in (evaluation.median, evaluation.p95))
+    if evaluation.n == 1:
+        return f"The only pose with truth has an error of {median}."
+    return f"Half of {evaluation.n} poses are within {median} of the truth, 95 % within {p95}."
+
+
+def _summary_table(
+    scopes: Sequence[tuple[str, dict[str, Statistics | None]]], unit: str, factor: float
+) -> str:
+    """Format a row for each error of each device."""
+    rows = []
+    for device, statistics in scopes:
+        for name, label, is_length in ERRORS:
+            values = statistics[name]
+            if values is not None:
+                scale, error_unit = (factor, unit) if is_length else (1.0, "deg")
+                cells = (number(scale * getattr(values, figure)) for figure in SUMMARY)
+                rows.append((device, f"{label} [{error_unit}]", values.n, *cells))
+    return console.table(("device", "error", "n", *SUMMARY), rows)
+
+
+def _full_table(
+    scopes: Sequence[tuple[str, dict[str, Statistics | None]]], unit: str, factor: float
+) -> str:
+    """Format a row for each statistic of each device, and a column for each error."""
+    known = [
+        (name, label, is_length)
+        for name, label, is_length in ERRORS
+        if any(statistics[name] is not None for _, statistics in scopes)
+    ]
+    titles = [f"{label} [{unit if is_length else 'deg'}]" for _, label, is_length in known]
+    rows: list[tuple[str, ...]] = []
+    for device, statistics in scopes:
+        for figure in ("n", *STATISTICS):
+            cells = []
+            for name, _, is_length in known:
+                values = statistics[name]
+                scale = factor if is_length else 1.0
+                if values is None:
+                    cells.append("-")
+                elif figure == "n":
+                    cells.append(str(values.n))
+                else:
+                    power = 2 if figure == "sse" else 1
+                    cells.append(number(scale**power * getattr(values, figure)))
+            rows.append((device, "sse [unit²]" if figure == "sse" else figure, *cells))
+    return console.table(("device", "statistic", *titles), rows)
 
 
 def number(value: float) -> str:
-    """Three decimals; three digits below a tenth, and nothing below rounding."""
+    """Format with three decimals, or three digits below 0.1; rounding errors are 0."""
     if value < 1e-9:
         return "0"
     return f"{value:.3f}" if value >= 0.1 else f"{value:.3g}"
 
 
-def _lines(found: Evaluation) -> list[str]:
-    facts = found.as_dict()
-    left_out = ", ".join(f"{count} {why}" for why, count in found.unscored.items() if count)
-    how = {
-        "interpolate": "truth interpolated to the poses",
-        "nearest": "nearest in time",
-    }[found.match]
+def _short_lines(evaluation: Evaluation) -> list[str]:
+    """Return coverage, alignment, and assumptions that are not the default ones."""
+    lines = [_coverage(evaluation), _alignment(evaluation)]
+    if evaluation.offset_s:
+        lines.append(_time_offset(evaluation))
+    if any(evaluation.unscored.values()):
+        lines.append(_unscored(evaluation))
+    return lines
+
+
+def _all_lines(evaluation: Evaluation) -> list[str]:
+    """Return a line for each assumption and each further statistic."""
     return [
         "RPE: from each pose to the next"
-        if found.rpe_delta == "1f"
-        else f"RPE: of poses {found.rpe_delta} apart",
-        f"alignment: {found.align}, fitted on {facts['align_fitted_on']}"
-        + (f" (scale {found.alignment.scale:.6f})" if found.align.startswith("sim") else ""),
-        f"association: {found.match} ({how})",
-        f"time offset: {found.offset_s:.4f} s ({found.time_offset.describe()})",
-        f"not scored: {left_out or 'nothing'}",
-        _coverage(found),
-        f"path: {found.path_m:.3f} m (truth), {found.path_estimate_m:.3f} m (estimate)",
-        _drift(facts["drift"]),
-        _consistency(found),
+        if evaluation.rpe_delta == "1f"
+        else f"RPE: between poses at a distance of {evaluation.rpe_delta}",
+        _alignment(evaluation),
+        f"association: {evaluation.match} ({ASSOCIATIONS[evaluation.match]})",
+        _time_offset(evaluation),
+        _unscored(evaluation),
+        _coverage(evaluation),
+        f"path: {evaluation.path_m:.3f} m (truth), {evaluation.path_estimate_m:.3f} m (estimate)",
+        _drift(evaluation),
+        _consistency(evaluation),
     ]
 
 
-def _coverage(found: Evaluation) -> str:
-    fraction, time = found.coverage.fraction, found.coverage
-    if fraction is None:
-        return "coverage: - (the truth tells of single poses)"
-    return f"coverage: {100 * fraction:.1f} % ({time.solved_s:.1f} of {time.truth_s:.1f} s)"
+def _alignment(evaluation: Evaluation) -> str:
+    if evaluation.align == "none":
+        return "alignment: none"
+    scale = f" (scale {evaluation.alignment.scale:.6f})" if evaluation.align[:3] == "sim" else ""
+    fitted_on = evaluation.as_dict()["align_fitted_on"]
+    return f"alignment: {evaluation.align}, fitted on {fitted_on}{scale}"
 
 
-def _drift(drift: dict[str, float | None]) -> str:
-    percent, turned = drift["translation_percent"], drift["rotation_deg_per_m"]
+def _time_offset(evaluation: Evaluation) -> str:
+    return f"time offset: {evaluation.offset_s:.4f} s ({evaluation.time_offset.describe()})"
+
+
+def _unscored(evaluation: Evaluation) -> str:
+    counts = ", ".join(f"{n} {reason}" for reason, n in evaluation.unscored.items() if n)
+    return f"not scored: {counts or 'nothing'}"
+
+
+def _coverage(evaluation: Evaluation) -> str:
+    coverage = evaluation.coverage
+    if coverage.fraction is None:
+        return "coverage: - (the truth has single poses only)"
+    percent = 100 * coverage.fraction
+    return f"coverage: {percent:.1f} % ({coverage.solved_s:.1f} of {coverage.truth_s:.1f} s)"
+
+
+def _drift(evaluation: Evaluation) -> str:
+    drift = evaluation.as_dict()["drift"]
+    percent, rotation = drift["translation_percent"], drift["rotation_deg_per_m"]
     if percent is None:
-        return "drift: - (the truth stands still)"
-    rotation = "" if turned is None else f", {number(turned)} deg/m"
-    return f"drift: {number(percent)} %{rotation} (over 10 to 50 % of the path)"
+        return "drift: - (the truth does not move)"
+    rate = "" if rotation is None else f", {number(rotation)} deg/m"
+    return f"drift: {number(percent)} %{rate} (over 10 to 50 % of the path)"
 
 
-def _consistency(found: Evaluation) -> str:
-    said = found.consistency
-    if said is None:
+def _consistency(evaluation: Evaluation) -> str:
+    consistency = evaluation.consistency
+    if consistency is None:
         return "consistency: - (the estimate has no covariances)"
     return (
-        f"consistency: {said.describe()}; NEES {said.mean:.3g} a degree of freedom "
-        f"({said.low:.2f} to {said.high:.2f} expected of independent poses), "
-        f"{100 * said.inside:.0f} % of the poses in their 95 % region"
+        f"consistency: {consistency.describe()}; NEES {consistency.mean:.3g} per degree of freedom "
+        f"({consistency.low:.2f} to {consistency.high:.2f} expected of independent poses), "
+        f"{100 * consistency.inside:.0f} % of the poses in their 95 % region"
     )

@@ -94,7 +94,7 @@ def import_sweeps(
     reader: Any, paths: tuple[Path, ...], output: Path, given: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, Any], str | None]:
     """Import sweeps; returns the results for ``--json`` and a summary of the losses."""
-    from locatk.formats.sessions import observations
+    from locatk.formats.sessions import lighthouse_description, observations
 
     with console.working("Reading"):
         imported = reader(list(paths), **_reader_arguments(paths, given))
@@ -110,7 +110,9 @@ def import_sweeps(
             overwrite=overwrite,
         )
     sweeps = imported.sweeps
-    stations = [info_lighthouse.told(station, station.channel) for station in imported.stations]
+    stations = [
+        lighthouse_description.station(report, report.channel) for report in imported.stations
+    ]
     truth_poses = sum(map(len, imported.truth))
     truth = f", {truth_poses} truth poses" if truth_poses else ""
     console.say(f"{len(sweeps)} sweeps of {_device_list(sweeps.devices)}{truth}")
@@ -131,6 +133,7 @@ def import_scene(
 ) -> tuple[dict[str, Any], str | None]:
     """Import the stations of a configuration as ``scene.toml``; returns as `import_sweeps`."""
     from locatk.formats.artifacts import scene as artifacts
+    from locatk.formats.sessions import lighthouse_description
 
     if output.suffix.lower() != ".toml":
         raise click.UsageError(
@@ -138,7 +141,7 @@ def import_scene(
         )
     scene = reader(paths[0])
     artifacts.write_scene(output, scene, overwrite=overwrite)
-    description = info_lighthouse.scene(scene)
+    description = lighthouse_description.scene(scene)
     stations = [{key: each[key] for key in SCENE_KEYS} for each in description["stations"]]
     warnings = list(scene.notes)
     if stations:

@@ -1,4 +1,4 @@
-"""``locatk info``: what is in a file."""
+"""``locatk info``: description of a session, a solution or an artifact."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.info import lighthouse as info_lighthouse
+from locatk.cli.command import Command
 from locatk.cli.info.text import text
 
 if TYPE_CHECKING:
     from locatk.formats.sessions.reader import Session
 
 
-@click.command(short_help="Say what is in a session, a solution or an artifact.")
+@click.command(cls=Command, short_help="Describe a session, a solution or an artifact.")
 @options.input_argument("file")
 @options.as_json
 @options.verbosity
 def command(file: Path, as_json: bool) -> None:
-    """Say what is in FILE: a session or a solution (.mcap, of any tool), or an artifact
-    (.toml): a lighthouse scene, a receiver, a manifest of dot sheets, a camera, tags, a sensor
-    array, a map of landmarks, hall sensors.
+    """Describe FILE: a session or solution (.mcap, also of other tools), or an artifact (.toml).
 
-    Of Lighthouse it tells for each station its channel and serial number, how long a rotation
-    takes (in ticks of 48 MHz; with `ppm` from nominal where it was measured), sweeps, the
-    share of them that was decoded, and where its calibration is from.
+    Artifacts are Lighthouse scenes and receivers; manifests of dot sheets and cameras; tags and
+    sensor arrays; maps of landmarks and hall sensors.
 
-    A damaged or cut recording is described as far as it can be read; the exit status
-    is 3 then, and `locatk recover` saves what is left. Of a recording that holds more than
-    16 MB of samples only the index is read.
+    The table of Lighthouse stations has their channel and serial number, the period of a rotation
+    (in ticks of 48 MHz, and its difference from the nominal one in ppm if it was measured), the
+    number of sweeps, the fraction of them that was decoded, and the origin of the calibration.
+
+    A damaged or truncated recording is described as far as it can be read. The exit status is
+    then 3, and `locatk recover` saves the rest. Of a recording with more than 16 MB of samples
+    only the index is read.
 
     \b
     Examples:
@@ -51,22 +52,24 @@ def command(file: Path, as_json: bool) -> None:
     else:
         console.result(text(facts))
     if facts.get("damage"):
-        hint = "; `locatk recover` saves what is left of it" if facts["recoverable"] else ""
+        hint = "; `locatk recover` saves the rest" if facts["recoverable"] else ""
         raise failures.Incomplete(f"{facts['damage']} in {file}{hint}")
 
 
 def _artifact(file: Path) -> dict[str, Any]:
+    """Read and describe an artifact."""
     from locatk.formats.artifacts import maps, sheets, tags
     from locatk.formats.artifacts import receiver as receivers
     from locatk.formats.artifacts import scene as artifacts
     from locatk.formats.artifacts.schema import read_format
     from locatk.formats.sessions import description as describe
+    from locatk.formats.sessions import lighthouse_description
 
     kinds: dict[str, Callable[[], dict[str, Any]]] = {
         artifacts.SCENE_FORMAT: lambda: {
             "kind": "scene",
             "system": "lighthouse",
-            **info_lighthouse.scene(artifacts.read_scene(file)),
+            **lighthouse_description.scene(artifacts.read_scene(file)),
         },
         sheets.MANIFEST_FORMAT: lambda: {
             "kind": "manifest",
@@ -101,13 +104,14 @@ def _artifact(file: Path) -> dict[str, Any]:
         receivers.RECEIVER_FORMAT: lambda: {
             "kind": "receiver",
             "system": "lighthouse",
-            "receivers": [info_lighthouse.receiver(receivers.read_receiver(file))],
+            "receivers": [lighthouse_description.receiver(receivers.read_receiver(file))],
         },
     }
     return kinds[read_format(file, tuple(kinds))]()
 
 
 def _recording(file: Path) -> dict[str, Any]:
+    """Describe a session, a solution, or a recording of another tool."""
     from locatk.formats.sessions import capture_record as captured
     from locatk.formats.sessions.reader import Session
 
@@ -134,7 +138,9 @@ def _recording(file: Path) -> dict[str, Any]:
         "recoverable": session.damage is not None,
     }
     if facts.get("system") == "lighthouse":
-        described |= info_lighthouse.recording(session)
+        from locatk.formats.sessions import lighthouse_description
+
+        described |= lighthouse_description.recording(session)
     elif facts.get("system") in ("dots", "polaris", "landmarks"):
         from locatk.formats.sessions import description as describe
 
@@ -143,6 +149,7 @@ def _recording(file: Path) -> dict[str, Any]:
 
 
 def _streams(session: Session) -> list[dict[str, Any]]:
+    """Describe the channels of a recording."""
     from locatk.formats.sessions import capture_record as captured
 
     samples = {each.topic: captured.samples(session, each.topic) for each in session.channels}

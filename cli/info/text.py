@@ -1,4 +1,4 @@
-"""What `locatk info` found in a file, as text for people."""
+"""Text of ``locatk info``: a block of facts, and a table for each kind of content."""
 
 from __future__ import annotations
 
@@ -12,28 +12,31 @@ from locatk.cli.info import capture as info_capture
 from locatk.cli.info import lighthouse as info_lighthouse
 from locatk.cli.info.capture import size
 
-MOST_TAGS = 20
-"""So many tags of a family are listed for people; ``--json`` holds them all."""
+MAX_ROWS = 20
+"""Number of tags or landmarks that are listed; ``--json`` lists all."""
 
-MOST_CELLS = 5_000
-"""A larger map is not drawn."""
+MAX_MAP_CELLS = 5_000
+"""Number of cells of the largest map that is drawn."""
 
-SHOWN_ABOVE = {("locatk", key) for key in ("format_version", "tool_version", "kind", "system")}
+KNOWN_METADATA = {("locatk", key) for key in ("format_version", "tool_version", "kind", "system")}
+"""Entries that the first lines show."""
 
-SIMULATED = "simulated_"
-"""Options of a simulation, and its truth: there are many, and some are long."""
+SIMULATION_PREFIX = "simulated_"
+"""Prefix of the options and the truth of a simulation, which are many and long."""
 
 
 def text(facts: dict[str, Any]) -> str:
-    """A block of facts and a table of each kind of thing; ``facts`` are what ``--json`` says."""
+    """Format the facts of ``--json``."""
+    from locatk.core.natural_order import natural_key
+
     kind = facts.get("kind") or "recording of another tool"
-    lines = [f"{facts['file']}: {kind}" + (f", {facts['system']}" if facts.get("system") else "")]
-    for label, value in (
+    system = f", {facts['system']}" if facts.get("system") else ""
+    facts_by_label = (
         ("size", size(facts["bytes"])),
         ("made by", facts.get("library")),
         ("start", when(facts.get("start_ns"))),
         ("duration", _seconds(facts.get("duration_s"))),
-        ("devices", ", ".join(facts.get("devices", ()))),
+        ("devices", ", ".join(sorted(facts.get("devices", ()), key=natural_key))),
         ("sweeps", facts.get("sweeps")),
         ("markers", facts.get("markers")),
         ("scale", facts.get("scale")),
@@ -47,19 +50,20 @@ def text(facts: dict[str, Any]) -> str:
         ("bars", _bars(facts.get("bars"))),
         ("patterns", _patterns(facts.get("patterns"))),
         *info_capture.lines(facts.get("capture") or {}),
-        ("not read", _not_read(facts.get("unread_bytes"))),
+        ("not read", _unread(facts.get("unread_bytes"))),
         ("damage", facts.get("damage")),
-    ):
-        if value not in (None, ""):
-            lines.append(f"  {label + ':':<10}{value}")
-    for note in facts.get("notes", ()):
-        lines.append(f"  note:     {note}")
+        *(("note", note) for note in facts.get("notes", ())),
+    )
+    shown_facts = [
+        (f"{label}:", str(value)) for label, value in facts_by_label if value not in (None, "")
+    ]
+    lines = [f"{facts['file']}: {kind}{system}", console.labelled(shown_facts, indent=2)]
 
     def section(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
         if rows:
             lines.extend(["", console.table(header, rows)])
 
-    streams = facts.get("streams", ())
+    streams = sorted(facts.get("streams", ()), key=lambda stream: natural_key(stream["topic"]))
     counted = any(s["samples"] is not None for s in streams)
     section(
         ("stream", "schema", "messages", "Hz", *(("samples", "Hz") if counted else ())),
@@ -78,7 +82,7 @@ def text(facts: dict[str, Any]) -> str:
         [(c["device"], c["frames"], _by(c["size_px"])) for c in facts.get("cameras", ())],
     )
     section(
-        ("sheet", "origin", "dots", "section", "paper [mm]", "pattern [mm]", "frame", "place"),
+        ("sheet", "origin", "dots", "section", "paper [mm]", "pattern [mm]", "frame", "position"),
         [
             (
                 s["id"],
@@ -88,13 +92,13 @@ def text(facts: dict[str, Any]) -> str:
                 _by(s["page_mm"]),
                 _by(s["pattern_mm"]),
                 s["frame"],
-                "-" if s["position_mm"] is None else _place(s),
+                "-" if s["position_mm"] is None else _pose(s),
             )
             for s in facts.get("sheets", ())
         ],
     )
     section(
-        ("array", "sensors", "Hz", "left out", "width [mm]", "noise [uT]", "range [uT]", "sensor"),
+        ("array", "sensors", "Hz", "unused", "width [mm]", "noise [uT]", "range [uT]", "sensor"),
         [
             (
                 a.get("device", "-"),
@@ -111,7 +115,7 @@ def text(facts: dict[str, Any]) -> str:
     )
     tags = facts.get("tags", [])
     section(
-        ("tag", "cell:orientation", "as built (passes)", "place"),
+        ("tag", "cell:orientation", "as built (passes)", "position"),
         [
             (
                 t["id"],
@@ -119,15 +123,24 @@ def text(facts: dict[str, Any]) -> str:
                     f"{c},{r}:{s}" for (c, r), s in zip(t["cells"], t["symbols"], strict=True)
                 ),
                 "-" if t["passes"] is None else t["passes"],
-                "-" if t["position_mm"] is None else _place(t),
+                "-" if t["position_mm"] is None else _pose(t),
             )
-            for t in tags[:MOST_TAGS]
+            for t in tags[:MAX_ROWS]
         ],
     )
-    if len(tags) > MOST_TAGS:
-        lines.append(f"... and {len(tags) - MOST_TAGS} more: see --json")
+    if len(tags) > MAX_ROWS:
+        lines.append(f"... and {len(tags) - MAX_ROWS} more: see --json")
     section(
-        ("robot", "sensors", "Hz", "left out", "noise [uT]", "range [mT]", "sensor", "places [mm]"),
+        (
+            "robot",
+            "sensors",
+            "Hz",
+            "unused",
+            "noise [uT]",
+            "range [mT]",
+            "sensor",
+            "positions [mm]",
+        ),
         [
             (
                 h.get("device", "-"),
@@ -137,14 +150,14 @@ def text(facts: dict[str, Any]) -> str:
                 _axes([h["noise_ut"]]),
                 _axes([h["range_mt"]]),
                 h["sensor"] or "-",
-                _places(h),
+                _positions(h),
             )
             for h in facts.get("halls", ())
         ],
     )
-    if facts.get("map") and facts["rows"] * facts["columns"] <= MOST_CELLS:
-        lines.extend(["", *_drawn(facts["map"])])
-    # What is wrong comes first.
+    if facts.get("map") and facts["rows"] * facts["columns"] <= MAX_MAP_CELLS:
+        lines.extend(["", *_draw_map(facts["map"])])
+    # Flagged landmarks first.
     built = sorted(facts.get("built", ()), key=lambda b: not b["flags"])
     section(
         ("cell", "x [mm]", "y [mm]", "heading [deg]", "strength of bars", "visits", "flags"),
@@ -158,34 +171,44 @@ def text(facts: dict[str, Any]) -> str:
                 b["visits"],
                 ", ".join(b["flags"]) or "-",
             )
-            for b in built[:MOST_TAGS]
+            for b in built[:MAX_ROWS]
         ],
     )
-    if len(built) > MOST_TAGS:
-        lines.append(f"... and {len(built) - MOST_TAGS} more: see --json")
+    if len(built) > MAX_ROWS:
+        lines.append(f"... and {len(built) - MAX_ROWS} more: see --json")
     section(
         ("attachment", "type", "bytes"),
         [(a["name"], a["media_type"], a["bytes"]) for a in facts.get("attachments", ())],
     )
-    left = [
-        (name, key, value)
-        for name, record in facts.get("metadata", {}).items()
-        for key, value in record.items()
-        if (name, key) not in SHOWN_ABOVE
-        and not info_capture.told(name, key)
-        and not info_lighthouse.shown(name, key)
-    ]
-    shown = [row for row in left if console.verbose() or not row[1].startswith(SIMULATED)]
-    section(("metadata", "key", "value"), shown)
-    if len(shown) < len(left):
-        lines.append(f"... and {len(left) - len(shown)} options of the simulation: see -v")
+    lines += _metadata(facts.get("metadata", {}))
     return "\n".join(lines)
 
 
-def _not_read(unread: int | None) -> str | None:
+def _metadata(records: dict[str, dict[str, Any]]) -> list[str]:
+    """Format the metadata that the lines above do not show, a block for each record."""
+    lines, simulation_options = [], 0
+    for name, record in records.items():
+        entries = []
+        for key, value in record.items():
+            if (name, key) in KNOWN_METADATA or info_capture.is_shown(name, key):
+                continue
+            if info_lighthouse.is_shown(name, key):
+                continue
+            if key.startswith(SIMULATION_PREFIX) and not console.verbose():
+                simulation_options += 1
+            else:
+                entries.append((key, str(value)))
+        if entries:
+            lines += ["", f"metadata {name}", console.labelled(entries)]
+    if simulation_options:
+        lines.append(f"... and {simulation_options} options of the simulation: see -v")
+    return lines
+
+
+def _unread(unread: int | None) -> str | None:
     if unread is None:
         return None
-    return f"the samples, which {size(unread)} of the file hold; the rest is from its index"
+    return f"the samples ({size(unread)}); this description is from the index of the file"
 
 
 def _print(facts: dict[str, Any]) -> str | None:
@@ -214,11 +237,12 @@ def _design(facts: dict[str, Any]) -> str | None:
     if "orientations" not in facts:
         return None
     family = "" if facts["family"] is None else f", a family of {facts['family']}"
-    apart = "" if facts["min_distance"] == 1 else f", {facts['min_distance']} steps apart"
+    distance = "" if facts["min_distance"] == 1 else f", {facts['min_distance']} steps apart"
     return (
         f"{facts['codec']}, {facts['magnets']} magnets of {facts['orientations']} orientations on "
         f"{facts['order']} x {facts['order']} cells {facts['spacing_mm']:.6g} mm apart, "
-        f"{facts['clearance_mm']:.6g} mm below the sensors, {facts['capacity']} ids{family}{apart}"
+        f"{facts['clearance_mm']:.6g} mm below the sensors, {facts['capacity']} ids"
+        f"{family}{distance}"
     )
 
 
@@ -240,7 +264,7 @@ def _floor(facts: dict[str, Any]) -> str | None:
         f"{facts['rows']} rows x {facts['columns']} columns {facts['pitch_mm']:.6g} mm apart",
         *([facts["name"]] if facts["name"] else []),
         f"alphabet {facts['alphabet']}, window {facts['window']}",
-        *([f"notices {facts['detect']} misread"] if facts["detect"] else []),
+        *([f"detects {facts['detect']} misread"] if facts["detect"] else []),
         *([f"{holes} without a landmark"] if holes else []),
         *([f"{facts['walls']} wall{'' if facts['walls'] == 1 else 's'}"] if facts["walls"] else []),
         *([f"{len(facts['built'])} as built"] if facts["built"] else []),
@@ -264,32 +288,32 @@ def _patterns(patterns: dict[str, int] | None) -> str | None:
     return ", ".join(f"{count} {letters}" for letters, count in patterns.items() if count)
 
 
-def _drawn(rows: list[str]) -> list[str]:
-    """The floor as it lies, y up; the first row of the file is the lowest."""
+def _draw_map(rows: list[str]) -> list[str]:
+    """Draw the map with y up: the first row of the file is the lowest."""
     width = len(str(len(rows) - 1))
     tens = "".join(str(column // 10) if column % 10 == 0 else " " for column in range(len(rows[0])))
     ones = "".join(str(column % 10) for column in range(len(rows[0])))
     ruler = [ones] if len(rows[0]) <= 10 else [ones, tens]
     return [
-        "map, seen from above, y up:",
+        "map from above, y up:",
         *(f"  {number:>{width}}  {row}" for number, row in reversed(list(enumerate(rows)))),
         *(f"  {'':>{width}}  {line}".rstrip() for line in ruler),
     ]
 
 
-def _places(halls: dict[str, Any]) -> str:
+def _positions(halls: dict[str, Any]) -> str:
     pairs = zip(halls["names"], halls["position_mm"], strict=True)
     return "  ".join(f"{name} {x:.6g},{y:.6g}" for name, (x, y) in pairs)
 
 
 def _axes(values: Sequence[float]) -> str:
-    """Numbers by axis, `-` where unknown."""
+    """Format numbers by axis, `-` if unknown."""
     return " ".join(f"{value:.4g}" if math.isfinite(value) else "-" for value in values)
 
 
-def _place(found: dict[str, Any]) -> str:
-    x, y = found["position_mm"]
-    return f"{x:.6g},{y:.6g} mm, {found['heading_deg']:.4g} deg"
+def _pose(site: dict[str, Any]) -> str:
+    x, y = site["position_mm"]
+    return f"{x:.6g},{y:.6g} mm, {site['heading_deg']:.4g} deg"
 
 
 def _by(pair: Sequence[float] | None) -> str:
@@ -297,12 +321,12 @@ def _by(pair: Sequence[float] | None) -> str:
 
 
 def when(time_ns: int | None) -> str | None:
-    """A time of a recording for people, in UTC."""
+    """Format a time of a recording in UTC."""
     if time_ns is None:
         return None
     try:
         return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="milliseconds")
-    except (OverflowError, ValueError, OSError):  # a damaged stamp beyond the year 9999
+    except (OverflowError, ValueError, OSError):  # A damaged stamp beyond the year 9999.
         return f"{time_ns} ns"
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import click
 
+from locatk.cli.command import Group
 from locatk.cli.print.landmarks import landmarks
 from locatk.cli.print.pattern import pattern
 from locatk.cli.print.tag import tag
 from locatk.cli.print.test_sheet import testsheet
 
 
-@click.group(short_help="Draw sheets at true size.")
+@click.group(cls=Group, short_help="Draw sheets at true size.")
 def command() -> None:
     """Draw sheets at true size.
 

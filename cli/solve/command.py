@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
+from locatk.cli.command import Command, section
+from locatk.cli.solve import text as solve_text
+
+if TYPE_CHECKING:
+    from locatk.formats.pipeline import Outcome, SolveJob
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
+
+BAR_CHARACTERS = 30
+"""Length of the progress bar of a batch."""
 
 scene_option = click.option(
     "--scene",
     type=click.Choice(SCENES),
     default=None,
-    help="Lighthouse: stations and geometry to assume. [default: auto, decided from the data]",
+    help="Lighthouse: assumed number and geometry of stations. [default: auto, from the data]",
 )
 
 
 class TemplateResolution(click.ParamType):
-    """Orientations, lateral offsets and points of templates, kept as ``36,5,80``."""
+    """Numbers of orientations, lateral offsets and points of templates, as in ``36,5,80``."""
 
     name = "resolution"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the three numbers without spaces."""
         numbers = [number.strip() for number in str(value).split(",")]
         if len(numbers) != 3 or not all(number.isdecimal() for number in numbers):
             self.fail(f"{value!r} is not of the form 36,5,80", param, ctx)
@@ -36,71 +47,81 @@ speed_option = click.option(
     "--speed",
     type=click.FloatRange(min=0, min_open=True, max=100),
     metavar="M/S",
-    help="Polaris: speed of the array over the tags, where it is known.",
+    help="Polaris: speed of the array over the tags, if it is known.",
 )
 
 templates_option = click.option(
     "--templates",
     type=TemplateResolution(),
     metavar="ORIENTATIONS,OFFSETS,POINTS",
-    help="Polaris, --method paper: resolution of the templates, in numbers. Orientations per "
-    "360 deg, lateral offsets within half a sensor spacing to either side, and points per "
-    "template, which extends one tag spacing before and behind the magnet. [default: 36,5,80]",
+    help="Polaris, --method paper: resolution of the templates. Orientations per 360 deg, lateral "
+    "offsets within half a sensor spacing to either side, and points per template, which extends "
+    "one tag spacing before and behind the magnet. [default: 36,5,80]",
 )
 
 
 def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
-    """Callback: a number of processes; 0 for one a core."""
+    """Convert a number of processes; 0 stands for one per core."""
     if value != "auto" and not value.isdecimal():
-        raise click.BadParameter("give a number, or auto for one a core")
+        raise click.BadParameter("give a number, or auto for one per core")
     return 0 if value == "auto" else int(value)
 
 
-@click.command(short_help="Solve recorded sessions into poses.")
+@click.command(cls=Command, short_help="Solve recorded sessions into poses.")
 @click.argument("sessions", nargs=-1, required=True)
 @click.option(
     "-o",
     "--output",
     metavar="PATH",
-    help="Solution to write (.mcap), or the folder for those of several sessions; a URL, too. "
-    "[default: <session>-solved.mcap beside each session]",
+    help="Solution to write (.mcap), or folder for the solutions of several sessions; also a URL. "
+    "[default: <session>-solved.mcap in the folder of each session]",
 )
 @options.method
-@scene_option
-@options.artifact
-@options.input_option(
-    "--camera",
-    metavar="FILE",
-    help="Dots: the camera (.toml) to use instead of the session's.",
-)
-@speed_option
-@templates_option
-@click.option(
-    "--save-scene",
-    type=options.PATH,
-    metavar="FILE",
-    help="Lighthouse: write the solved scene as an artifact (.toml) too, for --artifact.",
-)
-@click.option(
-    "--jobs",
-    metavar="N",
-    default="1",
-    callback=_jobs,
-    help="Sessions to solve at a time; 0 or auto for one a core.  [default: 1]",
-)
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Solve on the Dask cluster of this scheduler, tcp://host:8786 (extra locatk[dask]).",
-)
-@click.option(
-    "--resume",
-    is_flag=True,
-    help="Leave out what is solved: from the same session with the same options and version. "
-    "Outdated solutions are replaced.",
-)
 @options.overwrite
-@options.json_flag("A JSON object a session, each on a line")
+@section(
+    "Input",
+    options.artifact,
+    options.input_option(
+        "--camera",
+        metavar="FILE",
+        help="Dots: camera (.toml) to use instead of the session's.",
+    ),
+    scene_option,
+    speed_option,
+    templates_option,
+)
+@section(
+    "Output",
+    click.option(
+        "--save-scene",
+        type=options.PATH,
+        metavar="FILE",
+        help="Lighthouse: also write the solved scene (.toml), for --artifact.",
+    ),
+)
+@section(
+    "Batch",
+    click.option(
+        "--jobs",
+        metavar="N",
+        default="1",
+        callback=_jobs,
+        help="Sessions to solve at a time; 0 or auto for one per core.  [default: 1]",
+    ),
+    click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Solve on the Dask cluster of this scheduler, as tcp://host:8786 (extra "
+        "locatk[dask]).",
+    ),
+    click.option(
+        "--resume",
+        is_flag=True,
+        help="Skip sessions that are solved with the same options and version; replace outdated "
+        "solutions.",
+    ),
+)
+@options.json_flag("One JSON object per session, each on a line,")
 @options.verbosity
 def command(
     sessions: tuple[str, ...],
@@ -120,14 +141,14 @@ def command(
 ) -> None:
     """Solve SESSIONS and write the poses to OUTPUT.
 
-    SESSIONS are files, folders (each *.mcap in them that is no solution), patterns in quotes,
+    SESSIONS are files, folders (all *.mcap in them except solutions), patterns in quotes,
     and URLs such as s3://bucket/day/*.mcap (extra locatk[s3]). A session that fails does not
-    stop the others. With --json there is one line a session, in the order of the sessions.
+    stop the others. With --json, the lines are in the order of the sessions.
 
-    The exit status is 3 where a session could not be solved, a device in it has no pose, a
-    tag was not read, a robot does not know where on the map it is or met a landmark that is
-    not the map's, or more frames or moments of sweeps gave no pose than gave one; the rest is
-    written all the same.
+    The exit status is 3 if a session could not be solved or is only solved in part: a device
+    without a pose, an unread tag, a robot that is not localised on the map, a landmark that
+    differs from the map, or more frames or epochs without a pose than with one. The other
+    results are written.
 
     \b
     Examples:
@@ -136,58 +157,175 @@ def command(
       locatk solve first.mcap -o solved.mcap --save-scene scene.toml
       locatk solve day/*.mcap -o solved/ --artifact scene.toml
       locatk solve day/ -o solved/ --jobs auto --resume --json
-      locatk solve "s3://bucket/day/*.mcap" -o s3://bucket/solved --scheduler tcp://host:8786
+      locatk solve "s3://lab/day/*.mcap" -o s3://lab/out --scheduler tcp://host:8786
       locatk solve frames.mcap -o solved.mcap --camera camera.toml
       locatk solve pass.mcap -o solved.mcap --artifact tag.toml --speed 0.105
-      locatk solve pass.mcap -o solved.mcap --speed 0.105 --method paper --templates 72,9,80
+      locatk solve pass.mcap --speed 0.105 --method paper --templates 72,9,80
       locatk solve drive.mcap -o solved.mcap --artifact map.toml --method field
     """
-    from locatk.cli.solve import jobs as solve_batch
-    from locatk.cli.solve.batch import solve_all
-    from locatk.cli.systems import Request, check_given
-    from locatk.formats.pipeline.discovery import find_sessions
+    from locatk.formats import pipeline
 
     if scheduler is not None and jobs != 1:
         raise click.UsageError("--jobs is for this machine: leave it out with --scheduler.")
     if save_scene is not None and resume:
-        raise click.UsageError("--save-scene does not go with --resume.")
-    found = find_sessions(sessions, solve_batch.beside if output is None else None)
-    for place in found.passed_over:
-        console.detail(f"Passed over {place}: a solution")
+        raise click.UsageError("--save-scene cannot be combined with --resume.")
+    found = pipeline.find_sessions(sessions, pipeline.default_output if output is None else None)
+    for location in found.skipped_solutions:
+        console.detail(f"Skipped {location}: a solution")
     names = found.sessions
     if save_scene is not None:
-        check_scene(names)
-    outputs = solve_batch.plan_outputs(names, output, many=found.many)
-    aside = [path for path in (artifact, camera) if path is not None]
-    solve_batch.guard_outputs(
-        outputs, [*names, *map(str, aside)], overwrite=overwrite, resume=resume
-    )
+        _check_scene(names)
+    input_files = [path for path in (artifact, camera) if path is not None]
+    try:
+        outputs = pipeline.plan_outputs(names, output, is_folder=found.has_folder)
+        pipeline.check_outputs(
+            outputs, [*names, *map(str, input_files)], overwrite=overwrite, resume=resume
+        )
+    except pipeline.OutputConflictError as error:
+        raise click.UsageError(error.message) from None
     if save_scene is not None:
-        given = [Path(name) for name in names]
-        options.guard_output(save_scene, overwrite=overwrite, inputs=[*given, *aside])
+        inputs = [*map(Path, names), *input_files]
+        options.guard_output(save_scene, overwrite=overwrite, inputs=inputs)
 
-    request = Request(method, scene, artifact, camera, speed, templates)
+    request = pipeline.SolveRequest(method, scene, artifact, camera, speed, templates)
     if len(names) > 1:
-        check_given(request)
-    work = solve_batch.plan(
+        pipeline.check_artifacts(request)
+    work = pipeline.plan_jobs(
         names,
         outputs,
         request,
         overwrite=overwrite,
         resume=resume,
-        detections=as_json,
-        save_scene=save_scene,
-        travels=scheduler is not None,
+        scene_output=save_scene,
+        is_remote=scheduler is not None,
     )
-    solve_all(work, workers=jobs, scheduler=scheduler, as_json=as_json)
+    solve = _solve_one if len(work) == 1 else _solve_several
+    solve(work, as_json, workers=jobs, scheduler=scheduler)
 
 
-def check_scene(sessions: Sequence[str]) -> None:
-    """Refuse --save-scene for what solves no scene."""
-    from locatk.formats.pipeline import locations as places
+def _check_scene(sessions: Sequence[str]) -> None:
+    """Refuse --save-scene for systems that do not estimate a scene."""
+    from locatk.formats.pipeline import locations, systems
 
     if len(sessions) > 1:
         raise click.UsageError("--save-scene needs exactly one session.")
-    system = places.facts_of(sessions[0]).get("system")
-    if system in ("dots", "landmarks", "polaris"):
-        raise click.UsageError(f"--save-scene is for lighthouse: {system} solves no scene.")
+    name = locations.read_facts(sessions[0]).get("system", "")
+    system = systems.SYSTEMS.get(name)
+    if isinstance(system, systems.System) and not system.estimates_scene:
+        raise click.UsageError(f"--save-scene is for lighthouse: {name} estimates no scene.")
+
+
+def _solve_one(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> None:
+    """Solve one session; its error or its first loss is the result of the command."""
+    from locatk.formats import pipeline
+
+    with console.working("Solving"):
+        [outcome] = [
+            outcome for _, ready in pipeline.solve_batch(jobs, **workers) for outcome in ready
+        ]
+    if isinstance(outcome, pipeline.SolveFailure):
+        console.detail(outcome.traceback.rstrip())
+        raise outcome.error
+    _print_outcome(outcome, jobs[0], as_json)
+    losses = _losses(outcome)
+    for loss in losses[1:]:
+        console.warn(loss)
+    if losses:
+        raise failures.Incomplete(losses[0])
+
+
+def _solve_several(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> None:
+    """Solve sessions, print each outcome, and raise if there were failures or losses.
+
+    Raises
+    ------
+    click.ClickException
+        No session could be solved.
+    Incomplete
+        Some sessions could not be solved completely.
+    """
+    from locatk.formats import pipeline
+
+    total, printed, failed, incomplete = len(jobs), 0, 0, 0
+    progress = _BatchProgress(total, as_json)
+    try:
+        progress.show(0)
+        with contextlib.closing(pipeline.solve_batch(jobs, **workers)) as outcomes:
+            for done, ready in outcomes:
+                progress.erase()
+                for outcome in ready:
+                    _print_outcome(outcome, jobs[printed], as_json)
+                    losses = _losses(outcome)
+                    for loss in losses:
+                        console.warn(loss)
+                    is_failure = isinstance(outcome, pipeline.SolveFailure)
+                    failed += is_failure
+                    incomplete += bool(losses) and not is_failure
+                    printed += 1
+                progress.show(done)
+    except KeyboardInterrupt:
+        progress.erase()
+        console.say(
+            f"Interrupted after {printed} of {total} sessions. Hint: Repeat the command with "
+            "--resume to solve the others."
+        )
+        raise
+    progress.erase()
+    if failed == total:
+        raise click.ClickException(f"none of the {total} sessions could be solved")
+    if failed or incomplete:
+        parts = [f"{failed} of {total} sessions could not be solved"] if failed else []
+        parts += [f"{incomplete} of {total} are solved in part"] if incomplete else []
+        raise failures.Incomplete(", ".join(parts))
+
+
+def _print_outcome(outcome: Outcome, job: SolveJob, as_json: bool) -> None:
+    """Print the result of one session, without its losses."""
+    from locatk.formats import pipeline
+
+    if isinstance(outcome, pipeline.SolveFailure):
+        if as_json:
+            error = outcome.error
+            failure = {"session": outcome.session, "error": error.message, "hint": error.hint}
+            console.emit_json({"version": 1, "sessions": [failure]})
+        if outcome.traceback:
+            console.detail(outcome.traceback.rstrip())
+        return
+    if as_json:
+        entry = solve_text.json_entry(outcome)
+        if job.resume:
+            entry["resumed"] = outcome.is_resumed
+        console.emit_json({"version": 1, "sessions": [entry]})
+    console.result(solve_text.text(outcome))
+    for note in solve_text.notes(outcome):
+        console.say(note)
+
+
+def _losses(outcome: Outcome) -> list[str]:
+    """Return a line for each loss of a session, or its error."""
+    from locatk.formats import pipeline
+
+    if isinstance(outcome, pipeline.SolveFailure):
+        return [failures.describe(outcome.error)]
+    return [f"{outcome.session}: {loss.message}" for loss in outcome.losses]
+
+
+class _BatchProgress:
+    """Progress bar on the last line of a terminal, erased before results are printed."""
+
+    def __init__(self, total: int, as_json: bool) -> None:
+        is_terminal = console.talks() and sys.stderr.isatty()
+        self._is_shown = is_terminal and not (as_json and sys.stdout.isatty())
+        self._total = total
+
+    def show(self, done: int) -> None:
+        """Show the number of finished sessions."""
+        if self._is_shown:
+            full = BAR_CHARACTERS * done // self._total
+            bar = "#" * full + "-" * (BAR_CHARACTERS - full)
+            click.echo(f"\rSolving  [{bar}]  {done}/{self._total}", err=True, nl=False)
+
+    def erase(self) -> None:
+        """Erase the bar."""
+        if self._is_shown:
+            console.erase_line()

@@ -1,4 +1,4 @@
-"""Results of ``locatk solve`` for one session, as a JSON object and as text."""
+"""Reports of ``locatk solve``, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -7,64 +7,95 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console
-from locatk.cli.solve import detections_text as seen
 
 if TYPE_CHECKING:
-    from locatk.cli.systems import Solved
+    from locatk.formats.pipeline import SolveReport
+
+MAX_LANDMARKS = 40
+"""Number of landmarks listed as text; ``--json`` lists all."""
 
 
-def entry(session: str | Path, output: str | Path, solved: Solved) -> dict[str, Any]:
-    """Return the object of one session in ``--json`` (docs/commands.md)."""
+def json_entry(report: SolveReport) -> dict[str, Any]:
+    """Return the object of one session in ``--json`` (docs/formats.md)."""
     from locatk.core.solution import to_json
 
-    solution = solved.solution
     return {
-        "session": session,
-        "system": solution.system,
-        "method": solution.method,
-        "output": output,
-        "poses": solution.poses,
-        "rejected": solution.rejected,
-        "solve_s": solved.solve_s,
-        "detections": to_json(solution.detections),
-        **({"facts": to_json(solution.facts) or {}} if solution.system == "landmarks" else {}),
+        "session": report.session,
+        "system": report.system,
+        "method": report.method,
+        "output": report.output,
+        "poses": report.poses,
+        "rejected": report.rejected,
+        "solve_s": report.solve_s,
+        "detections": to_json(report.detections),
+        **({"facts": to_json(report.facts) or {}} if report.system == "landmarks" else {}),
     }
 
 
-def text(session: str | Path, output: str | Path, solved: Solved) -> str:
-    """Format one session as text: a line, a table of devices, and the rejected observations."""
-    solution = solved.solution
-    # A scene that nothing measured has no metres.
-    unit = "1e-3" if getattr(solution.artifact, "scale", None) == "unit" else "mm"
-    sigmas = [f"sigma {axis} [{unit}]" for axis in "xyz"]
-    header = ("device", "poses", *sigmas, "sigma heading [deg]")
-    rows = [(t.device, len(t), *_spread(t.sigma)) for t in solution.trajectories]
+def text(report: SolveReport) -> str:
+    """Format a summary line, the detections, a table of devices, and the rejected observations."""
+    duration = "solved before" if report.solve_s is None else f"{report.solve_s:.3g} s"
     rejected = ", ".join(
-        f"{count} {reason.replace('_', ' ')}" for reason, count in solution.rejected.items()
+        f"{count} {reason.replace('_', ' ')}" for reason, count in report.rejected.items()
     )
-    saw = seen.seen(solution)
-    took = "solved before" if math.isnan(solved.solve_s) else f"{solved.solve_s:.3g} s"
-    return "\n".join(
-        [
-            f"{session} -> {output}: {solution.poses} poses, {solution.system} by "
-            f"{solution.method}, {took}",
-            *([saw] if saw else []),
-            *([console.table(header, rows)] if rows else []),
-            f"rejected: {rejected or 'nothing'}",
-        ]
+    summary = (
+        f"{report.session} -> {report.output}: {report.poses} poses, {report.system} by "
+        f"{report.method}, {duration}"
     )
+    parts = [
+        summary,
+        _detection_table(report),
+        _device_table(report),
+        console.wrapped(f"rejected: {rejected or 'nothing'}"),
+    ]
+    return "\n".join(part for part in parts if part)
 
 
-def notes(session: str | Path, solved: Solved) -> list[str]:
-    """Return the remarks that a user of the poses needs; with ``--json`` too, on stderr."""
-    return [f"{Path(session).name}: {each.message}" for each in solved.solution.warnings]
+def notes(report: SolveReport) -> list[str]:
+    """Return the warnings of the solver, which are printed on stderr even with ``--json``."""
+    return [f"{Path(report.session).name}: {warning.message}" for warning in report.warnings]
 
 
-def _spread(sigma: Any) -> list[str]:
-    """Return median standard deviations: x, y, z in mm and heading in degrees, `-` if unknown."""
-    import numpy as np
+def _device_table(report: SolveReport) -> str:
+    """Format number of poses and median standard deviations of each device, `-` if unknown."""
+    from locatk.core.natural_order import natural_key
 
-    in_units = sigma[:, [0, 1, 2, 5]] * [1e3, 1e3, 1e3, 180 / np.pi]
-    known = [column[np.isfinite(column)] for column in in_units.T]
-    # Of lighthouse these are millimetres, of dots a thousandth of that.
-    return [f"{np.median(column):#.3g}" if len(column) else "-" for column in known]
+    if not report.devices:
+        return ""
+    # The positions of a scene without scale are not in metres.
+    unit = "mm" if report.is_metric else "1e-3"
+    factors = (1e3, 1e3, 1e3, 180 / math.pi)
+    header = (
+        "device",
+        "poses",
+        *(f"sigma {axis} [{unit}]" for axis in "xyz"),
+        "sigma heading [deg]",
+    )
+    rows = [
+        (
+            device.device,
+            device.poses,
+            # Of Lighthouse these are millimetres, of dots a thousandth of that.
+            *(
+                "-" if math.isnan(sigma) else f"{factor * sigma:#.3g}"
+                for sigma, factor in zip(device.median_sigma, factors, strict=True)
+            ),
+        )
+        for device in sorted(report.devices, key=lambda device: natural_key(device.device))
+    ]
+    return console.table(header, rows)
+
+
+def _detection_table(report: SolveReport) -> str:
+    """Format the detected tags or landmarks; empty for the other systems."""
+    from locatk.formats.report import detection_tables
+
+    if report.system not in ("polaris", "landmarks") or not report.detections:
+        return ""
+    if report.system == "polaris":
+        detected = detection_tables.tags(report.detections)
+    else:
+        detected = detection_tables.landmarks(report.detections, MAX_LANDMARKS)
+    table = console.table(detected.header, detected.rows)
+    more = f"\n... and {detected.more} more: see --json" if detected.more else ""
+    return f"{table}{more}"

@@ -17,7 +17,7 @@ from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts.maps import attached_map as read_map
-from locatk.formats.artifacts.receiver import read_receivers
+from locatk.formats.artifacts.receiver import read_receivers, receiver_attachments
 from locatk.formats.artifacts.scene import SCENE_FILE, dumps_scene
 from locatk.formats.artifacts.scene import attached_scene as read_scene
 from locatk.formats.artifacts.sheets import attached_camera as read_camera

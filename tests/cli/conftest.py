@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from locatk.cli import systems
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.recording import Sweeps
@@ -24,6 +23,7 @@ from locatk.core.lighthouse.results import StationDetection
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
+from locatk.formats.pipeline import systems
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.reader import Session
 
@@ -96,14 +96,14 @@ def session(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def requests(monkeypatch: pytest.MonkeyPatch) -> list[systems.Request]:
+def requests(monkeypatch: pytest.MonkeyPatch) -> list[systems.SolveRequest]:
     """Put a solver in place that answers with the truth, 1 mm off; gives what it was asked.
 
     A session called `still` is refused, in `blind` the robot is never seen.
     """
-    asked: list[systems.Request] = []
+    asked: list[systems.SolveRequest] = []
 
-    def solve(session: Session, request: systems.Request) -> systems.Solved:
+    def solve(session: Session, request: systems.SolveRequest) -> systems.SolvedSession:
         asked.append(request)
         name = Path(session.path).stem
         if name.startswith("still"):
@@ -131,7 +131,7 @@ def requests(monkeypatch: pytest.MonkeyPatch) -> list[systems.Request]:
             artifact=SCENE,
             warnings=(SolverWarning("generic_calibration", "generic calibration"),),
         )
-        return systems.Solved(solution, 0.25)
+        return systems.SolvedSession(solution, 0.25)
 
     monkeypatch.setitem(systems.SYSTEMS, "lighthouse", solve)
     return asked

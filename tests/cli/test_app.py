@@ -18,7 +18,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from locatk.cli import app as app_module
-from locatk.cli import console, failures
+from locatk.cli import calibrate, console, failures
 from locatk.cli.app import COMMANDS, app
 from locatk.core import errors
 
@@ -70,10 +70,18 @@ def test_examples_are_valid_usage(path: tuple[str, ...], monkeypatch: pytest.Mon
     console.reset()
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_table_agrees_with_commands(name: str) -> None:
-    module, short = COMMANDS[name]
-    assert importlib.import_module(module).command.short_help == short
+TABLES = [
+    (name, module, short)
+    for table in (COMMANDS, calibrate.COMMANDS)
+    for name, (module, short) in table.items()
+]
+
+
+@pytest.mark.parametrize(("name", "module", "short"), TABLES, ids=[row[0] for row in TABLES])
+def test_table_agrees_with_commands(name: str, module: str, short: str) -> None:
+    command = importlib.import_module(module).command
+    assert command.short_help == short
+    assert name in (command.name, module.rsplit(".", 1)[-1].rstrip("_"), module.split(".")[2])
 
 
 @pytest.mark.slow
@@ -165,7 +173,7 @@ def failing(error: BaseException) -> Callable[..., Result]:
             ZeroDivisionError("division by zero"),
             1,
             "Error: internal error, ZeroDivisionError: division by zero. Hint: Please report "
-            "it, with the traceback that -v shows.\n",
+            "it, with the traceback from -v.\n",
         ),
         (
             failures.Incomplete("2 sessions are unsolved"),
@@ -176,7 +184,7 @@ def failing(error: BaseException) -> Callable[..., Result]:
         (
             click.UsageError("Two are too many."),
             2,
-            "Error: Two are too many. Hint: `locatk broken --help` shows how to use it.\n",
+            "Error: Two are too many. Hint: See `locatk broken --help`.\n",
         ),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
@@ -206,7 +214,7 @@ def test_wrong_usage_is_one_line(locatk: Run) -> None:
         assert result.exit_code == 2, args
         assert result.stderr.startswith("Error: ")
         assert len(result.stderr.splitlines()) == 1
-        assert "--help` shows" in result.stderr
+        assert "Hint: See `locatk " in result.stderr
 
 
 def test_no_arguments_show_help(locatk: Run) -> None:

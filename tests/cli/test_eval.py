@@ -113,10 +113,10 @@ def test_json_says_all(locatk, run: Path, found: Path) -> None:
 
 
 def test_text_says_it_in_words(locatk, run: Path, found: Path, tmp_path: Path) -> None:
-    text = locatk("eval", found, "--truth", run, "--delta", "0.5m").stdout
+    text = locatk("eval", found, "--truth", run, "--delta", "0.5m", "--full").stdout
     for line in (
-        "RPE: of poses 0.5m apart",
-        "alignment: none, fitted on nothing",
+        "RPE: between poses at a distance of 0.5m",
+        "alignment: none\n",
         "association: interpolate",
         "time offset: 0.0000 s (none)",
         "not scored: nothing",
@@ -128,8 +128,21 @@ def test_text_says_it_in_words(locatk, run: Path, found: Path, tmp_path: Path) -
         assert line in text, line
     assert "APE [mm]" in text
     bold = solution(tmp_path / "bold.mcap", solved(factor=3.0))
-    said = locatk("eval", bold, "--truth", run).stdout
+    said = locatk("eval", bold, "--truth", run, "--full").stdout
     assert re.search(r"covariances are too small: errors are (2\.9|3|3\.1) times as large", said)
+
+
+def test_the_default_text_is_short(locatk, run: Path, found: Path) -> None:
+    """Verdict, APE, RPE and coverage; assumptions only if they are not the default ones."""
+    lines = locatk("eval", found, "--truth", run).stdout.splitlines()
+    assert lines[0].startswith("Half of 600 poses are within ")
+    assert lines[1].split() == ["device", "error", "n", "rmse", "mean", "median", "p95", "max"]
+    assert [line.split()[1] for line in lines[2:6]] == ["APE", "APE", "RPE", "RPE"]
+    assert lines[6:] == ["coverage: 100.0 % (29.9 of 29.9 s)", "alignment: none"]
+    aligned = locatk("eval", found, "--truth", run, "--align", "sim2", "--offset", "0.1").stdout
+    assert "alignment: sim2, fitted on the scored poses (scale " in aligned
+    assert "time offset: 0.1000 s" in aligned
+    assert "not scored: " in aligned
 
 
 def test_points_have_no_rotation(locatk, tmp_path: Path) -> None:
@@ -139,9 +152,9 @@ def test_points_have_no_rotation(locatk, tmp_path: Path) -> None:
     )
     run, found = session(tmp_path / "a.mcap", point), solution(tmp_path / "b.mcap", point)
     assert answer(locatk, found, "--truth", run)["ape"]["rotation_deg"] is None
-    lines = locatk("eval", found, "--truth", run).stdout.splitlines()
-    assert "covariances are too large: errors are less than 0.01 times as large" in lines[-1]
-    assert "[deg]" not in "\n".join(lines)
+    full = locatk("eval", found, "--truth", run, "--full").stdout
+    assert "covariances are too large: errors are less than 0.01 times as large" in full
+    assert "[deg]" not in full + locatk("eval", found, "--truth", run).stdout
 
 
 def test_one_device_of_another_name_is_told(locatk, run: Path, found: Path, tmp_path: Path) -> None:
@@ -149,7 +162,7 @@ def test_one_device_of_another_name_is_told(locatk, run: Path, found: Path, tmp_
     other = solution(tmp_path / "other.mcap", replace(solved(), device="robot"))
     done = locatk("eval", other, "--truth", run)
     assert done.exit_code == 0
-    assert "robot is compared with red, the only one there" in done.stderr
+    assert "robot is compared with red, the only other device" in done.stderr
     assert "compared" not in locatk("eval", other, "--truth", run, "--pair", "robot=red").stderr
 
 
@@ -161,7 +174,7 @@ def test_devices_of_other_names(locatk, tmp_path: Path) -> None:
     found = solution(tmp_path / "b.mcap", *gateway)
     refused = locatk("eval", found, "--truth", run)
     assert refused.exit_code == 1
-    assert "--pair NAME=NAME which of 785b, dffa is which of blue, red" in refused.stderr
+    assert "--pair NAME=NAME: one of 785b, dffa, and one of blue, red" in refused.stderr
     said = answer(locatk, found, "--truth", run, "--pair", "785b=red", "--pair", "dffa=blue")
     assert said["max_m"] < 1e-9
     assert set(said["devices"]) == {"785b", "dffa"}
@@ -186,7 +199,7 @@ def test_any_file_on_either_side(locatk, run: Path, found: Path, tmp_path: Path)
                                      "interpolate")  # fmt: skip
     backward = locatk("eval", run, "--truth", found, "--json")
     assert json.loads(backward.stdout)["rmse_m"] == pytest.approx(expected)
-    assert "holds no solved poses" in backward.stderr
+    assert "has no solved poses" in backward.stderr
 
 
 def test_kitti_is_compared_row_by_row(locatk, tmp_path: Path) -> None:
@@ -198,15 +211,17 @@ def test_kitti_is_compared_row_by_row(locatk, tmp_path: Path) -> None:
 
 
 def test_several_devices_have_rows_of_their_own(locatk, tmp_path: Path) -> None:
-    run = session(tmp_path / "run.mcap", unknown(drive("blue")), unknown(drive("red")))
-    found = solution(tmp_path / "solved.mcap", solved("blue"), solved("red"), solved("green"))
+    """In natural order of their names."""
+    names = ("robot-10", "robot-2")
+    run = session(tmp_path / "run.mcap", *(unknown(drive(name)) for name in names))
+    found = solution(tmp_path / "solved.mcap", *map(solved, (*names, "green")))
     result = locatk("eval", found, "--truth", run)
     assert "no truth for green" in result.stderr
     assert [line.split()[0] for line in result.stdout.splitlines()[2:14]] == (
-        ["all"] * 4 + ["blue"] * 4 + ["red"] * 4
+        ["all"] * 4 + ["robot-2"] * 4 + ["robot-10"] * 4
     )
     said = answer(locatk, found, "--truth", run)
-    assert said["n"] == 2 * said["devices"]["red"]["n"] == 2 * N
+    assert said["n"] == 2 * said["devices"]["robot-2"]["n"] == 2 * N
 
 
 def test_clocks_months_apart(locatk, run: Path, tmp_path: Path) -> None:
@@ -279,7 +294,8 @@ def test_one_pose_has_an_error_all_the_same(locatk, tmp_path: Path) -> None:
     (tmp_path / "b.txt").write_text(TUM)
     said = answer(locatk, tmp_path / "a.txt", "--truth", tmp_path / "b.txt")
     assert (said["n"], said["max_m"], said["rpe"]["translation_m"]) == (1, 0.5, None)
-    assert "drift: -" in locatk("eval", tmp_path / "a.txt", "--truth", tmp_path / "b.txt").stdout
+    full = locatk("eval", tmp_path / "a.txt", "--truth", tmp_path / "b.txt", "--full").stdout
+    assert "drift: -" in full
 
 
 def test_tum_files_need_no_scipy_and_no_session(tmp_path: Path) -> None:
@@ -314,7 +330,7 @@ def test_a_single_pose_and_what_comes_late_are_said_in_words(
 ) -> None:
     one, late = tmp_path / "one.csv", tmp_path / "late.csv"
     write_csv(one, [solved().select(np.arange(N) == 5)])
-    assert "The one pose with truth lies" in locatk("eval", one, "--truth", run).stdout
+    assert "The only pose with truth has an error of" in locatk("eval", one, "--truth", run).stdout
     write_csv(late, [solved(late_ns=-5_000_000_000_000)])
     said = locatk("eval", late, "--truth", run).stderr
     assert "starts 5000.000 s before the truth" in said

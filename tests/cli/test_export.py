@@ -180,7 +180,7 @@ def test_what_does_not_go_is_said_in_one_line(locatk, solved: Path, tmp_path: Pa
     unknown = locatk("export", solved, "--format", "csv", "--device", "blue", "-o", out)
     assert unknown.exit_code == 1
     assert unknown.stderr.count("\n") == 1
-    assert "There are red" in unknown.stderr
+    assert "The devices are red" in unknown.stderr
     assert locatk("export", solved, "--format", "csv", "--covariance", "-o", out).exit_code == 2
     assert locatk("export", solved, "--format", "csv", "-o", solved, "--overwrite").exit_code == 1
     assert locatk("export", solved, "--format", "xlsx", "-o", out).exit_code == 2

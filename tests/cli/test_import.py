@@ -174,8 +174,9 @@ def test_what_was_heard_goes_into_the_session(locatk, tmp_path: Path, asked: lis
     said = [" ".join(line.split()) for line in result.stderr.splitlines()]
     assert said == [
         "40 sweeps of 1 device (wand)",
-        "channel id period ppm sweeps decoded calibration OOTX frames damaged",
-        "1 4cc60647 958985.25 -15.38 40 95.2 % factory 11 1",
+        "OOTX",
+        "channel id period ppm sweeps decoded calibration frames damaged",
+        "1 4cc60647 958985 -15.38 40 95.2 % factory 11 1",
         "5 - 947000 - 3 - - 0 0",
         "Warning: the end is cut off",
     ]

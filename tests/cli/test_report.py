@@ -10,17 +10,17 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from locatk.cli import systems
 from locatk.cli.eval.command import ALIGNMENTS
 from locatk.cli.report import plan
 from locatk.core.evaluation import ALIGNMENTS as CORE
+from locatk.formats.pipeline import systems
 
 Locatk = Callable[..., Result]
 Record = Callable[..., Path]
 
 
 @pytest.fixture
-def solution(session: Path, requests: list[systems.Request], locatk: Locatk) -> Path:
+def solution(session: Path, requests: list[systems.SolveRequest], locatk: Locatk) -> Path:
     """`run.mcap`, solved into `solved.mcap` beside it."""
     path = session.with_name("solved.mcap")
     assert locatk("solve", session, "-o", path).exit_code == 0

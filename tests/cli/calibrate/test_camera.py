@@ -61,7 +61,8 @@ def test_a_session_in_a_camera_out(locatk, tilted: Path, tmp_path: Path) -> None
     assert list(table) == ["focal length", "centre x", "centre y", "radial"]
     assert [row[-1] for row in table.values()] == ["frames"] * 4
     assert float(table["centre x"][2]) == pytest.approx(camera.centre_px[0], abs=1e-3)
-    assert "px with this one; it draws the corners in by 4.3 %" in lines[6]
+    assert lines[6].startswith("residual of the dots: ")
+    assert lines[7] == "distortion of the corners: 4.3 %"
     assert lines[-1] == "skipped: nothing"
     assert result.stderr == ""
 
@@ -114,7 +115,7 @@ def test_untilted_frames_leave_the_focal_length_open(locatk, upright: Path, tmp_
     out = tmp_path / "camera.toml"
     result = locatk("calibrate", "camera", upright, "-o", out, "--json")
     assert result.exit_code == 3
-    assert "Incomplete: The focal length is not known" in result.stderr
+    assert "Incomplete: the focal length cannot be estimated" in result.stderr
     assert "--focal-px" in result.stderr
     assert "do not tell the focal length: they are not tilted enough" in result.stderr
     answer = json.loads(result.stdout)

@@ -79,17 +79,17 @@ def test_sessions_in_a_map_as_built_out(locatk, runs: list[Path], tmp_path: Path
     assert all(built.visits == 2 for built in floor.built.values())
     lines = result.stdout.splitlines()
     assert lines[0] == "6 landmarks as built against their design, 2 flagged:"
-    table = [line.split() for line in lines[1:8]]
-    assert table[0][0] == "landmark"
+    table = [line.split() for line in lines[2:9]]  # Two lines of titles.
+    assert table[0][0] == "cell"
     assert [row[0] for row in table[1:]] == ["0,0", "0,1", "0,2", "1,0", "1,1", "1,2"]
     built = floor.built[0, 2]
     assert table[3][1:4] == ["2", f"{1e3 * built.x_m:+.2f}", f"{1e3 * built.y_m:+.2f}"]
     assert table[3][-1] == "displaced"
     assert (table[5][6], table[5][-1]) == ("NNSS", "flipped:2")  # designed NNNS
-    assert lines[8] == "never visited: 0,3 1,3 2,0 2,1 2,2 2,3"
-    assert lines[9] == f"Wrote {out}"
+    assert lines[9] == "never visited: 0,3 1,3 2,0 2,1 2,2 2,3"
+    assert lines[10] == f"Wrote {out}"
     assert "1 landmark differs from the design; the map is still unique" in result.stderr
-    assert all(len(line) <= 100 for line in lines[:9])
+    assert all(len(line) <= 80 for line in lines[:10])
 
 
 @pytest.mark.slow
@@ -148,7 +148,7 @@ def test_recordings_that_cannot_be_used_are_named(
     assert left_out == {
         str(quiet): "no landmark was detected",
         str(lost): "no odometry of robot",
-        str(strange): "another map than in the first session",
+        str(strange): "the map differs from that of the first session",
     }
     for path in left_out:
         assert path in result.stderr
@@ -162,7 +162,7 @@ def test_the_map_may_be_given_and_must_be_there(
     bare, out = write(tmp_path / "bare.mcap", sound, floor=None), tmp_path / "built.toml"
     result = locatk("calibrate", "map", bare, "-o", out)
     assert result.exit_code == 1
-    assert f"Error: no map in {bare}" in result.stderr
+    assert f"Error: the session has no map in {bare}" in result.stderr
     assert "--artifact" in result.stderr
     assert not out.exists()
     given = tmp_path / "map.toml"

@@ -90,14 +90,14 @@ def test_capture_in_json_has_numbers(locatk, tmp_path: Path) -> None:
 
 
 def test_capture_for_people(locatk, tmp_path: Path) -> None:
-    text = locatk("info", live(tmp_path / "run.mcap")).stdout
+    text = " ".join(locatk("info", live(tmp_path / "run.mcap")).stdout.split())
     for words in (
-        "capture:  polaris-array on /dev/ttyACM0, as car, part 2, ended: Ctrl-C",
+        "capture: polaris-array on /dev/ttyACM0, as car, part 2, ended: Ctrl-C",
         "received: 1.08 MB (108 kB/s), 10000 frames (1000/s), at most 4.1 kB waited",
-        "losses:   3 bad frames, 324 bytes in no frame, 1 gap, 1.5 s without connection",
-        "clock:    drift -3.25 ppm, restarts 0",
-        "note:     third lap",
-        "meta:     robot = 07",
+        "losses: 3 bad frames, 324 bytes outside of frames, 1 gap, 1.5 s without connection",
+        "clock: drift -3.25 ppm, restarts 0",
+        "note: third lap",
+        "meta: robot = 07",
     ):
         assert words in text, words
     assert "serial_number" in text  # in the table
@@ -108,8 +108,8 @@ def test_capture_for_people(locatk, tmp_path: Path) -> None:
 def test_a_recording_that_lost_nothing_says_so(locatk, tmp_path: Path) -> None:
     path = live(tmp_path / "run.mcap", {"bytes": "1000", "frames": "10", "bad": "0"})
     text = locatk("info", path).stdout
-    assert "losses:   none" in text
-    assert "received: 1 kB, 10 frames" in text
+    assert "losses:    none" in text
+    assert "received:  1 kB, 10 frames" in text
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_a_large_session_of_magnetometers(locatk, tmp_path: Path, monkeypatch) -
     for key in ("sensors", "position_mm", "noise_ut", "sensor"):
         assert after[key] == before[key]
     text = locatk("info", path).stdout
-    assert "not read: the samples, which" in text
+    assert "not read:  the samples (" in text
 
 
 def test_a_large_session_that_does_not_count(locatk, tmp_path: Path, large: None) -> None:

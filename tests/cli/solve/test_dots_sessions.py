@@ -308,7 +308,7 @@ def test_a_session_without_a_manifest(locatk, folder: Path, manifest: Path, tmp_
     ("options", "status", "words"),
     [
         (["--method", "bundle"], 1, "no method 'bundle' for dots"),
-        (["--scene", "two-3d"], 1, "--scene means nothing to dots"),
+        (["--scene", "two-3d"], 1, "--scene is not an option of dots"),
         (["--save-scene", "scene.toml"], 2, "--save-scene is for lighthouse"),
     ],
 )
@@ -324,7 +324,10 @@ def test_options_that_are_for_lighthouse(
 
 @pytest.mark.parametrize(
     ("option", "words"),
-    [("--method", "no method 'lattice' for lighthouse"), ("--camera", "--camera means nothing")],
+    [
+        ("--method", "no method 'lattice' for lighthouse"),
+        ("--camera", "--camera is not an option of lighthouse"),
+    ],
 )
 def test_options_that_are_for_dots(
     locatk, record, camera: Path, tmp_path: Path, option: str, words: str

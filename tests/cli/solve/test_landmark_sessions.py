@@ -222,8 +222,9 @@ def test_info_tells_samples_sensors_and_map(locatk, tmp_path: Path) -> None:
     assert facts["patterns"]["NSNS"] == 2
     assert facts["map"] == ["75.", "035"]
     text = locatk("info", run).stdout
-    assert "2 rows x 3 columns 200 mm apart, lab, alphabet 16, window L, 1 without a" in text
-    assert "front 25,0  left 0,25  rear -25,0  right 0,-25" in text
+    words = " ".join(text.split())
+    assert "2 rows x 3 columns 200 mm apart, lab, alphabet 16, window L, 1 without a" in words
+    assert all(words.count(f" {sensor}") for sensor in ("front 25,0", "left 0,25", "rear -25,0"))
     # Seen from above: the row of the least y is the lowest.
     drawn = text.splitlines()
     assert drawn[drawn.index("  1  035") + 1] == "  0  75."
@@ -235,7 +236,7 @@ def test_info_tells_artifacts(locatk, tmp_path: Path) -> None:
     assert (facts["kind"], facts["pitch_mm"], facts["walls"]) == ("map", 200, 1)
     (built,) = facts["built"]
     assert (built["cell"], built["x_mm"], built["flags"]) == ([1, 1], 2, ["missing:2"])
-    text = locatk("info", path).stdout
+    text = " ".join(locatk("info", path).stdout.split())
     assert "30 x 10 x 5 mm, 1.2 T, 25 mm from the centre, 12 mm below the sensors" in text
     assert "missing:2" in text
 
@@ -393,12 +394,17 @@ def test_a_long_drive_is_not_listed_whole(locatk, solver: Solver, tmp_path: Path
 @pytest.mark.parametrize(
     ("facts", "seen", "poses", "words"),
     [
-        (told(False), [detection(None)], 0, "not localised: the likeliest place has a probability"),
-        (told(False, landmarks_seen=0), [], 0, "robot is not localised: no landmark was seen"),
+        (
+            told(False),
+            [detection(None)],
+            0,
+            "not localised: the likeliest position has a probability",
+        ),
+        (told(False, landmarks_seen=0), [], 0, "robot is not localised: no landmark was detected"),
         (told(False, probability=None), [], 0, "robot is not localised."),
         (None, [], 0, "no pose at all"),
-        (told(), [detection((0, 0), "misread")] * 2, 5, "2 landmarks are not those of the map"),
-        (told(), [detection(None, "no_landmark")], 5, "1 sighting refused (no landmark)"),
+        (told(), [detection((0, 0), "misread")] * 2, 5, "2 landmarks differ from the map"),
+        (told(), [detection(None, "no_landmark")], 5, "1 landmark refused (no landmark)"),
     ],
 )
 def test_what_is_left_unsolved_is_a_loss(
@@ -434,9 +440,9 @@ def test_without_a_map_there_is_no_place(locatk, solver: Solver, tmp_path: Path)
     ("args", "status", "words"),
     [
         (("--method", "joint"), 1, "no method 'joint' for landmarks"),
-        (("--speed", 0.1), 1, "--speed means nothing to landmarks"),
-        (("--scene", "auto"), 1, "--scene means nothing to landmarks"),
-        (("--camera", "run.mcap"), 1, "--camera means nothing to landmarks"),
+        (("--speed", 0.1), 1, "--speed is not an option of landmarks"),
+        (("--scene", "auto"), 1, "--scene is not an option of landmarks"),
+        (("--camera", "run.mcap"), 1, "--camera is not an option of landmarks"),
         (("--save-scene", "s.toml"), 2, "--save-scene is for lighthouse"),
         (("--artifact", "bad.toml"), 1, "bad.toml:map.rows[1]"),
     ],

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from click.testing import Result
 
+from locatk.formats.pipeline import SolvedSession, SolveFailure, SolveReport, SolveRequest, solving
 from locatk.formats.pipeline.provenance import source_facts
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution
@@ -29,9 +30,9 @@ SONAR = '''
 import os, signal, time
 from pathlib import Path
 
-from locatk.cli.systems import Solved
 from locatk.core.errors import DegenerateError
 from locatk.core.solution import Solution
+from locatk.formats.pipeline import SolvedSession
 from locatk.formats.sessions.observations import read_truth
 
 class Deadly(tuple):
@@ -60,7 +61,8 @@ def solve(session, request):
         raise ZeroDivisionError("by nought")
     # Warnings are walked through while the solution is written: the file is half there.
     warnings = {"deadly": Deadly, "slow": Slow}.get(name, tuple)()
-    return Solved(Solution("sonar", "echo", tuple(read_truth(session)), warnings=warnings), 0.5)
+    solution = Solution("sonar", "echo", tuple(read_truth(session)), warnings=warnings)
+    return SolvedSession(solution, 0.5)
 '''
 
 
@@ -172,7 +174,7 @@ def test_what_else_lies_in_a_folder(
         a, pipe, odd = entries(result.stdout)
         assert a["poses"] > 0
         assert pipe["error"] == "not a regular file"
-        assert odd["error"] == "its name is not UTF-8"
+        assert odd["error"] == "the file name is not UTF-8"
         (tmp_path / f"out{number}" / "a.mcap").unlink()
     twice = locatk("solve", "day/a.mcap", "day/round/a.mcap", "-o", "twice", "--json")
     assert len(entries(twice.stdout)) == 1
@@ -193,7 +195,7 @@ def test_beside_the_sessions_by_default(
     assert read_solution(folder / "a-solved.mcap").poses == 20
     result = locatk("solve", folder, "-v")  # a solution is there already
     assert result.exit_code == 1
-    assert f"Passed over {folder / 'a-solved.mcap'}: a solution\n" in result.stderr
+    assert f"Skipped {folder / 'a-solved.mcap'}: a solution\n" in result.stderr
     assert "a-solved.mcap' exists. Hint: Add --overwrite" in result.stderr
     assert locatk("solve", folder, "--overwrite").exit_code == 0
     everything = sorted(folder.glob("*.mcap"))  # as a shell expands it
@@ -345,28 +347,29 @@ def test_an_attempt_thought_lost_does_no_harm(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker that nobody hears from any more writes the output all the same, meanwhile."""
-    from locatk.cli import systems
-    from locatk.cli.solve import jobs as solve_batch
-
     [session] = day("a")
     out = tmp_path / "a.mcap"
-    [job] = solve_batch.plan([str(session)], [str(out)], systems.Request(), travels=False)
-    solve = systems.solve_session
+    job = solving.plan_job(str(session), str(out), SolveRequest())
+    solve = solving.solve_session
 
-    def twice(path: Path, request: systems.Request) -> systems.Solved:
-        monkeypatch.setattr(systems, "solve_session", solve)
-        assert "error" not in solve_batch.solve_file(job)
+    def twice(path: Path, request: SolveRequest) -> SolvedSession:
+        monkeypatch.setattr(solving, "solve_session", solve)
+        assert isinstance(solving.run_job(job), SolveReport)
         return solve(path, request)
 
-    monkeypatch.setattr(systems, "solve_session", twice)
-    answer = solve_batch.solve_file(job)
-    assert "error" not in answer
-    assert answer["entry"]["poses"] == 20
+    monkeypatch.setattr(solving, "solve_session", twice)
+    report = solving.run_job(job)
+    assert isinstance(report, SolveReport)
+    assert report.poses == 20
     whole = out.read_bytes()
-    assert solve_batch.solve_file(job)["entry"]["solve_s"] is None  # once more, afterwards
+    again = solving.run_job(job)  # once more, afterwards
+    assert isinstance(again, SolveReport)
+    assert again.solve_s is None
     assert out.read_bytes() == whole
     out.write_text("precious")
-    assert "exists" in solve_batch.solve_file(job)["entry"]["error"]
+    failure = solving.run_job(job)
+    assert isinstance(failure, SolveFailure)
+    assert "exists" in failure.error.message
     assert out.read_text() == "precious"
 
 
@@ -410,7 +413,8 @@ def test_an_interrupt_leaves_what_is_whole(
     assert batch.returncode == 130
     assert stdout.count(" -> ") == 2  # z is solved, but its turn has not come
     assert stderr == (
-        "Interrupted after 2 of 4 sessions. Hint: The same command with --resume does the rest.\n"
+        "Interrupted after 2 of 4 sessions. Hint: Repeat the command with --resume to solve the "
+        "others.\n"
         "\nAborted\n"
     )
     if jobs == 2:
@@ -533,9 +537,9 @@ def test_who_does_not_answer_is_named(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="dask is not installed")
-    from locatk.formats.pipeline import pools
+    from locatk.formats.pipeline import execution
 
-    monkeypatch.setattr(pools, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(execution, "SCHEDULER_TIMEOUT_S", 0.5)
     sessions = day("a", "b")
     address = f"tcp://127.0.0.1:{free_port()}"
     result = locatk("solve", *sessions, "-o", tmp_path / "out", "--scheduler", address)
@@ -652,7 +656,7 @@ def test_s3_places(
     assert locatk("solve", "s3://lab/day/a.mcap").exit_code == 0  # beside it
     again = locatk("solve", "s3://lab/day", "--overwrite", "-v")
     assert again.exit_code == 0, again.stderr
-    assert "Passed over s3://lab/day/a-solved.mcap: a solution" in again.stderr
+    assert "Skipped s3://lab/day/a-solved.mcap: a solution" in again.stderr
     assert locatk("solve", "s3://lab/day/a.mcap", "-o", tmp_path / "a.mcap").exit_code == 0
     assert (tmp_path / "a.mcap").read_bytes() == bucket.cat_file("lab/day/a-solved.mcap")
     assert locatk("solve", session, "-o", "s3://lab/new.mcap").exit_code == 0
@@ -660,11 +664,11 @@ def test_s3_places(
     for output in ("s3://nobucket/new.mcap", "s3://nobucket/out/"):
         refused = locatk("solve", session, "-o", output)
         assert refused.exit_code == 1
-        assert refused.stderr.startswith("Error: no bucket 'nobucket' to write into. Hint: ")
+        assert refused.stderr.startswith("Error: the bucket 'nobucket' does not exist. Hint: ")
     for place, words in (
         ("s3://lab/day/none.mcap", "No such object in s3://lab/day/none.mcap"),
         ("s3://lab/other/", "no *.mcap in s3://lab/other/"),
-        ("s3://lab/x*.mcap", "nothing matches s3://lab/x*.mcap"),
+        ("s3://lab/x*.mcap", "no file matches s3://lab/x*.mcap"),
         ("s3://nobucket/a.mcap", "s3://nobucket/a.mcap"),
         ("s5://lab/a.mcap", "s5"),
     ):

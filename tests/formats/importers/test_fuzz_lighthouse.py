@@ -49,7 +49,7 @@ from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.lighthouse import ImportedSession
 from locatk.formats.importers.saleae.recording import read_capture, read_saleae
-from locatk.formats.sessions import observations
+from locatk.formats.sessions import lighthouse_description, observations
 from locatk.formats.sessions import station_reports as heard
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
@@ -412,8 +412,7 @@ def records(rng: np.random.Generator, folder: Path, further: bool) -> None:
     if further:
         path.write_bytes(damaged(path.read_bytes(), entries, rng))
     session = Session.open(path, damaged_ok=True)
-    info_lighthouse.recording(session)
-    info_lighthouse.station_table(info_lighthouse.recording(session)["stations"])
+    info_lighthouse.station_table(lighthouse_description.recording(session)["stations"])
     observations.read_station_reports(session)
     observations.read_receivers(session)
 

@@ -1,4 +1,4 @@
-"""What a solution was made from."""
+"""Origin of solutions: digests, recognition of the same solution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.pipeline import provenance as made
+from locatk.formats.pipeline import SolveRequest, provenance
 from locatk.formats.sessions.solutions import write_solution
 
 START_NS = 1_700_000_000_000_000_000
@@ -32,53 +32,61 @@ def solution(poses: int = 3) -> Solution:
 
 
 def test_source_facts_are_those_of_sha256sum(source: Path) -> None:
-    facts = made.source_facts(source)
+    facts = provenance.source_facts(source)
     digest = hashlib.sha256(source.read_bytes()).hexdigest()
     assert facts == {"source": "run.mcap", "source_bytes": "2304000", "source_sha256": digest}
     os.utime(source, (1, 1))
     (source.parent / "copy").mkdir()
     copy = Path(shutil.copy(source, source.parent / "copy"))
-    assert made.source_facts(copy) == facts
+    assert provenance.source_facts(copy) == facts
 
 
 def test_options_count_by_their_content(tmp_path: Path) -> None:
     artifact = tmp_path / "tag.toml"
     artifact.write_text("a = 1")
-    digest = made.options_digest({"method": "paper", "artifact": artifact, "speed": None})
+    digest = provenance.options_digest(SolveRequest(method="paper", artifact=artifact))
     moved = artifact.rename(tmp_path / "other.toml")
-    assert made.options_digest({"artifact": moved, "method": "paper"}) == digest
+    assert provenance.options_digest(SolveRequest(method="paper", artifact=moved)) == digest
     moved.write_text("a = 2")
-    changed = made.options_digest({"method": "paper", "artifact": moved})
-    others = [made.options_digest(asked) for asked in ({}, {"method": "paper"}, {"speed": 0.1})]
+    changed = provenance.options_digest(SolveRequest(method="paper", artifact=moved))
+    requests = (SolveRequest(), SolveRequest(method="paper"), SolveRequest(speed=0.1))
+    others = [provenance.options_digest(request) for request in requests]
     assert len({digest, changed, *others}) == 5
 
 
+def test_digests_of_earlier_versions_stay_valid() -> None:
+    """Otherwise --resume would solve every session again."""
+    request = SolveRequest("paper", speed=0.1)
+    known = hashlib.sha256(b'{"method": "paper", "speed": 0.1}').hexdigest()
+    assert provenance.options_digest(request) == known
+
+
 def test_the_same_solution_is_known_again(source: Path, tmp_path: Path) -> None:
-    facts = {**made.source_facts(source), "options_sha256": "0"}
+    facts = {**provenance.source_facts(source), "options_sha256": "0"}
     out = tmp_path / "solved.mcap"
-    assert made.same_solution(out, facts) is None
+    assert provenance.same_solution(out, facts) is None
     write_solution(out, solution(), source=source, facts=facts)
-    found = made.same_solution(out, facts)
+    found = provenance.same_solution(out, facts)
     assert found is not None
     assert found.poses == 3
     for name in facts:
-        assert made.same_solution(out, {**facts, name: "other"}) is None
-    assert made.same_solution(source, facts) is None
+        assert provenance.same_solution(out, {**facts, name: "other"}) is None
+    assert provenance.same_solution(source, facts) is None
     whole = out.read_bytes()
     out.write_bytes(whole[:-50])
-    assert made.same_solution(out, facts) is None
+    assert provenance.same_solution(out, facts) is None
 
 
 def test_only_our_own_is_replaced(source: Path, tmp_path: Path) -> None:
     out = tmp_path / "solved.mcap"
     write_solution(out, solution(), source=source)
-    assert made.is_ours(out, "run.mcap")
-    assert not made.is_ours(out, "walk.mcap")
+    assert provenance.is_replaceable(out, "run.mcap")
+    assert not provenance.is_replaceable(out, "walk.mcap")
     whole = out.read_bytes()
     out.write_bytes(whole[:-50])
-    assert made.is_ours(out, "run.mcap")
+    assert provenance.is_replaceable(out, "run.mcap")
     out.write_bytes(b"")
-    assert made.is_ours(out, "run.mcap")
+    assert provenance.is_replaceable(out, "run.mcap")
     out.write_text("precious")
-    assert not made.is_ours(out, "run.mcap")
-    assert not made.is_ours(tmp_path / "absent", "run.mcap")
+    assert not provenance.is_replaceable(out, "run.mcap")
+    assert not provenance.is_replaceable(tmp_path / "absent", "run.mcap")

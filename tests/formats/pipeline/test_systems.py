@@ -1,4 +1,4 @@
-"""What the solver of Lighthouse is given of a session."""
+"""Systems: the input of the Lighthouse solver, options, sessions of unknown systems."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.cli.systems import SYSTEMS, Request, solve_session
 from locatk.core import lighthouse
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import Calibration
@@ -18,10 +17,30 @@ from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Marker, Scene
 from locatk.core.solution import Solution, SolverWarning
 from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.pipeline import SYSTEMS, SolveRequest, solve_session
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.reader import Session
 
 OF_SOLVER = SolverWarning("test", "of the solver")
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    """A session of the device `red` with one marker."""
+    path, n = tmp_path / "run.mcap", 40
+    sweeps = Sweeps(
+        devices=("red",),
+        time_ns=1_700_000_000_000_000_000 + 50_000_000 * np.arange(n),
+        device=np.zeros(n, np.int32),
+        sensor=np.zeros(n, np.int32),
+        channel=np.ones(n, np.int32),
+        polynomial=np.full(n, -1, np.int32),
+        sweep=np.full(n, -1, np.int32),
+        count=40_000.0 + np.arange(n),
+    )
+    scene = Scene(markers=(Marker("corner", np.zeros(3)),))
+    observations.write_session(path, system="lighthouse", sweeps=sweeps, scene=scene)
+    return path
 
 
 @pytest.fixture
@@ -44,7 +63,7 @@ def sweeps_of(session: Path, sensors: int) -> Sweeps:
 
 
 def test_a_plain_session(session: Path, given: dict[str, Any]) -> None:
-    solution = solve_session(session, Request()).solution
+    solution = solve_session(session, SolveRequest()).solution
     assert [marker.name for marker in given["scene"].markers] == ["corner"]
     assert "receivers" not in given
     assert solution.warnings == (OF_SOLVER,)
@@ -56,7 +75,7 @@ def test_one_photodiode_is_no_rigid_device(
 ) -> None:
     path, sweeps = tmp_path / "light.mcap", sweeps_of(session, sensors)
     observations.write_session(path, system="lighthouse", sweeps=sweeps, receivers={"red": DECK})
-    solve_session(path, Request())
+    solve_session(path, SolveRequest())
     assert ("receivers" in given) == rigid
 
 
@@ -82,7 +101,7 @@ def test_receivers_and_what_stations_sent(
             ids={2: 0xC},
         ),
     )
-    solution = solve_session(path, Request(artifact=room)).solution
+    solution = solve_session(path, SolveRequest(artifact=room)).solution
     scene = given["scene"]
     assert [marker.name for marker in scene.markers] == ["new"]
     assert {c: each.source for c, each in scene.calibrations.items()} == {
@@ -99,5 +118,5 @@ def test_receivers_and_what_stations_sent(
 
 @pytest.mark.parametrize("system", ["lighthouse", "dots", "landmarks"])
 def test_templates_are_for_polaris(system: str) -> None:
-    with pytest.raises(InputError, match=f"--templates means nothing to {system}"):
-        SYSTEMS[system](None, Request(templates="36,5,80"))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=f"--templates is not an option of {system}"):
+        SYSTEMS[system](None, SolveRequest(templates="36,5,80"))  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Places: what paths and URLs name, and what is left at them."""
+"""Locations: names of paths and URLs, reading and writing, sessions in folders."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError, LocatkError, MissingDataError, OutputExistsError
 from locatk.formats.output import atomic_write
-from locatk.formats.pipeline import locations as places
-from locatk.formats.pipeline.discovery import find_sessions
+from locatk.formats.pipeline import locations
+from locatk.formats.pipeline.locations import find_sessions
 
 
 @pytest.mark.parametrize(
-    ("place", "url", "name"),
+    ("location", "is_url", "name"),
     [
         ("run.mcap", False, "run.mcap"),
         ("/a/b c/run.mcap", False, "run.mcap"),
@@ -27,39 +27,39 @@ from locatk.formats.pipeline.discovery import find_sessions
         ("a://b", False, "b"),
     ],
 )
-def test_names(place: str, url: bool, name: str) -> None:
-    assert places.is_url(place) is url
-    assert places.name_of(place) == name
+def test_names(location: str, is_url: bool, name: str) -> None:
+    assert locations.is_url(location) is is_url
+    assert locations.file_name(location) == name
 
 
-def test_neighbours() -> None:
-    assert places.beside("s3://b/day/run.mcap", "x.mcap") == "s3://b/day/x.mcap"
-    assert places.beside("day/run.mcap", "x.mcap") == "day/x.mcap"
-    assert places.within("s3://b/out/", "x.mcap") == "s3://b/out/x.mcap"
-    assert places.within("out", "x.mcap") == "out/x.mcap"
-    assert places.absolute("s3://b/run.mcap") == "s3://b/run.mcap"
-    assert places.absolute("run.mcap") == str(Path.cwd() / "run.mcap")
+def test_siblings_and_folders() -> None:
+    assert locations.sibling("s3://b/day/run.mcap", "x.mcap") == "s3://b/day/x.mcap"
+    assert locations.sibling("day/run.mcap", "x.mcap") == "day/x.mcap"
+    assert locations.within("s3://b/out/", "x.mcap") == "s3://b/out/x.mcap"
+    assert locations.within("out", "x.mcap") == "out/x.mcap"
+    assert locations.absolute("s3://b/run.mcap") == "s3://b/run.mcap"
+    assert locations.absolute("run.mcap") == str(Path.cwd() / "run.mcap")
 
 
 def test_a_local_file_is_itself(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with places.local(str(path)) as found:
+    with locations.local(str(path)) as found:
         assert found == path
 
 
-def test_parts_of_one_output_are_removed(tmp_path: Path) -> None:
+def test_partial_files_of_one_output_are_removed(tmp_path: Path) -> None:
     name = "x" * 60 + ".mcap"
     other = tmp_path / ".x.mcap.0123abcd.part"
     other.touch()
     output = atomic_write(tmp_path / name)
     output.__enter__().write(b"half")
     assert len(list(tmp_path.iterdir())) == 2
-    places.remove_parts(str(tmp_path / name))  # as after its process was killed
+    locations.remove_partial_files(str(tmp_path / name))  # as after its process was killed
     assert list(tmp_path.iterdir()) == [other]
     with pytest.raises(LocatkError):
         output.__exit__(None, None, None)
-    places.remove_parts(str(tmp_path / "absent" / name))
-    places.remove_parts(f"s3://bucket/{name}")
+    locations.remove_partial_files(str(tmp_path / "absent" / name))
+    locations.remove_partial_files(f"s3://bucket/{name}")
 
 
 def test_urls_of_any_file_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,27 +67,27 @@ def test_urls_of_any_file_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     path = tmp_path / "run.mcap"
     path.write_bytes(b"data")
     url = (tmp_path / "store" / "deep" / "run.mcap").as_uri()
-    places.put(path, url)
+    locations.upload(path, url)
     assert (tmp_path / "store" / "deep" / "run.mcap").read_bytes() == b"data"
     with pytest.raises(OutputExistsError):
-        places.put(path, url)
+        locations.upload(path, url)
     path.write_bytes(b"newer")
-    places.put(path, url, overwrite=True)
+    locations.upload(path, url, overwrite=True)
     assert [p.name for p in (tmp_path / "store" / "deep").iterdir()] == ["run.mcap"]
-    with places.local(url) as copy:
+    with locations.local(url) as copy:
         assert copy.name == "run.mcap"
         assert copy.read_bytes() == b"newer"
     assert not copy.exists()
     with (
         pytest.raises(MissingDataError, match="No such object in file://"),
-        places.local(url + "x"),
+        locations.local(url + "x"),
     ):
         pass
     with pytest.raises(InputError, match="web"):
-        places.check("https://host/run.mcap", overwrite=True)
+        locations.check_writable("https://host/run.mcap", overwrite=True)
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(LocatkError, match="s3://") as missing:
-        places.exists("s3://bucket/key")
+        locations.exists("s3://bucket/key")
     assert missing.value.hint == 'Install it: pip install "locatk[s3]"'
 
 

@@ -1,4 +1,4 @@
-"""The engine: every job has one result, whatever dies."""
+"""Execution of jobs: each has one result, even if processes die."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ from types import ModuleType
 
 import pytest
 
-from locatk.formats.pipeline import pools
-from locatk.formats.pipeline.engine import Lost, Pool, in_order, run
+from locatk.formats.pipeline.execution import (
+    LostJob,
+    Pool,
+    in_order,
+    processes,
+    run_jobs,
+    this_process,
+)
 
 JOBS = """
 import os, signal, time
@@ -54,15 +60,15 @@ def calls(folder: Path, number: int) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pool", [pools.serial(), pools.processes(3)], ids=["serial", "processes"])
+@pytest.mark.parametrize("pool", [this_process(), processes(3)], ids=["serial", "processes"])
 def test_each_job_has_its_result(module: ModuleType, tmp_path: Path, pool: Pool) -> None:
     kinds = ["late", "", "raise", "", "late", ""]
     jobs = [(tmp_path, number, how) for number, how in enumerate(kinds)]
-    results = dict(run(module.work, jobs, pool))
+    results = dict(run_jobs(module.work, jobs, pool))
     assert results == {
         0: 0,
         1: 1,
-        2: Lost("ValueError: no good", "Please report it"),
+        2: LostJob("ValueError: no good", "Please report it"),
         3: 9,
         4: 16,
         5: 25,
@@ -75,10 +81,10 @@ def test_a_deadly_job_takes_no_other_along(module: ModuleType, tmp_path: Path) -
     kinds = ["late", "deadly", "late", "", "once", "exit", "", ""]
     jobs = [(tmp_path, number, how) for number, how in enumerate(kinds)]
     cleaned: list[int] = []
-    found = list(run(module.work, jobs, pools.processes(2), clean=lambda j: cleaned.append(j[1])))
+    found = list(run_jobs(module.work, jobs, processes(2), clean=lambda j: cleaned.append(j[1])))
     assert sorted(number for number, _ in found) == list(range(8))  # nothing lost, nothing twice
     results = dict(found)
-    died = Lost("its process died 2 times")
+    died = LostJob("its process died 2 times")
     assert [n for n, result in results.items() if result == died] == [1, 5]
     assert {n: r for n, r in results.items() if r != died} == {n: n * n for n in (0, 2, 3, 4, 6, 7)}
     assert {1, 4, 5} <= set(cleaned)
@@ -92,7 +98,7 @@ def test_workers_have_our_environment_but_one_thread(
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.setenv("LOCATK_TEST", "later than the server that forks")
     names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LOCATK_TEST"]
-    found = dict(run(module.environment, names, pools.processes(1)))
+    found = dict(run_jobs(module.environment, names, processes(1)))
     assert found == {0: "1", 1: "1", 2: "later than the server that forks"}
     assert os.environ["OMP_NUM_THREADS"] == "7"
 
@@ -100,7 +106,7 @@ def test_workers_have_our_environment_but_one_thread(
 def test_an_interrupt_ends_the_workers(module: ModuleType, tmp_path: Path) -> None:
     jobs = [(tmp_path, 0, ""), (tmp_path, 1, "late"), (tmp_path, 2, "late"), (tmp_path, 3, "late")]
     cleaned: list[int] = []
-    results = run(module.work, jobs, pools.processes(2), clean=lambda job: cleaned.append(job[1]))
+    results = run_jobs(module.work, jobs, processes(2), clean=lambda job: cleaned.append(job[1]))
     next(results)
     with pytest.raises(KeyboardInterrupt):
         results.throw(KeyboardInterrupt())
@@ -108,6 +114,6 @@ def test_an_interrupt_ends_the_workers(module: ModuleType, tmp_path: Path) -> No
     assert 1 in cleaned
 
 
-def test_results_are_told_in_order() -> None:
+def test_results_are_yielded_in_order() -> None:
     came = iter([(2, "c"), (0, "a"), (3, "d"), (1, "b")])
     assert list(in_order(came)) == [(1, []), (2, ["a"]), (3, []), (4, ["b", "c", "d"])]

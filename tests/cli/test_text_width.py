@@ -1,0 +1,162 @@
+"""Text of the commands: lines of 80 columns, sections of options, suggestions for typos."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from locatk.cli import console
+from locatk.cli.app import app
+
+Run = Callable[..., Result]
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(app, [str(arg) for arg in args], prog_name="locatk")
+
+
+def too_wide(text: str) -> list[str]:
+    return [line for line in text.splitlines() if len(line) > console.TEXT_COLUMNS]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A working folder with one short session of each system, so that paths are short."""
+    path, before = tmp_path_factory.mktemp("text"), Path.cwd()
+    os.chdir(path)
+    try:
+        assert run("map", "design", "4x4", "-o", "map.toml").exit_code == 0
+        assert run("tag", "design", "--id", 77, "-o", "tag.toml").exit_code == 0
+        for system, options in (
+            ("lighthouse", ("--duration", 3, "--robots", 2)),
+            ("dots", ("--frames", 3)),
+            ("polaris", ()),
+            ("landmarks", ("map.toml", "--landmarks", 3)),
+        ):
+            made = run("simulate", system, "-o", f"{system}.mcap", *options)
+            assert made.exit_code == 0, made.stderr
+            solved = run("solve", f"{system}.mcap", "-o", f"{system}-solved.mcap")
+            assert solved.exit_code in (0, 3), solved.stderr
+        yield path
+    finally:
+        os.chdir(before)
+
+
+SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(f"info {system}.mcap -v" for system in SYSTEMS),
+        *(f"info {system}-solved.mcap" for system in SYSTEMS),
+        *(f"solve {system}.mcap -o again.mcap --overwrite" for system in SYSTEMS),
+        *(f"eval {system}-solved.mcap --truth {system}.mcap" for system in SYSTEMS),
+        *(f"eval {system}-solved.mcap --truth {system}.mcap --full" for system in SYSTEMS),
+        *(f"export {system}-solved.mcap --format tum -o poses-{system}" for system in SYSTEMS),
+        "info map.toml",
+        "calibrate scene lighthouse.mcap -o scene.toml --overwrite",
+        "calibrate camera dots.mcap -o camera.toml --overwrite",
+        "calibrate tag polaris.mcap polaris.mcap -o built-tag.toml --overwrite",
+        "calibrate map landmarks.mcap -o built.toml --overwrite",
+        "demo dots -o report.html --overwrite",
+        "simulate dots --frames 2 -o new.mcap --overwrite",
+        "report dots-solved.mcap -o dots.html --overwrite",
+        "decode polaris.mcap -o decoded.mcap --overwrite",
+        "recover polaris.mcap -o recovered.mcap --overwrite",
+        "map check map.toml",
+        "map design 7x7 --alphabet 6 -o small.toml",
+        "map export map.toml -o map.csv --overwrite",
+        "tag encode 262143",
+        "print tag tag.toml --id 77 -o tag.pdf --overwrite",
+        "print pattern -o sheet.pdf --overwrite",
+        "print testsheet -o test.pdf --overwrite",
+        "print landmarks map.toml -o pack.pdf --overwrite",
+        "capture --list",
+    ],
+)
+def test_results_fit_80_columns(folder: Path, command: str) -> None:
+    result = run(*command.split())
+    assert result.exit_code != 2, result.stderr
+    assert "internal error" not in result.stderr
+    assert too_wide(result.stdout) == []
+
+
+@pytest.mark.parametrize("name", ["solve", "sovle", "evla", "calibarte", "simulat"])
+def test_a_typo_of_a_command_gets_a_suggestion(name: str) -> None:
+    result = run(name, "run.mcap")
+    meant = {"sovle": "solve", "evla": "eval", "calibarte": "calibrate", "simulat": "simulate"}
+    if name in meant:
+        assert result.exit_code == 2
+        assert f"No such command {name!r}. Did you mean {meant[name]!r}" in result.stderr
+        assert result.stderr.count("\n") == 1
+    else:
+        assert "Did you mean" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    "args", [("calibrate", "printr"), ("simulate", "polris"), ("map", "chek"), ("print", "patern")]
+)
+def test_a_typo_of_a_subcommand_gets_a_suggestion(args: tuple[str, str]) -> None:
+    result = run(*args)
+    assert result.exit_code == 2
+    assert "Did you mean" in result.stderr
+
+
+def test_a_name_like_no_other_gets_no_suggestion() -> None:
+    result = run("xyzzy")
+    assert result.stderr == "Error: No such command 'xyzzy'. Hint: See `locatk --help`.\n"
+
+
+def test_options_of_a_command_are_in_sections() -> None:
+    text = run("solve", "--help").stdout
+    titles = [line for line in text.splitlines() if line.endswith(":") and line[0] != " "]
+    assert titles == ["Options:", "Input:", "Output:", "Batch:", "General:"]
+    assert text.rindex("--json") > text.index("General:")
+
+
+LONG = "a text of many words " * 6
+
+
+def test_titles_of_a_wide_table_are_wrapped() -> None:
+    header = ("device", *(f"sigma of quantity {number} [mm]" for number in range(5)))
+    lines = console.table(header, [("red", *(["1.5"] * 5))]).splitlines()
+    assert max(map(len, lines)) <= 80
+    assert len(lines) > 2
+    assert lines[-1].split() == ["red", *(["1.5"] * 5)]
+
+
+def test_the_last_text_of_a_wide_table_is_wrapped() -> None:
+    text = console.table(("name", "n", "remark"), [("red", 1, LONG), ("blue", 2, "short")])
+    assert too_wide(text) == []
+    assert " ".join(text.split()).count("many words") == 6
+    assert text.splitlines()[-1] == "blue  2  short"
+
+
+def test_columns_of_a_very_wide_table_continue_below() -> None:
+    header = ("name", *(f"column{number}" for number in range(20)))
+    text = console.table(header, [("red", *range(100, 120)), ("blue", *range(120, 140))])
+    assert too_wide(text) == []
+    blocks = text.split("\n\n")
+    assert len(blocks) > 1
+    assert all(block.split()[0] == "name" for block in blocks)
+    values = [word for block in blocks for word in block.splitlines()[1].split()[1:]]
+    assert values == [str(number) for number in range(100, 120)]
+
+
+def test_long_values_of_labels_are_wrapped() -> None:
+    text = console.labelled([("size:", "3 MB"), ("note:", LONG)], indent=2)
+    assert too_wide(text) == []
+    assert text.splitlines()[0] == "  size:  3 MB"
+    assert text.splitlines()[2].startswith("         ")
+
+
+def test_a_path_is_never_broken() -> None:
+    path = "/folder" * 20 + "/run.mcap"
+    assert path in console.labelled([("file:", path)])
+    assert path in console.wrapped(f"wrote {path} and more")
