@@ -85,13 +85,13 @@ def _refused(seen: Sequence[TagDetection | LandmarkDetection], what: str, how: s
 
 def seen(solution: Solution) -> str | None:
     """A table of what the system saw; None where it saw nothing, or has no such table."""
-    from locatk.formats.report import detection_tables as seen_text
+    from locatk.formats.report import detections
 
     if solution.system not in ("polaris", "landmarks") or not solution.detections:
         return None
     if solution.system == "polaris":
-        found = seen_text.tags(solution.detections)
+        found = detections.tag_table(solution.detections)
     else:
-        found = seen_text.landmarks(solution.detections, MOST_LANDMARKS)
+        found = detections.landmark_table(solution.detections, MOST_LANDMARKS)
     table = console.table(found.header, found.rows)
-    return f"{table}\n... and {found.more} more: see --json" if found.more else table
+    return f"{table}\n... and {found.omitted} more: see --json" if found.omitted else table

@@ -1,4 +1,4 @@
-"""Where the bars of a floor lie, for what is drawn of it on a screen."""
+"""Bar magnets of a floor of landmarks, as drawn in figures and viewers."""
 
 from __future__ import annotations
 
@@ -11,40 +11,49 @@ from locatk.core.landmarks.map.floor import Cell, FloorMap, as_built_landmark
 
 Array = NDArray[np.float64]
 
-MOST_LANDMARKS = 2500
-"""Of a larger floor only those near the paths are drawn."""
+MAX_LANDMARKS = 2500
+"""Number of landmarks up to which a floor is drawn completely; drawing 10,000 bars takes about a
+second. Of a larger floor only the landmarks near the trajectories are drawn."""
 
-NEAR_PITCHES = 3.0
-"""How near, in pitches of the floor."""
+MAX_CELLS_FROM_PATH = 3
+"""Distance [cells] from a trajectory up to which the landmarks of a large floor are drawn."""
 
-WEAK = 0.3
-"""A bar that was found to have a lesser strength is drawn as missing."""
+MIN_BAR_STRENGTH = 0.3
+"""Strength of a bar, relative to the nominal one, below which it is drawn as weak or missing."""
 
 
-def cells_near(floor: FloorMap, paths: Sequence[Array]) -> list[Cell]:
-    """Cells with a landmark, where they are too many only those near ``paths``."""
+def cells_near(floor: FloorMap, positions_m: Sequence[Array]) -> list[Cell]:
+    """Return the cells with a landmark, of a large floor only those near trajectories.
+
+    ``positions_m`` are the positions (n, 2 or more) of each trajectory, in the frame of the map.
+    """
     cells = floor.cells()
-    if len(cells) <= MOST_LANDMARKS:
+    if len(cells) <= MAX_LANDMARKS:
         return cells
-    place = np.concatenate([path[:, :2] for path in paths]) if paths else np.zeros((0, 2))
-    place = place[np.isfinite(place).all(axis=1)]
-    column, row = np.round((place - floor.origin_m) / floor.pitch_m).T
-    met = set(zip(row.tolist(), column.tolist(), strict=True))
-    reach = np.arange(-NEAR_PITCHES, NEAR_PITCHES + 1)
-    near = {(r + dr, c + dc) for r, c in met for dr in reach for dc in reach}
+    points = [each[:, :2] for each in positions_m]
+    position = np.concatenate(points) if points else np.zeros((0, 2))
+    position = position[np.isfinite(position).all(axis=1)]
+    column, row = np.round((position - floor.origin_m) / floor.pitch_m).astype(int).T
+    visited = set(zip(row.tolist(), column.tolist(), strict=True))
+    offsets = range(-MAX_CELLS_FROM_PATH, MAX_CELLS_FROM_PATH + 1)
+    near = {(r + dr, c + dc) for r, c in visited for dr in offsets for dc in offsets}
     return [cell for cell in cells if cell in near]
 
 
 def bars_on_floor(floor: FloorMap, cell: Cell) -> tuple[Array, Array, Array]:
-    """The four bars of a cell, as built where that is known.
+    """Return the four bars of a cell, as built if that is known.
 
     Returns
     -------
-    (4, 2), (4,), (4,) ndarray
-        Their middles in the map's frame, in metres; the directions in which they are
-        magnetised; their strengths, positive where N, 0 where missing.
+    centre_m : (4, 2) ndarray
+        In the frame of the map.
+    heading_rad : (4,) ndarray
+        Direction of magnetisation.
+    strength : (4,) ndarray
+        Relative to the nominal one; positive for an N bar, 0 for a missing one.
     """
     pose, strength = as_built_landmark(floor, cell)
-    at = pose[2] + np.arange(4) * np.pi / 2
-    middles = pose[:2] + floor.geometry.radius_m * np.column_stack([np.cos(at), np.sin(at)])
-    return middles, at + np.where(strength < 0, -np.pi / 2, np.pi / 2), strength
+    bearing = pose[2] + np.arange(4) * np.pi / 2
+    radial = np.column_stack([np.cos(bearing), np.sin(bearing)])
+    centre = pose[:2] + floor.geometry.radius_m * radial
+    return centre, bearing + np.where(strength < 0, -np.pi / 2, np.pi / 2), strength

@@ -34,7 +34,7 @@ from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris import codec
 from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets, cell_positions, vertices
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots.floor_bars import WEAK, bars_on_floor, cells_near
+from locatk.formats.plots.floor_bars import MIN_BAR_STRENGTH, bars_on_floor, cells_near
 from locatk.formats.sessions.messages import timestamp
 from locatk.formats.sessions.reader import Session
 
@@ -322,7 +322,7 @@ def _landmark(floor: FloorMap, cell: Cell, time_ns: int) -> SceneEntity:
         strengths.tolist(),
         strict=True,
     ):
-        there = abs(strength) >= WEAK
+        there = abs(strength) >= MIN_BAR_STRENGTH
         color = BAR_COLORS[1 if strength > 0 else -1] if there else WEAK_COLOR
         # The map's plane is that of the bars' tops.
         below = _pose((x, y, -height / 2), quaternion)

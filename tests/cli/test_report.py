@@ -12,7 +12,7 @@ from click.testing import Result
 
 from locatk.cli import systems
 from locatk.cli.eval.command import ALIGNMENTS
-from locatk.cli.report import plan
+from locatk.cli.report import plan_outputs
 from locatk.core.evaluation import ALIGNMENTS as CORE
 
 Locatk = Callable[..., Result]
@@ -33,7 +33,7 @@ def test_a_page_is_written(solution: Path, locatk: Locatk) -> None:
     assert done.exit_code == 0, done.stderr
     assert done.stdout == f"Wrote {page}\n"
     text = page.read_text(encoding="utf-8")
-    assert "Half of the poses lie within 1.00 mm" in text
+    assert "Half of the poses are within 1.00 mm" in text
     assert "3.00" not in done.stderr
     assert "jump" in text
     assert page.stat().st_size < 12e6
@@ -83,10 +83,10 @@ def test_solutions_of_one_name_are_told_apart(
 
 def test_names_of_outputs() -> None:
     one, two = Path("a.mcap"), Path("b/a.mcap")
-    assert plan((one,), Path("r.html"), []) == (Path("r.html"), [[]])
-    assert plan((one,), Path("r.PNG"), [".png"]) == (None, [[Path("r.PNG")]])
-    assert plan((one,), Path("r.png"), [".pdf"]) == (None, [[Path("r.png"), Path("r.pdf")]])
-    assert plan((one, two), Path("x/r.svg"), []) == (
+    assert plan_outputs((one,), Path("r.html"), []) == (Path("r.html"), [[]])
+    assert plan_outputs((one,), Path("r.PNG"), [".png"]) == (None, [[Path("r.PNG")]])
+    assert plan_outputs((one,), Path("r.png"), [".pdf"]) == (None, [[Path("r.png"), Path("r.pdf")]])
+    assert plan_outputs((one, two), Path("x/r.svg"), []) == (
         None,
         [[Path("x/r-a.svg")], [Path("x/r-a-2.svg")]],
     )
@@ -146,7 +146,7 @@ def test_the_session_can_be_elsewhere(
     far = session.rename(tmp_path / "far" / "run.mcap")
     page = tmp_path / "r.html"
     assert locatk("report", solution, "-o", page).exit_code == 0
-    assert "--session FILE gives it" in page.read_text(encoding="utf-8")
+    assert "--session FILE adds them" in page.read_text(encoding="utf-8")
     assert locatk("report", solution, "-o", page, "--session", far, "--overwrite").exit_code == 0
     assert "Half of the poses" in page.read_text(encoding="utf-8")
 
@@ -165,7 +165,7 @@ def test_sessions_belong_to_solutions_by_name(
     assert text.count("Half of the poses") == 2
     done = locatk(*both, "--session", solution, "--overwrite")
     assert done.exit_code == 2
-    assert "No solution was made of" in done.stderr
+    assert "No solution is from the session" in done.stderr
 
 
 @pytest.mark.slow
@@ -173,8 +173,10 @@ def test_truth_that_fits_nothing_is_told(solution: Path, locatk: Locatk, tmp_pat
     (tmp_path / "old.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--truth", tmp_path / "old.tum")
     assert done.exit_code == 0
-    assert "No pose has truth at its time" in done.stderr
-    assert "No pose has truth at its time" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "No pose has truth of its device at its time" in done.stderr
+    assert "No pose has truth of its device at its time" in (tmp_path / "r.html").read_text(
+        encoding="utf-8"
+    )
 
 
 @pytest.mark.slow

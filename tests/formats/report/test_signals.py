@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 pytest.importorskip("plotly")
 
@@ -24,8 +24,9 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.simulation import session as polaris_simulate
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.report import signals, signals_drawing, signals_lighthouse, signals_reading
-from locatk.formats.report.panel import Panel
+from locatk.formats.report import diagrams, signals
+from locatk.formats.report.panels import Panel
+from locatk.formats.report.systems import lighthouse as lighthouse_signals
 from locatk.formats.sessions import frames, halls, observations
 from locatk.formats.sessions import magnetometers as arrays
 from locatk.formats.sessions.reader import Session
@@ -105,57 +106,6 @@ def landmarks_solution(*detections: LandmarkDetection, device: str = "robot") ->
     return Solution("landmarks", "field", (nothing,), detections=detections)
 
 
-# ---- thinning
-
-
-def test_peaks_of_a_long_signal_are_drawn() -> None:
-    rng = np.random.default_rng(1)
-    value = rng.normal(size=123_457)
-    value[[7, 60_001, 123_456]] = 50, -40, 30
-    value[1000:5000] = np.nan
-    time = np.arange(len(value)) * 0.01
-    x, y = signals_drawing.envelope(time, value)
-    assert len(x) <= 2.1 * signals_drawing.COLUMNS
-    assert {50.0, -40.0, 30.0} <= set(y.tolist())
-    assert np.all(np.diff(x) >= 0)
-    kept = np.isfinite(y)
-    assert_array_equal(value[np.round(x[kept] / 0.01).astype(int)], y[kept])
-    assert not np.any(kept & (x > 12) & (x < 48))  # nothing is drawn over what is missing
-
-
-def test_a_short_signal_stays_as_it_is_and_breaks_at_gaps() -> None:
-    time = np.r_[np.arange(10) * 0.1, 5 + np.arange(10) * 0.1]
-    x, y = signals_drawing.envelope(time, np.ones(20))
-    assert len(x) == 21
-    assert np.isnan(y[10])
-    assert_allclose(x[[9, 10, 11]], [0.9, 5, 5])
-    for n in range(3):
-        assert len(signals_drawing.envelope(np.arange(float(n)), np.arange(float(n)))[0]) == n
-
-
-def test_marks_that_hide_each_other_are_drawn_once() -> None:
-    time = np.linspace(0, 100, 50_000)
-    value = np.sin(time)
-    value[25_000] = 30.0
-    kept = signals_drawing.one_a_pixel(time, value)
-    assert len(kept) <= signals_drawing.MOST_MARKS
-    assert 25_000 in kept
-    assert_array_equal(signals_drawing.one_a_pixel(time[:10], value[:10]), np.arange(10))
-    noise = np.random.default_rng(0).normal(size=50_000)
-    assert 500 < len(signals_drawing.one_a_pixel(time, noise)) <= signals_drawing.MOST_MARKS
-    assert len(signals_drawing.one_a_pixel(np.zeros(9000), np.zeros(9000))) == 1
-
-
-def test_the_telling_detections_are_those_refused_the_least_sure_and_the_surest() -> None:
-    refused = ["", "", "a", "a", "b", "", ""]
-    sure = [0.9, 0.2, 0.0, 0.0, 0.0, 0.5, 0.99]
-    assert signals_drawing.telling(refused, sure, 4) == [1, 2, 4, 6]
-    assert signals_drawing.telling(refused, sure, 20) == [0, 1, 2, 4, 5, 6]
-    assert signals_drawing.telling([], [], 3) == []
-    assert signals_drawing.telling(["a", "b", "c", "d"], [0.0] * 4, 3) == [0]
-    assert signals_drawing.telling(["", ""], [np.nan, 1.0], 1) == [1]
-
-
 # ---- systems
 
 
@@ -166,7 +116,7 @@ def test_every_panel_has_words_and_draws_without_webgl(
     session, _ = hall_session(tmp_path / "halls.mcap")
     robot = landmarks_solution(landmark(20), landmark(50, refused="misread"))
     for recording, solution in (lighthouse, polaris, (session, robot)):
-        for panel in signals.panels(recording, solution):
+        for panel in signals.signal_panels(recording, solution):
             assert panel.title
             assert panel.note.endswith(".")
             assert {each["type"] for each in traces(panel)} <= {"scatter", "heatmap"}
@@ -178,14 +128,14 @@ def test_every_panel_has_words_and_draws_without_webgl(
 
 def test_sweeps_are_told_apart_as_the_solver_did(lighthouse: tuple[Session, Solution]) -> None:
     session, solution = lighthouse
-    found = signals.panels(session, solution)
+    found = signals.signal_panels(session, solution)
     assert [panel.title for panel in found] == ["Sweeps of robot-1", "Sweeps of robot-2"]
     left_out, no_pose = 0, 0
     for panel in found:
         names = [each["name"] for each in traces(panel)]
         assert {"channel 1", "channel 2", "poses"} <= set(names)
         for name in names:
-            if name.startswith("left out"):
+            if name.startswith("rejected"):
                 left_out += int(name.split("(")[1][:-1])
             if name.startswith("no pose"):
                 no_pose += int(name.split("(")[1][:-1])
@@ -204,15 +154,15 @@ def test_sweeps_of_several_photodiodes_belong_to_their_own_moments(
     solution = lighthouse_solver.solve(one)
     assert [each.device for each in solution.trajectories] == ["deck/0", "deck/1"]
     deck = Session.open(tmp_path / "deck.mcap")
-    (panel,) = signals.panels(deck, solution)
+    (panel,) = signals.signal_panels(deck, solution)
     assert "no signals" not in panel.note
-    held, posed = signals_lighthouse._used(one, solution)
+    held, posed = lighthouse_signals._classify(one, solution)
     assert np.count_nonzero(held & ~posed) == sum(each.rejected for each in solution.detections)
 
 
 def test_tags_are_marked_where_their_field_is(polaris: tuple[Session, Solution]) -> None:
     session, solution = polaris
-    whole, near = signals.panels(session, solution)
+    whole, near = signals.signal_panels(session, solution)
     assert whole.title == "Magnetic field along bar"
     (image,) = (each for each in whole.figure.data if each.type == "heatmap")
     assert image.z.shape[0] == 9
@@ -224,7 +174,7 @@ def test_tags_are_marked_where_their_field_is(polaris: tuple[Session, Solution])
         row = np.abs(image.y - y).argmin()
         around = image.z[row, max(0, column - 6) : column + 7]
         assert around.max() > 0.3 * np.nanmax(image.z)
-    (read,) = (each for each in whole.figure.data if each.name == "read (1)")
+    (read,) = (each for each in whole.figure.data if each.name == "identified (1)")
     assert str(solution.detections[0].tag_id) in read.text[0]
     assert len(near.figure.data) == 3 * 9
     assert "There was one." in near.note
@@ -235,8 +185,8 @@ def test_a_bar_whose_sensors_are_nowhere_is_drawn_by_numbers(
 ) -> None:
     session, solution = polaris
     monkeypatch.setattr(session, "attachment", lambda name: None)
-    whole, _ = signals.panels(session, solution)
-    assert "not known: they are numbered" in whole.note
+    whole, _ = signals.signal_panels(session, solution)
+    assert "unknown: they are numbered" in whole.note
     assert any(each.get("name") == "sensor 9" for each in traces(whole))
 
 
@@ -248,8 +198,8 @@ def test_a_dead_sensor_and_a_short_recording_are_drawn(tmp_path: Path) -> None:
         tmp_path / "run.mcap", [Samples("bar", made.array, made.time_ns[:30], field)]
     )
     nothing = Solution("polaris", "joint", ())
-    (panel,) = signals.panels(Session.open(tmp_path / "run.mcap"), nothing)
-    assert "Nothing was found in it." in panel.note
+    (panel,) = signals.signal_panels(Session.open(tmp_path / "run.mcap"), nothing)
+    assert "No magnet was detected." in panel.note
     (image,) = (each for each in panel.figure.data if each.type == "heatmap")
     assert np.isnan(image.z[4]).all()
     assert np.isfinite(np.delete(image.z, 4, axis=0)).all()
@@ -260,10 +210,10 @@ def test_halls_are_drawn_with_their_peaks_and_sightings(tmp_path: Path) -> None:
     solution = landmarks_solution(
         landmark(20), landmark(50, refused="misread"), landmark(90, cell=None, pattern=None)
     )
-    whole, near = signals.panels(session, solution)
+    whole, near = signals.signal_panels(session, solution)
     (left,) = (each for each in whole.figure.data if each.name == "left")
     assert np.nanmax(values(left)) == pytest.approx(31.0)
-    assert len(left.x) <= 2.1 * signals_drawing.COLUMNS
+    assert len(left.x) <= 2.1 * diagrams.SIGNAL_COLUMNS
     assert "Thinned" in whole.note
     (refused,) = (each for each in whole.figure.data if each.name == "refused (1)")
     assert refused.x[0] == pytest.approx(50, abs=0.01)
@@ -279,7 +229,9 @@ def test_names_of_sensors_are_no_html(tmp_path: Path) -> None:
     samples = HallSamples("robot", sensors, time_ns, np.zeros((50, 4)))
     halls.write_session(tmp_path / "run.mcap", [samples])
     bad = landmark(0.1, refused="<i>why</i>", pattern="<u>")
-    for panel in signals.panels(Session.open(tmp_path / "run.mcap"), landmarks_solution(bad)):
+    for panel in signals.signal_panels(
+        Session.open(tmp_path / "run.mcap"), landmarks_solution(bad)
+    ):
         text = panel.figure.to_json()
         assert "<b>" not in text
         assert "<i>" not in text
@@ -299,7 +251,7 @@ def test_frames_are_shown_decoded_and_rejected(tmp_path: Path, camera: bool) -> 
     frames.write_session(tmp_path / "run.mcap", [spoiled], made.manifest, camera=lens)
     options = dots_solver.SolveOptions(camera=lens)
     solution = dots_solver.solve([spoiled], made.manifest, options)
-    shown, over_time = signals.panels(Session.open(tmp_path / "run.mcap"), solution)
+    shown, over_time = signals.signal_panels(Session.open(tmp_path / "run.mcap"), solution)
     assert len(shown.pictures) == 8
     assert all(each.png.startswith(PNG) for each in shown.pictures)
     captions = [each.caption for each in shown.pictures]
@@ -336,12 +288,12 @@ def test_a_large_recording_is_drawn_in_parts_and_says_so(
         tmp_path / "run.mcap", [HallSamples("robot", HallSensors(), time_ns, field)]
     )
     session = Session.open(tmp_path / "run.mcap")
-    monkeypatch.setattr(signals_reading, "MOST_READ", 2 << 20)
-    read = signals_reading.excerpt(session, session.topics("/halls/"))
+    monkeypatch.setattr(signals, "MAX_READ_BYTES", 2 << 20)
+    read = signals.read_excerpt(session, session.topics("/halls/"))
     size = sum(map(len, read.payloads["/halls/robot"]))
     assert size < 6 << 20  # of 9.6 MB unpacked
     solution = landmarks_solution(*(landmark(at) for at in np.arange(1.0, 1999.0)))
-    whole, near = signals.panels(session, solution)
+    whole, near = signals.signal_panels(session, solution)
     assert "The recording is large" in whole.note
     front = next(each for each in whole.figure.data if each.name == "front")
     assert front.x[0] == pytest.approx(0, abs=1)
@@ -359,9 +311,9 @@ def test_damaged_parts_are_left_out_and_told(tmp_path: Path) -> None:
     middle = segment.offset + segment.length // 2
     data[middle : middle + 8] = b"\xff" * 8
     (tmp_path / "run.mcap").write_bytes(data)
-    whole, *_ = signals.panels(Session.open(tmp_path / "run.mcap"), landmarks_solution())
+    whole, *_ = signals.signal_panels(Session.open(tmp_path / "run.mcap"), landmarks_solution())
     assert f"1 of {len(session.index.segments)} parts of the recording are damaged" in whole.note
-    assert "No landmark was found in it." in whole.note
+    assert "No landmark was detected." in whole.note
 
 
 def test_a_recording_cut_short_shows_what_is_left(
@@ -372,7 +324,7 @@ def test_a_recording_cut_short_shows_what_is_left(
     for share in (0.2, 0.5, 0.9):
         (tmp_path / "cut.mcap").write_bytes(data[: int(share * len(data))])
         cut = Session.open(tmp_path / "cut.mcap", damaged_ok=True)
-        found = signals.panels(cut, solution)
+        found = signals.signal_panels(cut, solution)
         assert found
         assert all(panel.note for panel in found)
 
@@ -380,18 +332,18 @@ def test_a_recording_cut_short_shows_what_is_left(
 def test_other_recordings_say_what_they_lack(
     tmp_path: Path, polaris: tuple[Session, Solution], lighthouse: tuple[Session, Solution]
 ) -> None:
-    (panel,) = signals.panels(polaris[0], lighthouse[1])
-    assert panel.note == "No signals of lighthouse in the recording: it is one of polaris."
-    (panel,) = signals.panels(lighthouse[0], replace(lighthouse[1], system="sonar"))
+    (panel,) = signals.signal_panels(polaris[0], lighthouse[1])
+    assert panel.note == "No signals of lighthouse in the recording: it is of polaris."
+    (panel,) = signals.signal_panels(lighthouse[0], replace(lighthouse[1], system="sonar"))
     assert "'sonar' cannot be drawn" in panel.note
     for system in signals.MODULES:
         other = polaris[0] if system != "polaris" else lighthouse[0]
-        (panel,) = signals.panels(other, Solution(system, "x", ()))
+        (panel,) = signals.signal_panels(other, Solution(system, "x", ()))
         assert panel.figure is None
         assert panel.note
     session, _ = hall_session(tmp_path / "run.mcap", n=500)
-    whole, *_ = signals.panels(session, landmarks_solution(device="another"))
-    assert "The recording has no signals of another, of which the solution has poses." in whole.note
+    whole, *_ = signals.signal_panels(session, landmarks_solution(device="another"))
+    assert "The recording has no signals of another, although there are poses." in whole.note
 
 
 def test_many_devices_are_named_where_they_are_not_drawn(tmp_path: Path) -> None:
@@ -400,8 +352,10 @@ def test_many_devices_are_named_where_they_are_not_drawn(tmp_path: Path) -> None
         HallSamples(f"robot-{k}", HallSensors(), time_ns, np.zeros((50, 4))) for k in range(6)
     ]
     halls.write_session(tmp_path / "run.mcap", samples)
-    found = signals.panels(Session.open(tmp_path / "run.mcap"), Solution("landmarks", "field", ()))
-    assert len(found) == signals_reading.MOST_DEVICES
+    found = signals.signal_panels(
+        Session.open(tmp_path / "run.mcap"), Solution("landmarks", "field", ())
+    )
+    assert len(found) == signals.MAX_DEVICES
     assert "Not drawn: robot-4, robot-5." in found[0].note
 
 
@@ -413,5 +367,5 @@ def test_a_recording_that_is_gone_is_told(
     (tmp_path / "gone.mcap").write_bytes(data)
     gone = Session.open(tmp_path / "gone.mcap")
     (tmp_path / "gone.mcap").unlink()
-    (panel,) = signals.panels(gone, solution)
+    (panel,) = signals.signal_panels(gone, solution)
     assert "cannot be drawn: no such file" in panel.note
