@@ -23,7 +23,7 @@ from locatk.formats.plots.series import (
 )
 from locatk.formats.plots.shapes import COLORS, is_in_legend
 from locatk.formats.plots.units import abbreviate, format_count
-from locatk.formats.report.panels import escape, join_sentences
+from locatk.formats.report.panels import Panel, escape, join_sentences
 from locatk.formats.report.style import INK
 
 Array = NDArray[np.float64]
@@ -196,6 +196,37 @@ class Event:
         return (self.start_s + self.stop_s) / 2
 
 
+@dataclass(frozen=True)
+class Signals:
+    """Samples of several sensors, each with one or several components.
+
+    Attributes
+    ----------
+    time_s : (n,) ndarray
+        On the time axis, ascending.
+    value : (n, sensors, components) ndarray
+    names, colors : list of str
+        Of the sensors.
+    components : tuple of str
+        Titles of the value axes.
+    hover : str
+        Template of plotly for a value.
+    """
+
+    time_s: Array
+    value: NDArray[Any]
+    names: list[str]
+    colors: list[str]
+    components: tuple[str, ...]
+    hover: str
+
+    def between(self, start_s: float, stop_s: float) -> Signals:
+        """Return the samples in an interval of time."""
+        inside = (self.time_s >= start_s) & (self.time_s <= stop_s)
+        rest = (self.names, self.colors, self.components, self.hover)
+        return Signals(self.time_s[inside], self.value[inside], *rest)
+
+
 class Diagrams:
     """Grid of diagrams of signals that becomes one figure.
 
@@ -222,12 +253,19 @@ class Diagrams:
         axes = {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
         self._traces.append({"type": "scatter", "x": x, "y": y, **axes, **trace})
 
-    def add_signal(
-        self, row: int, time_s: Array, value: NDArray[Any], color: str, **trace: Any
+    def add_signals(
+        self, row: int, signals: Signals, component: int = 0, column: int = 1, **trace: Any
     ) -> None:
-        """Add a signal (n,) as a line through its extremes."""
-        x, y = envelope(time_s, value)
-        self.add(row, x, y, mode="lines", line={"color": color, "width": 1}, **trace)
+        """Add one component of all sensors as lines through its extremes."""
+        for sensor, (name, color) in enumerate(zip(signals.names, signals.colors, strict=True)):
+            x, y = envelope(signals.time_s, signals.value[:, sensor, component])
+            look = {"mode": "lines", "line": {"color": color, "width": 1}, "name": name}
+            look["legendgroup"] = name
+            self.add(row, x, y, column=column, hovertemplate=signals.hover, **look, **trace)
+
+    def limit_time(self, time_s: Array) -> None:
+        """Limit the time axes to the samples (n,) of a recording."""
+        self.figure.update_xaxes(range=[float(time_s[0]), float(time_s[-1])])
 
     def add_steps(
         self, row: int, edges: Array, value: Array, color: str, width_px: float, **trace: Any
@@ -394,86 +432,92 @@ def selection_note(shown: int, total: int, noun: str) -> str:
     )
 
 
-@dataclass(frozen=True)
-class Signals:
-    """Samples of several sensors, each with one or several components.
+def detail_panels(
+    title: str,
+    note: str,
+    signals: Signals,
+    events: Sequence[Event],
+    certainty: Sequence[float],
+    margins_s: Sequence[tuple[float, float]],
+    *,
+    noun: str,
+    limit: int,
+    row_height_px: int,
+    mark_time: bool = False,
+    **layout: Any,
+) -> list[Panel]:
+    """Return a panel of the signals around some events, none if no samples of events were read.
 
-    Attributes
+    Parameters
     ----------
-    time_s : (n,) ndarray
-        On the time axis, ascending.
-    value : (n, sensors, components) ndarray
-    names, colors : list of str
-        Of the sensors.
-    components : tuple of str
-        Titles of the value axes.
-    hover : str
-        Template of plotly for a value.
+    title, note : str
+    signals : Signals
+        Each component is drawn in a row of its own.
+    events : sequence of Event
+        Their descriptions become the titles of their diagrams.
+    certainty : sequence of float
+        Of each event, see :func:`select_details`.
+    margins_s : sequence of (float, float)
+        Drawn time before and after each event.
+    noun : str
+        Name of the events, in the plural.
+    limit : int
+        Number of events that are drawn, in up to three columns.
+    row_height_px : int
+    mark_time : bool
+        Draw a dotted line at the centre of each event.
+    **layout
+        Of the figure.
     """
-
-    time_s: Array
-    value: NDArray[Any]
-    names: list[str]
-    colors: list[str]
-    components: tuple[str, ...]
-    hover: str
-
-    def between(self, start_s: float, stop_s: float) -> Signals:
-        """Return the samples in an interval of time."""
-        inside = (self.time_s >= start_s) & (self.time_s <= stop_s)
-        rest = (self.names, self.colors, self.components, self.hover)
-        return Signals(self.time_s[inside], self.value[inside], *rest)
-
-
-def draw_details(
-    signals: Signals, events: Sequence[Event], windows_s: Sequence[tuple[float, float]]
-) -> Diagrams:
-    """Draw the signals around each event in up to three columns, each component in a row.
-
-    ``windows_s`` are start and end of the drawn time of each event. The description of an event is
-    the title of its diagrams.
-    """
+    spans = np.array([(event.start_s, event.stop_s) for event in events]).reshape(-1, 2)
+    first, stop = np.searchsorted(signals.time_s, spans.T)
+    read = np.flatnonzero(stop - first > 1).tolist()
+    refused = [events[k].refused for k in read]
+    selected = select_details(refused, [certainty[k] for k in read], limit)
+    if not selected:
+        return []
+    chosen = [read[k] for k in selected]
     components = len(signals.components)
-    columns = min(3, len(events)) if components > 1 else 3
-    bands = math.ceil(len(events) / columns)
-    titles = [""] * (bands * components * columns)
-    for k, event in enumerate(events):
-        lines = event.description
-        title = ", ".join(lines[:2]) + "<br>" + ", ".join(lines[2:])
-        titles[(k // columns * components) * columns + k % columns] = title
-    rows = bands * components
+    columns = min(3, len(chosen)) if components > 1 else 3
+    rows = math.ceil(len(chosen) / columns) * components
+    cells = [(k // columns * components + 1, k % columns + 1) for k in range(len(chosen))]
+    titles = [""] * (rows * columns)
+    for (row, column), k in zip(cells, chosen, strict=True):
+        lines = events[k].description
+        titles[(row - 1) * columns + column - 1] = (
+            ", ".join(lines[:2]) + "<br>" + ", ".join(lines[2:])
+        )
     diagrams = Diagrams(
         rows,
         columns,
         shared_xaxes="columns" if components > 1 else False,
         shared_yaxes="rows",
         horizontal_spacing=0.03,
-        vertical_spacing=0.3 / rows if components == 1 else 0.04,
+        vertical_spacing=0.04 if components > 1 else 0.3 / rows,
         subplot_titles=titles,
     )
-    for k, (start_s, stop_s) in enumerate(windows_s):
-        part = signals.between(start_s, stop_s)
-        row, column = k // columns * components + 1, k % columns + 1
-        for sensor, (name, color) in enumerate(zip(part.names, part.colors, strict=True)):
-            for component in range(components):
-                diagrams.add_signal(
-                    row + component,
-                    part.time_s,
-                    part.value[:, sensor, component],
-                    color,
-                    column=column,
-                    name=name,
-                    legendgroup=name,
-                    showlegend=k == 0 and component == 0,
-                    hovertemplate=signals.hover,
-                )
-        if k >= len(events) - columns:
-            last = row + components - 1
-            diagrams.figure.update_xaxes(title="time [s]", row=last, col=column)
-        for component, title in enumerate(signals.components):
-            diagrams.figure.update_yaxes(title=title, row=row + component, col=1)
+    for (row, column), k in zip(cells, chosen, strict=True):
+        event, (before_s, after_s) = events[k], margins_s[k]
+        part = signals.between(event.start_s - before_s, event.stop_s + after_s)
+        for component, component_title in enumerate(signals.components):
+            in_legend = k == chosen[0] and component == 0
+            at = row + component
+            diagrams.add_signals(at, part, component, column, showlegend=in_legend)
+            diagrams.figure.update_yaxes(title=component_title, row=at, col=1)
+        if mark_time:
+            color = REFUSED if event.refused else USED
+            diagrams.add_vertical_line(event.centre_s, row, column, color, "dot")
+    for row, column in cells[-columns:]:
+        diagrams.figure.update_xaxes(title="time [s]", row=row + components - 1, col=column)
     diagrams.figure.update_annotations(font_size=11)
-    return diagrams
+    figure = diagrams.finish(
+        90 + row_height_px * rows,
+        column_titles=(),
+        margin_t=60,
+        width=DETAIL_WIDTH_PX * columns if columns > 1 else None,
+        **layout,
+    )
+    return [Panel(title, f"{selection_note(len(chosen), len(read), noun)} {note}", figure)]
 
 
 # ---- values over time, by device

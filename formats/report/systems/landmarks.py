@@ -10,19 +10,14 @@ from locatk.core.solution import Solution
 from locatk.formats.plots.series import origin_ns
 from locatk.formats.report.detections import format_cell, format_probability
 from locatk.formats.report.diagrams import (
-    DETAIL_WIDTH_PX,
     LINES_THINNED,
     MAX_EVENT_LABELS,
     NEUTRAL_COLORS,
-    REFUSED,
     SIGNAL_COLUMNS,
-    USED,
     Diagrams,
     Event,
     Signals,
-    draw_details,
-    select_details,
-    selection_note,
+    detail_panels,
 )
 from locatk.formats.report.panels import (
     Panel,
@@ -45,8 +40,8 @@ from locatk.formats.sessions.reader import Session
 MAX_DETAILED_VISITS = 6
 """Number of visits that are drawn sample by sample, three in a row."""
 
-DETAIL_BEFORE_S, DETAIL_AFTER_S = 3.0, 1.5
-"""Drawn time before and after a detection, which is stamped near the end of its visit."""
+DETAIL_BEFORE_S, DETAIL_AFTER_S = 2.75, 1.25
+"""Drawn time before and after the mark of a detection, which is near the end of its visit."""
 
 MARK_HALF_WIDTH_S = 0.25
 """Half the width of the mark of a detection, of which only one time is known."""
@@ -73,9 +68,19 @@ def signal_panels(session: Session, solution: Solution) -> list[Panel]:
         )
         detections = [each for each in solution.detections if each.device == device]
         events = [_event(detection, start_ns) for detection in detections]
-        certainty = [as_float(detection.probability) for detection in detections]
-        recording = _draw_recording(title, signals, events, note)
-        return [recording, *_draw_visits(device, signals, events, certainty)]
+        details = detail_panels(
+            f"Visits of {device} in detail",
+            "The dotted line is the time of the detection.",
+            signals,
+            events,
+            [as_float(detection.probability) for detection in detections],
+            [(DETAIL_BEFORE_S, DETAIL_AFTER_S)] * len(events),
+            noun="visits",
+            limit=MAX_DETAILED_VISITS,
+            row_height_px=230,
+            mark_time=True,
+        )
+        return [_draw_recording(title, signals, events, note), *details]
 
     decode = partial(decode_field_samples, KIND)
     source = SignalSource("Hall sensors of", KIND.topic, KIND.schema, decode, draw, NOTE)
@@ -113,12 +118,9 @@ def _event(detection: LandmarkDetection, start_ns: int) -> Event:
 def _draw_recording(title: str, signals: Signals, events: list[Event], note: str) -> Panel:
     """Draw the whole recording of one robot."""
     diagrams = Diagrams(2, shared_xaxes=True, row_heights=[0.22, 0.78], vertical_spacing=0.02)
-    for k, (name, color) in enumerate(zip(signals.names, signals.colors, strict=True)):
-        value = signals.value[:, k, 0]
-        diagrams.add_signal(2, signals.time_s, value, color, name=name, hovertemplate=signals.hover)
+    diagrams.add_signals(2, signals)
     diagrams.add_strip(events, ("used", "refused"), shaded_rows=(2,))
-    limits = [float(signals.time_s[0]), float(signals.time_s[-1])]
-    diagrams.figure.update_xaxes(range=limits)
+    diagrams.limit_time(signals.time_s)
     return Panel(
         title,
         join_sentences(
@@ -129,33 +131,3 @@ def _draw_recording(title: str, signals: Signals, events: list[Event], note: str
         ),
         diagrams.finish(420, ["vertical field [mT]"]),
     )
-
-
-def _draw_visits(
-    device: str, signals: Signals, events: list[Event], certainty: list[float]
-) -> list[Panel]:
-    """Draw some visits sample by sample; none if no samples of visits were read."""
-    windows = [(e.centre_s - DETAIL_BEFORE_S, e.centre_s + DETAIL_AFTER_S) for e in events]
-    read = [k for k, window in enumerate(windows) if len(signals.between(*window).time_s) > 1]
-    refused = [events[k].refused for k in read]
-    selected = select_details(refused, [certainty[k] for k in read], MAX_DETAILED_VISITS)
-    if not selected:
-        return []
-    chosen = [read[k] for k in selected]
-    drawn = [events[k] for k in chosen]
-    diagrams = draw_details(signals, drawn, [windows[k] for k in chosen])
-    for k, event in enumerate(drawn):
-        color = REFUSED if event.refused else USED
-        row, column = k // diagrams.columns + 1, k % diagrams.columns + 1
-        diagrams.add_vertical_line(event.centre_s, row, column, color, "dot")
-    height = 90 + 230 * diagrams.rows
-    width = DETAIL_WIDTH_PX * diagrams.columns
-    figure = diagrams.finish(height, column_titles=(), margin_t=60, width=width)
-    note = selection_note(len(drawn), len(read), "visits")
-    return [
-        Panel(
-            f"Visits of {device} in detail",
-            f"{note} The dotted line is the time of the detection.",
-            figure,
-        )
-    ]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -16,7 +17,6 @@ from locatk.core.polaris.results import TagDetection
 from locatk.core.solution import Solution
 from locatk.formats.plots.series import origin_ns
 from locatk.formats.report.diagrams import (
-    DETAIL_WIDTH_PX,
     GAP_INTERVALS,
     LINES_THINNED,
     REFUSED,
@@ -25,9 +25,7 @@ from locatk.formats.report.diagrams import (
     Diagrams,
     Event,
     Signals,
-    draw_details,
-    select_details,
-    selection_note,
+    detail_panels,
     single_precision,
 )
 from locatk.formats.report.panels import (
@@ -84,8 +82,23 @@ def signal_panels(session: Session, solution: Solution) -> list[Panel]:
         lateral_mm = _lateral_positions_mm(session, device, sensor_count)
         signals = _signals(samples, lateral_mm, start_ns)
         detections = [each for each in solution.detections if each.device == device]
-        recording = _draw_recording(title, signals, lateral_mm, detections, start_ns, note)
-        return [recording, *_draw_passes(device, signals, detections, start_ns)]
+        events = [_event(detection, start_ns) for detection in detections]
+        recording = _draw_recording(title, signals, lateral_mm, detections, events, start_ns, note)
+        duration_s = [max(event.stop_s - event.start_s, MIN_PASS_S) for event in events]
+        details = detail_panels(
+            f"Passes of {device} in detail",
+            "Components of the field, minus their medians. The names of sensors contain their "
+            "position across the bar, positive to the left.",
+            signals,
+            events,
+            [as_float(detection.margin) for detection in detections],
+            [(DETAIL_MARGIN_FRACTION * each, DETAIL_MARGIN_FRACTION * each) for each in duration_s],
+            noun="passes",
+            limit=MAX_DETAILED_PASSES,
+            row_height_px=157,
+            legend_traceorder="reversed",
+        )
+        return [recording, *details]
 
     decode = partial(decode_field_samples, KIND)
     source = SignalSource("Magnetic field along", KIND.topic, KIND.schema, decode, draw, NOTE)
@@ -162,6 +175,7 @@ def _draw_recording(
     signals: Signals,
     lateral_mm: Array | None,
     detections: Sequence[TagDetection],
+    events: Sequence[Event],
     start_ns: int,
     note: str,
 ) -> Panel:
@@ -171,14 +185,9 @@ def _draw_recording(
     _add_field_map(diagrams, signals.time_s, magnitude, lateral_mm)
     if lateral_mm is not None:
         _add_magnets(diagrams, detections, start_ns)
-    for k, (name, color) in enumerate(zip(signals.names, signals.colors, strict=True)):
-        diagrams.add_signal(
-            3, signals.time_s, magnitude[:, k], color, name=name, hovertemplate=signals.hover
-        )
-    events = [_event(detection, start_ns) for detection in detections]
+    diagrams.add_signals(3, replace(signals, value=magnitude[:, :, None]))
     diagrams.add_strip(events, ("identified", "not identified"), shaded_rows=(3,))
-    limits = [float(signals.time_s[0]), float(signals.time_s[-1])]
-    diagrams.figure.update_xaxes(range=limits)
+    diagrams.limit_time(signals.time_s)
     diagrams.figure.update_yaxes(rangemode="tozero", row=3, col=1)
     return Panel(
         title,
@@ -256,45 +265,3 @@ def _add_magnets(diagrams: Diagrams, detections: Sequence[TagDetection], start_n
         line = {"width": 2 if is_large else 1}
         look = {"symbol": "circle-open", "color": color, "size": 9 if is_large else 4}
         diagrams.add_marks(2, *points.T, marker={**look, "line": line}, name=name, hoverinfo="skip")
-
-
-def _draw_passes(
-    device: str, signals: Signals, detections: Sequence[TagDetection], start_ns: int
-) -> list[Panel]:
-    """Draw some passes sample by sample; none if no samples of passes were read."""
-    read = list(_read_passes(signals, detections, start_ns))
-    refused = [event.refused for _, event in read]
-    margins = [as_float(detection.margin) for detection, _ in read]
-    chosen = select_details(refused, margins, MAX_DETAILED_PASSES)
-    if not chosen:
-        return []
-    events = [read[k][1] for k in chosen]
-    windows = []
-    for event in events:
-        margin_s = DETAIL_MARGIN_FRACTION * max(event.stop_s - event.start_s, MIN_PASS_S)
-        windows.append((event.start_s - margin_s, event.stop_s + margin_s))
-    diagrams = draw_details(signals, events, windows)
-    width = DETAIL_WIDTH_PX * diagrams.columns if diagrams.columns > 1 else None
-    figure = diagrams.finish(
-        560, column_titles=(), legend_traceorder="reversed", margin_t=60, width=width
-    )
-    return [
-        Panel(
-            f"Passes of {device} in detail",
-            "Components of the field, minus their medians, during passes over tags. "
-            + selection_note(len(events), len(read), "passes")
-            + " The names of sensors contain their position across the bar, positive to the left.",
-            figure,
-        )
-    ]
-
-
-def _read_passes(
-    signals: Signals, detections: Sequence[TagDetection], start_ns: int
-) -> Iterator[tuple[TagDetection, Event]]:
-    """Yield the detections of which samples were read."""
-    for detection in detections:
-        event = _event(detection, start_ns)
-        first, stop = np.searchsorted(signals.time_s, (event.start_s, event.stop_s))
-        if stop - first > 1:
-            yield detection, event
