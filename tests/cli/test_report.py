@@ -40,7 +40,9 @@ def test_a_page_is_written(solution: Path, locatk: Locatk) -> None:
 
 
 @pytest.mark.slow
-def test_pictures_are_written_beside_it(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
+def test_pictures_are_written_next_to_the_page(
+    solution: Path, locatk: Locatk, tmp_path: Path
+) -> None:
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--png", "--svg", "--json")
     assert done.exit_code == 0, done.stderr
     files = [str(tmp_path / name) for name in ("r.html", "r.png", "r.svg")]
@@ -69,7 +71,7 @@ def test_several_solutions_share_a_page(solution: Path, locatk: Locatk, tmp_path
     assert "2 solutions" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
-def test_solutions_of_one_name_are_told_apart(
+def test_solutions_of_one_name_have_their_paths_as_titles(
     solution: Path, locatk: Locatk, tmp_path: Path
 ) -> None:
     (tmp_path / "again").mkdir()
@@ -92,7 +94,9 @@ def test_names_of_outputs() -> None:
     )
 
 
-def test_nothing_is_replaced_unasked(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
+def test_nothing_is_replaced_without_overwrite(
+    solution: Path, locatk: Locatk, tmp_path: Path
+) -> None:
     """Not even the page is begun where a picture is in the way."""
     (tmp_path / "r.png").write_text("mine")
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--png")
@@ -139,7 +143,7 @@ def test_what_is_no_solution_is_one_line(session: Path, locatk: Locatk, tmp_path
     assert done.stderr.count("\n") == 1
 
 
-def test_the_session_can_be_elsewhere(
+def test_the_session_can_be_in_another_folder(
     solution: Path, session: Path, locatk: Locatk, tmp_path: Path
 ) -> None:
     (tmp_path / "far").mkdir()
@@ -169,7 +173,7 @@ def test_sessions_belong_to_solutions_by_name(
 
 
 @pytest.mark.slow
-def test_truth_that_fits_nothing_is_told(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
+def test_truth_of_another_time_is_reported(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
     (tmp_path / "old.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--truth", tmp_path / "old.tum")
     assert done.exit_code == 0

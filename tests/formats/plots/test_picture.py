@@ -84,13 +84,14 @@ def test_every_kind_of_picture_is_written_the_same_twice(tmp_path: Path, suffix:
     assert sorted(p.name for p in tmp_path.iterdir()) == [first.name, second.name]
 
 
+@pytest.mark.slow
 def test_png_is_1200_by_600(tmp_path: Path) -> None:
     write_picture(tmp_path / "a.png", solution(), truth=TRUTH)
     data = (tmp_path / "a.png").read_bytes()
     assert struct.unpack(">II", data[16:24]) == (1200, 600)
 
 
-def test_what_exists_is_not_replaced_unasked(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_text("mine")
     with pytest.raises(OutputExistsError) as caught:
@@ -188,7 +189,7 @@ def test_an_alignment_brings_all_into_the_frame_of_the_truth() -> None:
     np.testing.assert_allclose(dots, [[-2.0, 0.0]], atol=1e-9)
 
 
-def test_without_truth_it_shows_what_the_solver_expects() -> None:
+def test_without_truth_sigmas_are_shown() -> None:
     said = texts(draw_picture(solution()))
     assert "solver's sigma [mm]" in said
     assert not any("MAE" in text for text in said)
@@ -224,7 +225,7 @@ def test_stations_are_in_view_or_named_at_the_margin() -> None:
 @pytest.mark.parametrize(
     ("far_m", "said"), [(0.46, "ch 1\n460 mm"), (1.24, "ch 1\n1.2 m"), (87.3, "ch 1\n87 m")]
 )
-def test_a_small_map_tells_how_far_stations_are(far_m: float, said: str) -> None:
+def test_a_small_map_shows_the_distance_of_stations(far_m: float, said: str) -> None:
     small = replace(track("red"), position=0.01 * track("red").position)
     station = Station(1, np.array([0.0, far_m, 0.0]), np.eye(3), IDEAL_CALIBRATION)
     scene = Scene(stations=(station,), scale="markers")
@@ -233,7 +234,7 @@ def test_a_small_map_tells_how_far_stations_are(far_m: float, said: str) -> None
     assert said in texts(figure)
 
 
-def test_paths_break_where_nothing_was_seen() -> None:
+def test_paths_break_at_gaps() -> None:
     whole = track("red")
     keep = np.r_[0:40, 60:120]
     part = Trajectory.from_positions("red", "floor", whole.time_ns[keep], whole.position[keep])
@@ -243,7 +244,7 @@ def test_paths_break_where_nothing_was_seen() -> None:
     assert np.flatnonzero(np.isnan(x)).tolist() == [40]
 
 
-def test_wild_poses_do_not_hide_the_others() -> None:
+def test_outliers_do_not_hide_the_other_poses() -> None:
     wild = track("red")
     wild.position[50] = [700.0, -300.0, 0.0]
     figure = draw_picture(Solution("lighthouse", "bundle", (wild,), artifact=SCENE), TRUTH)
@@ -298,7 +299,7 @@ def test_every_word_is_inside_the_picture(
         assert box.y1 <= frame.y1 + 1, text
 
 
-def test_what_the_covariance_expects_is_drawn() -> None:
+def test_expected_errors_are_drawn() -> None:
     figure = draw_picture(solution(names=("red",)), TRUTH)
     over_time = next(a for a in figure.axes if a.get_ylabel() == "error [mm]")
     assert (
@@ -312,6 +313,6 @@ def test_what_the_covariance_expects_is_drawn() -> None:
     assert not any("95 % of errors" in text for text in texts(many))
 
 
-def test_the_title_tells_how_much_was_solved() -> None:
+def test_the_title_contains_the_solved_fraction() -> None:
     said = "\n".join(texts(draw_picture(solution(), TRUTH)))
     assert "100.0 % of the time solved" in said

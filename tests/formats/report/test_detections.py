@@ -47,7 +47,7 @@ LIGHTHOUSE = Solution(
 )
 
 
-def test_shares_are_of_what_a_reason_is_counted_in() -> None:
+def test_fractions_are_of_all_sweeps_or_moments() -> None:
     stations, rejected = panels(LIGHTHOUSE)
     assert stations.table is not None
     assert stations.table.rows[1] == (*("2", "0a0b0c0d", "959000", "generic", "90", "6", "0.150"),)
@@ -65,10 +65,10 @@ def test_shares_are_of_what_a_reason_is_counted_in() -> None:
     assert sorted(n for each in bars for n in each["x"]) == [3, 5, 8]
 
 
-def test_nothing_seen_and_nothing_rejected_are_said() -> None:
+def test_panels_without_detections_and_rejections_have_a_note() -> None:
     for system in (*rejections.REASONS, "sonar"):
-        saw, rejected = panels(Solution(system, "x", ()))
-        assert saw.note
+        detected, rejected = panels(Solution(system, "x", ()))
+        assert detected.note
         assert rejected.note == "Nothing was rejected."
         assert rejected.figure is None
 
@@ -86,7 +86,7 @@ def test_reasons_of_other_systems_are_shown_without_a_sentence() -> None:
     assert panels(odd)[1].table.rows == [("of tomorrow", "2", "-", "")]  # type: ignore[union-attr]
 
 
-def test_frames_are_counted_by_what_became_of_them() -> None:
+def test_frames_are_counted_by_outcome() -> None:
     frames = tuple(
         FrameOutcome(
             time_s=k * 0.1,
@@ -106,14 +106,14 @@ def test_frames_are_counted_by_what_became_of_them() -> None:
         frames[:8],
         facts=DotFacts(frames),
     )
-    saw, rejected = panels(solution)
-    assert saw.table is not None
-    assert saw.table.rows == [
+    detected, rejected = panels(solution)
+    assert detected.table is not None
+    assert detected.table.rows == [
         ("decoded", "8", "80.0", "104", "4", "100.00"),
         ("rejected", "2", "20.0", "108", "8", "-"),
     ]
-    assert saw.figure is not None
-    counted = sum(np.sum(each.y) for each in saw.figure.data if each.xaxis == "x2")
+    assert detected.figure is not None
+    counted = sum(np.sum(each.y) for each in detected.figure.data if each.xaxis == "x2")
     assert counted == 10
     assert rejected.table is not None
     assert rejected.table.rows[0][2] == "20 % of 10 frames"
@@ -149,15 +149,15 @@ def tag(**more: Any) -> TagDetection:
 
 def test_many_tags_are_listed_in_part() -> None:
     found = (tag(tag_id=None, refused="magnets_missing", margin=None), *(tag() for _ in range(99)))
-    saw, rejected = panels(Solution("polaris", "joint", (), {"magnets_missing": 1}, found))
-    assert "99 of 100 passes" in saw.note
-    assert f"The first {detections.MAX_LISTED} are listed" in saw.note
-    assert saw.table is not None
-    assert len(saw.table.rows) == detections.MAX_LISTED
-    assert saw.table.rows[0][:3] == ("-", "-", "5")
-    assert saw.table.rows[0][-1] == "magnets missing"
-    assert saw.table.rows[1][3:6] == ("12.30", "-", "5.73 ± 0.057")
-    assert saw.figure is not None
+    detected, rejected = panels(Solution("polaris", "joint", (), {"magnets_missing": 1}, found))
+    assert "99 of 100 passes" in detected.note
+    assert f"The first {detections.MAX_LISTED} are listed" in detected.note
+    assert detected.table is not None
+    assert len(detected.table.rows) == detections.MAX_LISTED
+    assert detected.table.rows[0][:3] == ("-", "-", "5")
+    assert detected.table.rows[0][-1] == "magnets missing"
+    assert detected.table.rows[1][3:6] == ("12.30", "-", "5.73 ± 0.057")
+    assert detected.figure is not None
     assert rejected.table is not None
     assert rejected.table.rows[0][2] == "1 % of 100 passes"
     few, _ = panels(Solution("polaris", "joint", (), {}, (tag(),)))
@@ -168,23 +168,23 @@ def test_a_refused_visit_of_the_solver_is_listed() -> None:
     told = describe_visit(
         VisitHypotheses("robot", 10**18, 0, 9, np.zeros(3), (), refused="too_weak"), None, None
     )
-    saw, rejected = panels(Solution("landmarks", "field", (), {"too_weak": 1}, (told,)))
-    assert saw.table is not None
-    assert saw.table.rows[0][:4] == ("01:46:40.000", "-", "-", "0.0")
-    assert saw.table.rows[0][-1] == "too weak"
-    assert "1 visit to landmarks" in saw.note
+    detected, rejected = panels(Solution("landmarks", "field", (), {"too_weak": 1}, (told,)))
+    assert detected.table is not None
+    assert detected.table.rows[0][:4] == ("01:46:40.000", "-", "-", "0.0")
+    assert detected.table.rows[0][-1] == "too weak"
+    assert "1 visit to landmarks" in detected.note
     assert rejected.table is not None
     assert rejected.table.rows[0][2] == "100 % of 1 visit"
 
 
 def test_detections_of_unknown_systems_are_counted() -> None:
     records = (GenericRecord({"a": 1}), GenericRecord({"sweeps": "x", "rejected": []}))
-    saw, rejected = panels(Solution("sonar", "x", (), {"spike": 1}, records))
-    assert saw.note == "2 detections of sonar."
+    detected, rejected = panels(Solution("sonar", "x", (), {"spike": 1}, records))
+    assert detected.note == "2 detections of sonar."
     assert rejected.note
 
 
-def test_words_of_tables() -> None:
+def test_formats_of_tables() -> None:
     assert detections.format_probability(0.99996) == ">99.9"
     assert detections.format_probability(1.0) == "100"
     assert detections.format_probability(None) == detections.format_probability(float("nan")) == "-"

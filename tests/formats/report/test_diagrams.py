@@ -38,7 +38,7 @@ def test_nan_is_no_peak() -> None:
 
 
 @given(st.lists(st.integers(0, 10_000), max_size=50))
-def test_points_are_shared(counts: list[int]) -> None:
+def test_points_are_allotted_to_devices(counts: list[int]) -> None:
     shares = allot_points(counts, 3000)
     assert len(shares) == len(counts)
     assert sum(shares) <= max(3000 + 20 * len(counts), sum(counts) if sum(counts) <= 3000 else 0)
@@ -69,7 +69,7 @@ def test_a_short_signal_stays_as_it_is_and_breaks_at_gaps() -> None:
         assert len(diagrams.envelope(np.arange(float(n)), np.arange(float(n)))[0]) == n
 
 
-def test_marks_that_hide_each_other_are_drawn_once() -> None:
+def test_marks_that_cover_each_other_are_drawn_once() -> None:
     time = np.linspace(0, 100, 50_000)
     value = np.sin(time)
     value[25_000] = 30.0

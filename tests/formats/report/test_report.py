@@ -61,7 +61,7 @@ def solution(*names: str, n: int = 60, **more: Any) -> Solution:
     return Solution("lighthouse", "bundle", tracks, **given)
 
 
-def judged(solved: Solution, **more: Any) -> Subject:
+def evaluated(solved: Solution, **more: Any) -> Subject:
     """A subject with truth."""
     truth = tuple(track(t.device, len(t)) for t in solved.trajectories)
     pairs = [(t, u) for t, u in zip(solved.trajectories, truth, strict=True) if len(t)]
@@ -90,7 +90,7 @@ def values(array: Any) -> np.ndarray:
 
 def test_one_copy_of_the_script_and_no_address(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
-    write_report(path, [judged(solution("red")), judged(solution("blue"))])
+    write_report(path, [evaluated(solution("red")), evaluated(solution("blue"))])
     page = path.read_text(encoding="utf-8")
     assert page.count("plotly.js v") == 1
     scripts = re.findall(r"<script>(.*?)</script>", page, re.S)
@@ -110,20 +110,20 @@ def test_one_copy_of_the_script_and_no_address(tmp_path: Path) -> None:
 
 def test_the_same_subjects_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.html", "b.html"):
-        write_report(tmp_path / name, [judged(solution("red"))])
+        write_report(tmp_path / name, [evaluated(solution("red"))])
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
-def test_what_exists_is_not_replaced_unasked(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     path.write_text("mine")
     with pytest.raises(OutputExistsError):
-        write_report(path, [judged(solution("red"))])
+        write_report(path, [evaluated(solution("red"))])
     assert path.read_text() == "mine"
-    write_report(path, [judged(solution("red"))], overwrite=True)
+    write_report(path, [evaluated(solution("red"))], overwrite=True)
     assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     with pytest.raises(MissingDataError):
-        write_report(tmp_path / "nowhere" / "a.html", [judged(solution("red"))])
+        write_report(tmp_path / "nowhere" / "a.html", [evaluated(solution("red"))])
 
 
 @pytest.mark.slow
@@ -137,13 +137,13 @@ def test_neither_matplotlib_nor_scipy_is_imported() -> None:
     assert done.stdout.strip() == "[]"
 
 
-# ---- words of others
+# ---- foreign text
 
 
 def test_names_of_devices_do_no_harm() -> None:
     facts = {"command": f"locatk solve {EVIL}", "source": EVIL, "other": EVIL}
     warnings = (SolverWarning("test", EVIL),)
-    subject = replace(judged(solution(EVIL, warnings=warnings), facts=facts), name=EVIL)
+    subject = replace(evaluated(solution(EVIL, warnings=warnings), facts=facts), name=EVIL)
     page = render_report([subject, subject])
     assert "<img" not in page
     assert page.lower().count("</script>") == page.count("<script")
@@ -156,19 +156,19 @@ def test_names_of_devices_do_no_harm() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["Łódź 🤖", "%{x}", "$5^2$", "_x", "a\nb", "<b>bold</b>", " "])
 def test_odd_names_are_shown(name: str) -> None:
-    page = render_report([judged(solution(name, "other"))])
+    page = render_report([evaluated(solution(name, "other"))])
     assert specs(page)
 
 
 def test_the_command_is_there_to_be_copied() -> None:
     page = render_report(
-        [judged(solution("red"), facts={"command": "locatk solve 'a b.mcap' -o <x>"})]
+        [evaluated(solution("red"), facts={"command": "locatk solve 'a b.mcap' -o <x>"})]
     )
     assert "locatk solve &#x27;a b.mcap&#x27; -o &lt;x&gt;</pre>" in page
     assert 'class="copy"' in page
 
 
-# ---- what it says
+# ---- text
 
 
 def texts(subject: Subject) -> str:
@@ -177,14 +177,14 @@ def texts(subject: Subject) -> str:
     )
 
 
-def test_the_verdict_is_that_of_the_evaluation() -> None:
-    said = texts(judged(solution("red")))
+def test_the_summary_is_that_of_the_evaluation() -> None:
+    said = texts(evaluated(solution("red")))
     assert "Half of the poses are within 1.00 mm of the truth, 95 % within 1.00 mm" in said
     assert "No alignment was fitted" in said
     assert "a note" in said
 
 
-def test_without_truth_it_says_so_and_shows_sigmas() -> None:
+def test_without_truth_the_report_shows_sigmas() -> None:
     subject = Subject("run.mcap", solution("red"), facts={"source": "run.mcap"})
     said = texts(subject)
     assert "No truth is available" in said
@@ -223,25 +223,25 @@ def test_a_scene_without_scale_has_no_metres() -> None:
         Solution("dots", "lattice", (track("red", 0),), rejected={"blurred": 7}),
     ],
 )
-def test_nothing_solved_is_a_report_too(empty: Solution) -> None:
+def test_a_solution_without_poses_has_a_report(empty: Solution) -> None:
     said = texts(Subject("run.mcap", empty))
     assert "Nothing was solved" in said
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_few_poses_are_a_report(n: int) -> None:
-    assert specs(render_report([judged(solution("red", n=n))]))
+def test_few_poses_have_a_report(n: int) -> None:
+    assert report_panels(evaluated(solution("red", n=n)))
 
 
-def test_poses_without_covariance_are_a_report() -> None:
+def test_poses_without_covariance_have_a_report() -> None:
     t = track("red")
     bare = Trajectory.from_positions(t.device, t.frame, t.time_ns, t.position)
-    subject = judged(replace(solution("red"), trajectories=(bare,)))
+    subject = evaluated(replace(solution("red"), trajectories=(bare,)))
     assert "Standard deviation over time" not in [panel.title for panel in report_panels(subject)]
     assert "reports no covariance" in texts(replace(subject, evaluation=None, truth=()))
 
 
-def test_poses_that_are_no_numbers_are_left_out_and_counted() -> None:
+def test_poses_that_are_not_finite_are_left_out_and_counted() -> None:
     solved = solution("red")
     solved.trajectories[0].position[5:9] = np.nan
     truth = (track("red"),)
@@ -257,7 +257,7 @@ def test_poses_that_are_no_numbers_are_left_out_and_counted() -> None:
 
 
 def test_devices_without_truth_are_named() -> None:
-    subject = judged(solution("red", "blue"))
+    subject = evaluated(solution("red", "blue"))
     only = evaluate([(subject.solution.trajectories[0], subject.truth[0])])
     said = figure(replace(subject, evaluation=only), "Statistics").note
     assert "There is no truth for blue." in said
@@ -293,7 +293,7 @@ def test_all_time_axes_begin_with_the_recording() -> None:
     recording = SimpleNamespace(
         start_ns=START_NS - 3_000_000_000, end_ns=START_NS + 10**10, facts={}
     )
-    subject = judged(solution("red"))
+    subject = evaluated(solution("red"))
     titles = ("Error over time", "Error by axis", "Standard deviation over time")
     for title in titles:
         assert min(times(figure(subject, title))) == pytest.approx(0.0)
@@ -315,12 +315,12 @@ def replace_start(recording: Any) -> Any:
 
 
 def test_devices_come_first_in_legends() -> None:
-    traces = figure(judged(solution("red")), "Trajectory").figure.data
+    traces = figure(evaluated(solution("red")), "Trajectory").figure.data
     ranks = {t.name: t.legendrank or 1000 for t in traces if t.showlegend is not False}
     assert min(ranks, key=lambda name: ranks[name]) == "red"
 
 
-def test_a_thinned_path_breaks_where_nothing_was_seen_and_nowhere_else() -> None:
+def test_a_thinned_path_breaks_only_at_gaps() -> None:
     t = track("red", 6000)
     t.time_ns[3000:] += 30_000_000_000
     panel = figure(Subject("a", replace(solution("red"), trajectories=(t,))), "Trajectory")
@@ -335,7 +335,7 @@ def figure(subject: Subject, title: str) -> Any:
 
 
 def test_the_map_is_to_scale_and_shows_what_is_there() -> None:
-    panel = figure(judged(solution("red")), "Trajectory")
+    panel = figure(evaluated(solution("red")), "Trajectory")
     assert panel.figure.layout.yaxis.scaleanchor == "x"
     traces = {t.name: t for t in panel.figure.data}
     assert {"truth", "red", "marker", "station"} <= set(traces)
@@ -349,7 +349,7 @@ def test_the_map_is_to_scale_and_shows_what_is_there() -> None:
     assert traces["95 % ellipse, \u00d7 10"]
 
 
-def test_ellipses_have_the_size_they_say() -> None:
+def test_ellipses_have_the_right_size() -> None:
     t = track("red")
     covariance = np.zeros((len(t), 3, 3))
     covariance[:, 0, 0], covariance[:, 1, 1] = 0.04, 0.01
@@ -362,10 +362,10 @@ def test_ellipses_have_the_size_they_say() -> None:
 
 def test_a_path_that_rises_is_seen_from_the_side() -> None:
     steep = replace(solution("red"), trajectories=(track("red", rise_m=0.1),))
-    titles = [panel.title for panel in report_panels(judged(steep))]
+    titles = [panel.title for panel in report_panels(evaluated(steep))]
     assert "Trajectory from the side" in titles
     assert "Trajectory from the side" not in [
-        p.title for p in report_panels(judged(solution("red")))
+        p.title for p in report_panels(evaluated(solution("red")))
     ]
 
 
@@ -385,20 +385,20 @@ def test_poses_in_two_frames_share_no_map() -> None:
         assert f"camera-{name}" in names
 
 
-def test_wild_errors_are_at_the_edge_and_counted() -> None:
+def test_outliers_are_at_the_upper_limit_and_counted() -> None:
     solved = solution("red", n=100)
     solved.trajectories[0].position[50, 0] += 40.0
-    panel = figure(judged(solved), "Error over time")
+    panel = figure(evaluated(solved), "Error over time")
     assert "1 of 100 values lie beyond this scale (triangles)" in panel.note
     (triangle,) = [t for t in panel.figure.data if t.yaxis == "y2"]
     np.testing.assert_allclose(triangle.customdata, [40_001.0], rtol=1e-6)
     assert panel.figure.layout.yaxis.range[1] < 10
-    (spread,) = figure(judged(solved), "Histogram of errors").figure.data
+    (spread,) = figure(evaluated(solved), "Histogram of errors").figure.data
     assert sum(spread.y) == 100
 
 
 def test_errors_and_bands_are_those_of_the_solution() -> None:
-    subject = judged(solution("red"))
+    subject = evaluated(solution("red"))
     panel = figure(subject, "Error over time")
     shown = {t.name: t for t in panel.figure.data}
     np.testing.assert_allclose(shown["red"].y, 1.0, atol=1e-9)
@@ -406,7 +406,7 @@ def test_errors_and_bands_are_those_of_the_solution() -> None:
     np.testing.assert_allclose(shown["95 % expected"].y, 2.7955, rtol=4e-3)
 
 
-# ---- much
+# ---- large solutions
 
 
 def test_ten_thousand_poses_are_thinned_and_small() -> None:
@@ -416,7 +416,7 @@ def test_ten_thousand_poses_are_thinned_and_small() -> None:
     for t in solved.trajectories:
         t.position[:] += 1e-3 * rng.standard_normal(t.position.shape)
     solved.trajectories[3].position[417] += 5.0  # must not be lost
-    page = render_report([judged(solved)])
+    page = render_report([evaluated(solved)])
     assert len(page.encode()) < 12e6
     assert "of 10\u202f800 poses" in page
     for ident, spec in specs(page).items():
@@ -428,14 +428,14 @@ def test_ten_thousand_poses_are_thinned_and_small() -> None:
 
 def test_few_devices_are_named_and_the_rest_counted() -> None:
     solved = solution(*[f"robot-{k}" for k in range(20)], n=5)
-    panel = figure(judged(solved), "Trajectory")
+    panel = figure(evaluated(solved), "Trajectory")
     named = [t for t in panel.figure.data if t.showlegend and str(t.name).startswith("robot")]
     assert len(named) == 7
     assert "The legend names 7 of 20 devices" in panel.note
 
 
 def test_several_subjects_are_in_a_table_with_links() -> None:
-    page = render_report([judged(solution("red")), Subject("b.mcap", solution("blue"))])
+    page = render_report([evaluated(solution("red")), Subject("b.mcap", solution("blue"))])
     assert '<a href="#s2">b.mcap</a>' in page
     assert page.count('class="subject"') == 2
     assert len(specs(page)) == len(set(specs(page)))

@@ -1,4 +1,4 @@
-"""Subjects of reports: which session and which truth are taken, and what is refused."""
+"""Subjects of reports: the session and truth that are used, and refused files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def solved(path: Path, solution: Solution = SOLUTION, source: str = "run.mcap") 
     return path
 
 
-def test_the_session_beside_it_gives_the_truth(session: Path, tmp_path: Path) -> None:
+def test_truth_is_read_from_the_session_in_the_same_folder(session: Path, tmp_path: Path) -> None:
     subject = load_subject(solved(tmp_path / "solved.mcap"))
     assert subject.name == "solved.mcap"
     assert subject.session is not None
@@ -71,7 +71,7 @@ def test_the_session_beside_it_gives_the_truth(session: Path, tmp_path: Path) ->
     assert subject.evaluation.median == pytest.approx(2e-3)
 
 
-def test_without_it_there_is_no_truth(tmp_path: Path) -> None:
+def test_without_session_there_is_no_truth(tmp_path: Path) -> None:
     subject = load_subject(solved(tmp_path / "solved.mcap"))
     assert (subject.session, subject.truth, subject.evaluation) == (None, (), None)
 
@@ -98,7 +98,7 @@ def test_a_recording_of_another_time_is_another_recording(tmp_path: Path) -> Non
     assert load_subject(solved(tmp_path / "solved.mcap")).session is None
 
 
-def test_a_session_elsewhere_can_be_named(tmp_path: Path) -> None:
+def test_a_session_in_another_folder_can_be_given(tmp_path: Path) -> None:
     (tmp_path / "far").mkdir()
     far = record(tmp_path / "far" / "other.mcap")
     subject = load_subject(solved(tmp_path / "solved.mcap"), session=far)
@@ -123,14 +123,14 @@ def test_a_damaged_session_does_not_stop_the_report(session: Path, tmp_path: Pat
         assert load_subject(solved(path)).solution.poses == 60
 
 
-def test_truth_from_a_file_goes_first(session: Path, tmp_path: Path) -> None:
+def test_a_truth_file_replaces_the_truth_of_the_session(session: Path, tmp_path: Path) -> None:
     trajectories.write_tum(tmp_path / "camera.tum", track(off_m=5e-3))
     subject = load_subject(solved(tmp_path / "solved.mcap"), truth=tmp_path / "camera.tum")
     assert subject.evaluation is not None
     assert subject.evaluation.median == pytest.approx(3e-3)
 
 
-def test_alignment_and_offset_are_those_asked_for(session: Path, tmp_path: Path) -> None:
+def test_alignment_and_offset_are_the_requested_ones(session: Path, tmp_path: Path) -> None:
     subject = load_subject(solved(tmp_path / "solved.mcap"), align="se2")
     assert subject.evaluation is not None
     assert subject.evaluation.align == "se2"
@@ -141,7 +141,9 @@ def test_alignment_and_offset_are_those_asked_for(session: Path, tmp_path: Path)
     assert late.median > 0.05
 
 
-def test_a_scene_without_scale_is_compared_only_when_asked(session: Path, tmp_path: Path) -> None:
+def test_a_scene_without_scale_is_evaluated_only_with_scaling_alignment(
+    session: Path, tmp_path: Path
+) -> None:
     unit = replace(SOLUTION, artifact=Scene(scale="unit"))
     path = solved(tmp_path / "solved.mcap", unit)
     subject = load_subject(path)
@@ -181,9 +183,7 @@ def test_devices_are_in_the_order_of_their_names(tmp_path: Path) -> None:
     assert [t.device for t in found] == ["7", "a/2", "a/11", "robot", "robot-9", "robot-10"]
 
 
-def test_poses_that_are_no_numbers_do_not_cost_the_others_their_errors(
-    session: Path, tmp_path: Path
-) -> None:
+def test_poses_that_are_not_finite_are_not_evaluated(session: Path, tmp_path: Path) -> None:
     some = replace(SOLUTION, trajectories=(track(off_m=2e-3),))
     some.trajectories[0].position[3] = np.nan
     subject = load_subject(solved(tmp_path / "solved.mcap", some))
