@@ -175,7 +175,7 @@ def _tag_panel(solution: Solution) -> Panel:
         f"{len(margins)} of {format_count(len(detections), 'passes')} over magnets "
         f"{'was' if len(margins) == 1 else 'were'} identified as a tag. Poses of tags are in the "
         "frame of the bar, with standard deviations. The margin is the difference between the "
-        "second nearest id and the nearest one, in steps of orientation."
+        "distances of the second nearest and the nearest id, in steps of orientation."
     )
     table = tag_table(detections, MAX_LISTED, compact=True)
     return _list_panel(note, table, "margin [steps]", margins, "passes")

@@ -124,10 +124,10 @@ def _draw_recording(title: str, signals: Signals, events: list[Event], note: str
     return Panel(
         title,
         join_sentences(
+            note,
             "" if events else "No landmark was detected.",
             "Hovering over a mark shows its landmark." if len(events) > MAX_EVENT_LABELS else "",
             LINES_THINNED if len(signals.time_s) > 2 * SIGNAL_COLUMNS else "",
-            note,
         ),
         diagrams.finish(420, ["vertical field [mT]"]),
     )

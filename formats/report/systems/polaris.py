@@ -192,12 +192,12 @@ def _draw_recording(
     return Panel(
         title,
         join_sentences(
+            note,
             "" if detections else "No magnet was detected.",
             "The positions of the sensors are unknown: they are numbered."
             if lateral_mm is None
             else "",
             LINES_THINNED if len(signals.time_s) > SIGNAL_COLUMNS else "",
-            note,
         ),
         diagrams.finish(
             620,

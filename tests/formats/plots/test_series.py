@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plots.series import (
@@ -17,6 +18,7 @@ from locatk.formats.plots.series import (
     origin_ns,
     overlap_in_time,
     pose_span_ns,
+    scored_covariance,
 )
 
 S = 1_000_000_000
@@ -86,3 +88,19 @@ def test_axes_leave_out_outliers() -> None:
     assert axis_limit(values) < 2
     assert axis_limit(np.zeros(3)) > 0
     assert axis_limit(np.full(3, np.nan)) > 0
+
+
+def test_a_rotation_mixes_unknown_axes_only_with_those_it_turns_them_into() -> None:
+    solved = solution(130)
+    solved.trajectories[0].covariance[:, :3, :3] = np.diag([np.nan, 1.0, 4.0])
+    evaluation: Any = SimpleNamespace(
+        n=1,
+        devices=("red",),
+        device=np.zeros(1, int),
+        time_ns=np.array([130 * S]),
+        align="sim3",
+        alignment=Similarity(2.0, rotation_exp([0.0, 0.0, 0.5]), np.zeros(3)),
+    )
+    (covariance,) = scored_covariance(solved, evaluation)
+    assert np.isnan(covariance[:2]).all()
+    assert covariance[2, 2] == pytest.approx(16.0)

@@ -26,9 +26,9 @@ from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, Tags, as_built_magne
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plots.floor_bars import MAX_LANDMARKS, bars_on_floor, cells_near
-from locatk.formats.plots.ground import MAX_LABELS
+from locatk.formats.plots.ground import MAX_LABELS, View
 from locatk.formats.plots.picture import draw_picture
-from locatk.formats.plots.shapes import Drawing, draw_artifact
+from locatk.formats.plots.shapes import Drawing, Label, draw_artifact
 
 START_NS = 1_000_000_000
 ROTATION = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -311,3 +311,11 @@ def test_of_a_large_floor_only_landmarks_near_the_path_are_drawn() -> None:
     figure = draw_picture(floor_solution(large, visit((0, 0)), y=4.0))
     assert len(figure.axes[0].texts) <= MAX_LABELS
     assert draw_picture(floor_solution(large, n=0)).axes
+
+
+def test_labels_are_written_only_if_they_do_not_overlap() -> None:
+    view = View((0, 1), np.zeros(2), np.ones(2))
+    labels = [Label(str(k), np.zeros(3)) for k in range(MAX_LABELS)]
+    outside = Label("outside", np.array([2.0, 0, 0]))
+    assert view.select_labels([*labels, outside]) == labels
+    assert view.select_labels([*labels, Label("one too many", np.zeros(3))]) == []

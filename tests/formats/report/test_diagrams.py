@@ -12,7 +12,15 @@ pytest.importorskip("plotly")
 
 from locatk.formats.plots.series import Series
 from locatk.formats.report import diagrams
-from locatk.formats.report.diagrams import ValueRow, allot_points, draw_values, thin
+from locatk.formats.report.diagrams import (
+    Event,
+    Signals,
+    ValueRow,
+    allot_points,
+    detail_panels,
+    draw_values,
+    thin,
+)
 
 
 @given(n=st.integers(0, 3000), most=st.integers(20, 500), peak=st.integers(0, 2999))
@@ -103,3 +111,25 @@ def test_a_reference_line_and_triangles_of_outliers_are_drawn() -> None:
     (triangle,) = (trace for trace in figure.data if trace.yaxis == "y2")
     assert_allclose(triangle.customdata, [50.0])
     assert "1 of 200 values lie beyond this scale" in note
+
+
+def test_thinned_values_contain_the_outliers() -> None:
+    value = np.ones(20_000)
+    value[12_345] = -7.0
+    series = {"red": Series(10**9 * np.arange(20_000), value)}
+    row = ValueRow("x [mm]", series, {})
+    figure, note = draw_values([row], {"red": "#000000"}, 0, signed=True)
+    assert np.nanmin(figure.data[0].y) == -7.0
+    assert "of 20\u202f000 values" in note
+
+
+def test_only_events_with_samples_are_drawn_in_detail() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    signals = Signals(time_s, np.ones((100, 1, 1)), ["s"], ["#000000"], ("field",), "%{y}")
+    events = [Event(start, start + 1, "", ("a", "b")) for start in (2.0, 30.0, 5.0)]
+    options = {"noun": "visits", "limit": 3, "row_height_px": 100}
+    margins = [(0.5, 0.5)] * 3
+    (panel,) = detail_panels("Visits", "", signals, events, [1.0] * 3, margins, **options)
+    assert panel.note.startswith("All 2 visits are drawn.")
+    assert_allclose([trace.x[0] for trace in panel.figure.data], [1.5, 4.5])
+    assert detail_panels("Visits", "", signals, events[1:2], [1.0], margins[:1], **options) == []

@@ -19,15 +19,17 @@ import pytest
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.errors import MissingDataError, OutputExistsError
 from locatk.core.evaluation import evaluate
+from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import GenericRecord, Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots.ground import finite_poses
+from locatk.formats.plots.ground import build_ground, finite_poses
 from locatk.formats.report.diagrams import MAX_POSES
 from locatk.formats.report.evaluation import covariance_panels, error_panels
 from locatk.formats.report.report import render_report, report_panels, write_report
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.trajectory_map import map_panels
 from locatk.formats.sessions.reader import Session
 
 START_NS = 1_767_225_600_000_000_000
@@ -360,6 +362,20 @@ def test_ellipses_have_the_right_size() -> None:
     np.testing.assert_allclose(np.ptp(first, axis=1), 2 * 2.4477 * np.array([0.2, 0.1]), rtol=1e-3)
 
 
+def test_ellipses_are_in_the_frame_of_the_truth() -> None:
+    t = track("red")
+    covariance = np.broadcast_to(np.diag([0.04, 0.01, 0.0]), (len(t), 3, 3))
+    wide = Trajectory.from_positions(t.device, t.frame, t.time_ns, t.position, covariance)
+    solved = replace(solution("red"), trajectories=(wide,))
+    to_truth = Similarity(0.5, rotation_exp([0.0, 0.0, np.pi / 2]), np.zeros(3))
+    ground = replace(build_ground(solved), transform=to_truth)
+    panel = map_panels(solved, ground, START_NS, "Trajectory")[0]
+    assert panel.figure is not None
+    (trace,) = [t for t in panel.figure.data if str(t.name).startswith("95 % ellipse")]
+    first = np.array([trace.x[:25], trace.y[:25]], float)
+    np.testing.assert_allclose(np.ptp(first, axis=1), 2 * 2.4477 * np.array([0.05, 0.1]), rtol=1e-3)
+
+
 def test_a_path_that_rises_is_seen_from_the_side() -> None:
     steep = replace(solution("red"), trajectories=(track("red", rise_m=0.1),))
     titles = [panel.title for panel in report_panels(evaluated(steep))]
@@ -393,8 +409,10 @@ def test_outliers_are_at_the_upper_limit_and_counted() -> None:
     (triangle,) = [t for t in panel.figure.data if t.yaxis == "y2"]
     np.testing.assert_allclose(triangle.customdata, [40_001.0], rtol=1e-6)
     assert panel.figure.layout.yaxis.range[1] < 10
-    (spread,) = figure(evaluated(solved), "Histogram of errors").figure.data
-    assert sum(spread.y) == 100
+    histogram = figure(evaluated(solved), "Histogram of errors").figure
+    assert sum(histogram.data[0].y) == 100
+    # The median and the 95 % quantile, both 1 mm.
+    np.testing.assert_allclose([line.x0 for line in histogram.layout.shapes], [1.0, 1.0], rtol=0.1)
 
 
 def test_errors_and_bands_are_those_of_the_solution() -> None:

@@ -220,6 +220,8 @@ def test_hall_signals_have_their_peaks_and_detections(tmp_path: Path) -> None:
     assert refused.text[0] == "misread<br>2,3<br>NNNS"
     assert "refused: misread" in refused.customdata[0]
     assert "All 3 visits are drawn." in near.note
+    lines = [shape.x0 for shape in near.figure.layout.shapes]
+    assert_allclose(lines, [20, 50, 90], atol=0.01)  # the time of each detection
     assert len(field) == 30_000
 
 
