@@ -40,6 +40,7 @@ MAX_DETECTION_DELAY_NS = 1_000_000_000
 """Time between a detection and the nearest pose up to which the detection is drawn on the path."""
 
 SHEET_CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+"""Corners of a sheet in units of its width and height."""
 
 
 @dataclass(frozen=True)

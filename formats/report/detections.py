@@ -23,6 +23,7 @@ MAX_LISTED = 20
 """Number of detections in the table of a report; ``locatk solve --json`` lists all."""
 
 HISTOGRAM_BINS = 40
+"""Number of bins of a histogram; up to two share the width of a page."""
 
 DEGREES_PER_RADIAN = math.degrees(1)
 

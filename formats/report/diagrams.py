@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -223,8 +223,7 @@ class Signals:
     def between(self, start_s: float, stop_s: float) -> Signals:
         """Return the samples in an interval of time."""
         inside = (self.time_s >= start_s) & (self.time_s <= stop_s)
-        rest = (self.names, self.colors, self.components, self.hover)
-        return Signals(self.time_s[inside], self.value[inside], *rest)
+        return replace(self, time_s=self.time_s[inside], value=self.value[inside])
 
 
 class Diagrams:
@@ -540,6 +539,23 @@ class ValueRow:
     values: dict[str, Series]
     expected: dict[str, Series]
 
+    def __post_init__(self) -> None:
+        """Remove devices without values, and expected values that are unknown or too many."""
+        values = {name: s for name, s in self.values.items() if len(s.value)}
+        known = {name: s for name, s in self.expected.items() if np.isfinite(s.value).any()}
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "expected", known if len(known) <= MAX_EXPECTED_DEVICES else {})
+
+    def magnitudes(self) -> Array:
+        """Return the finite absolute values of all devices."""
+        return np.concatenate([np.abs(s.value[np.isfinite(s.value)]) for s in self.values.values()])
+
+    def limit(self, reference: float | None) -> float:
+        """Return the upper limit of the value axis, which includes a reference value."""
+        bounds = [s.value for s in self.expected.values()]
+        limit = axis_limit(self.magnitudes(), np.concatenate(bounds) if bounds else None)
+        return limit if reference is None else max(limit, 1.15 * reference)
+
 
 def draw_values(
     rows: Sequence[ValueRow],
@@ -574,48 +590,41 @@ def draw_values(
     """
     figure: Figure = make_subplots(len(rows), 1, shared_xaxes=True, vertical_spacing=0.05)
     beyond = total = shown = 0
-    shading: set[int] = set()
     for number, row in enumerate(rows, start=1):
-        values = {name: s for name, s in row.values.items() if len(s.value)}
-        expected = {n: s for n, s in row.expected.items() if np.isfinite(s.value).any()}
-        if len(expected) > MAX_EXPECTED_DEVICES:
-            expected = {}
-        shading.add(len(expected))
-        every = np.concatenate([np.abs(s.value[np.isfinite(s.value)]) for s in values.values()])
-        bounds = [s.value for s in expected.values()]
-        limit = axis_limit(every, np.concatenate(bounds) if bounds else None)
-        if reference is not None:
-            limit = max(limit, 1.15 * reference)
-            line = {"color": INK, "width": 1.2, "dash": "dash"}
-            figure.add_hline(y=reference, line=line, exclude_empty_subplots=False)
-        beyond += int(np.count_nonzero(every > limit))
-        total += len(every)
-        counts = allot_points([len(s.value) for s in values.values()], MAX_POSES // len(rows))
-        mode = "markers" if as_marks else _line_mode(len(values), sum(counts))
-        for k, ((name, s), count) in enumerate(zip(values.items(), counts, strict=True)):
-            kept = thin(len(s.value), count, np.abs(s.value))
-            shown += len(kept)
-            if name in expected:
-                is_first = k == 0 and number == 1
-                for trace in _expected_traces(
-                    expected[name], start_ns, colors[name], signed, len(expected) == 1, is_first
-                ):
-                    figure.add_trace(trace, row=number, col=1)
+        limit, magnitude = row.limit(reference), row.magnitudes()
+        beyond += int(np.count_nonzero(magnitude > limit))
+        total += len(magnitude)
+        counts = allot_points([len(s.value) for s in row.values.values()], MAX_POSES // len(rows))
+        kept = {
+            name: thin(len(s.value), count, np.abs(s.value))
+            for (name, s), count in zip(row.values.items(), counts, strict=True)
+        }
+        shown += sum(map(len, kept.values()))
+        mode = "markers" if as_marks else _line_mode(len(kept), sum(counts))
+        for k, (name, s) in enumerate(row.values.items()):
+            traces = []
+            if name in row.expected:
+                is_first, is_only = k == 0 and number == 1, len(row.expected) == 1
+                bound = row.expected[name]
+                traces = _expected_traces(bound, start_ns, colors[name], signed, is_only, is_first)
             look = {
-                "type": "scatter",
                 "name": escape(abbreviate(name)),
                 "legendgroup": name,
                 "legendrank": DEVICE_LEGEND_RANK,
-                "showlegend": number == 1 and len(values) > 1 and is_in_legend(k, len(values)),
+                "showlegend": number == 1 and len(kept) > 1 and is_in_legend(k, len(kept)),
             }
             for trace in _value_traces(
-                s, kept, start_ns, colors[name], mode, limit if as_marks else None
+                s, kept[name], start_ns, colors[name], mode, limit if as_marks else None
             ):
+                traces.append({**look, **trace})
+            for trace in traces:
                 # Triangles are on an overlaid axis, which is not one of a row.
                 cell = {} if "yaxis" in trace else {"row": number, "col": 1}
-                figure.add_trace({**look, **trace}, **cell)
-        title = {"title": {"text": row.title}}
-        figure.update_yaxes(**title, range=[-limit if signed else 0, limit], row=number, col=1)
+                figure.add_trace({"type": "scatter", **trace}, **cell)
+        limits = [-limit if signed else 0, limit]
+        figure.update_yaxes(title={"text": row.title}, range=limits, row=number, col=1)
+    if reference is not None:
+        figure.add_hline(y=reference, line={"color": INK, "width": 1.2, "dash": "dash"})
     figure.update_xaxes(title={"text": "time [s]"}, row=len(rows), col=1)
     height = 360 if as_marks else ROW_HEIGHT_PX * len(rows) + 60
     figure.update_layout(height=height)
@@ -623,7 +632,7 @@ def draw_values(
         overlay = {"overlaying": "y", "range": [0, 1], "fixedrange": True, "visible": False}
         figure.update_layout(yaxis2=overlay)
     note = join_sentences(
-        _expected_note(max(shading), signed),
+        _expected_note(max(len(row.expected) for row in rows), signed),
         f"{format_count(beyond)} of {format_count(total, 'values')} lie beyond "
         + ("this scale (triangles)" if as_marks else "these scales")
         + ": double-click to see them."
@@ -688,7 +697,6 @@ def _expected_traces(
     rows = np.column_stack([(s.time_ns[kept] - start_ns) * 1e-9, s.value[kept]])
     x, y = interrupt_at_gaps(rows, s.time_ns, kept).T
     look: dict[str, Any] = {
-        "type": "scatter",
         "x": x,
         "mode": "lines",
         "name": "95 % expected",

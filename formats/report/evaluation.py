@@ -34,6 +34,7 @@ from locatk.formats.report.style import INK
 from locatk.formats.report.subject import Subject
 
 HISTOGRAM_BINS = 50
+"""Number of bins of the histogram of errors, on an axis of about 900 pixels."""
 
 ALL_DEVICES_COLOR = "#8896a3"
 """Color of a histogram of more devices than a legend names."""
@@ -41,8 +42,8 @@ ALL_DEVICES_COLOR = "#8896a3"
 UNSOLVED_DEVICE_COLOR = "#5b6875"
 """Color of a device in the evaluation that is not in the solution."""
 
-MIN_RELATIVE_ERROR = 1e-9
-"""Error in z [m] up to which estimate and truth are in one plane, and z is not drawn."""
+MIN_HEIGHT_ERROR_M = 1e-9
+"""Largest error in z up to which estimate and truth are in one plane, and z is not drawn."""
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "p95")
 
@@ -273,7 +274,7 @@ def _axis_panel(
     bound = NORMAL_95_QUANTILE * np.sqrt(np.einsum("nii->ni", covariance)) * unit.per_si
     rows = []
     for axis, name in enumerate("xyz"):
-        if axis == 2 and not np.abs(evaluation.residuals[:, 2]).max() > MIN_RELATIVE_ERROR:
+        if axis == 2 and not np.abs(evaluation.residuals[:, 2]).max() > MIN_HEIGHT_ERROR_M:
             continue
         values = split_by_device(evaluation, residual[:, axis])
         expected = split_by_device(evaluation, bound[:, axis])

@@ -28,6 +28,7 @@ MAX_UNBROKEN_CHARACTERS = 28
 """Length of a cell of a table up to which it stays on one line."""
 
 DEFAULT_FIGURE_HEIGHT_PX = 380
+"""Height of a figure whose layout has none."""
 
 
 def document(title: str, body: Sequence[str]) -> str:

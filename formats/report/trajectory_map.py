@@ -45,6 +45,7 @@ MAX_ELLIPSES = 40
 """Number of covariance ellipses on a map; more would cover the trajectories."""
 
 ELLIPSE_POINTS = 25
+"""Number of points of the outline of an ellipse, the first and the last of which are equal."""
 
 ELLIPSE_95_SIGMAS = float(np.sqrt(-2 * np.log(0.05)))
 """Semi-axes in sigmas of the ellipse that contains 95 % of a normal distribution in the plane."""

@@ -40,6 +40,7 @@ MAX_PICTURES = 8
 """Number of frames that are shown, of all cameras together."""
 
 MIN_PICTURES_PER_CAMERA = 2
+"""Number of frames that are shown of each camera, however many cameras there are."""
 
 MAX_REJECTED_PICTURES = 3
 """Number of reasons of rejection of which a frame is shown."""
