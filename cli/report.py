@@ -1,4 +1,4 @@
-"""``locatk report``: solutions as one page to look at and to share."""
+"""``locatk report``: one HTML page on solutions, and pictures of them."""
 
 from __future__ import annotations
 
@@ -9,35 +9,44 @@ from pathlib import Path
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command, section
 from locatk.cli.eval.command import align_option, offset_option
 
-PAGES = (".html", ".htm")
-PICTURES = (".png", ".pdf", ".svg")
+PAGE_SUFFIXES = (".html", ".htm")
+PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
-@click.command(short_help="Show solutions on one page that opens anywhere.")
+@click.command(cls=Command, short_help="Show solutions on one HTML page.")
 @options.input_argument("solutions", many=True)
-@options.output("Page to write (.html), or just a picture (.png, .pdf, .svg).")
-@options.input_option(
-    "--session",
-    "sessions",
-    many=True,
-    metavar="FILE",
-    help="The recording that was solved. [default: the one that the solution names, beside it]",
-)
-@options.input_option(
-    "--truth",
-    metavar="FILE",
-    help="Reference poses: a session, a solution, TUM, KITTI or CSV. [default: the session's]",
-)
-@align_option
-@offset_option
-@click.option("--png", is_flag=True, help="Write pictures beside the page too: report.png.")
-@click.option("--pdf", is_flag=True, help="The same as PDF.")
-@click.option("--svg", is_flag=True, help="The same as SVG.")
+@options.output("Page (.html), or a picture only (.png, .pdf, .svg).")
 @options.overwrite
-@options.as_json
-@options.verbosity
+@section(
+    "Session and truth",
+    options.input_option(
+        "--session",
+        "sessions",
+        many=True,
+        metavar="FILE",
+        help="Recording that was solved. Repeatable.  "
+        "[default: the session that the solution names, in its folder]",
+    ),
+    options.input_option(
+        "--truth",
+        metavar="FILE",
+        help="Reference poses: a session, a solution, TUM, KITTI or CSV.  "
+        "[default: those of the session]",
+    ),
+    align_option,
+    offset_option,
+)
+@section(
+    "Output",
+    click.option("--png", is_flag=True, help="Also write a picture of each solution: report.png."),
+    click.option("--pdf", is_flag=True, help="Also write a picture as PDF."),
+    click.option("--svg", is_flag=True, help="Also write a picture as SVG."),
+    options.as_json,
+    options.verbosity,
+)
 def command(
     solutions: tuple[Path, ...],
     output: Path,
@@ -51,11 +60,11 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Show SOLUTIONS on one page: is it good, and what does it stand on?
+    """Show the quality of SOLUTIONS on one HTML page.
 
-    The page is one file that opens in any browser without a network: the path over the
-    artifact, errors where there is truth, what was rejected and why, covariances, raw
-    signals, and the facts of the run. A solution's session is found beside it.
+    The page is one file that opens in any browser without a network. It contains a map of
+    the trajectories over the artifact, errors if there is truth, rejected observations with
+    reasons, covariances, the recorded signals, and facts of the run.
 
     \b
     Examples:
@@ -65,43 +74,44 @@ def command(
       locatk report bundle.mcap paper.mcap -o both.html --png
       locatk report solved.mcap -o figure.svg
     """
-    kinds = [kind for kind, wanted in zip(PICTURES, (png, pdf, svg), strict=True) if wanted]
-    page, pictures = plan(solutions, output, kinds)
+    flags = zip(PICTURE_SUFFIXES, (png, pdf, svg), strict=True)
+    page, pictures = plan_outputs(solutions, output, [suffix for suffix, on in flags if on])
     inputs = [*solutions, *sessions, *([] if truth is None else [truth])]
     for path in [*([] if page is None else [page]), *(p for row in pictures for p in row)]:
         options.guard_output(path, overwrite=overwrite, inputs=inputs)
-    given = _sessions_of(solutions, sessions)
+    session_of = _match_sessions(solutions, sessions)
 
-    from locatk.formats.report import subjects
+    from locatk.formats.report.evaluation import why_not_evaluated
+    from locatk.formats.report.subject import load_subject
 
     with console.working("Reading"):
-        found = [
-            subjects.load(path, session=session, truth=truth, align=align, offset_s=offset)  # type: ignore[arg-type]
-            for path, session in zip(solutions, given, strict=True)
+        subjects = [
+            load_subject(path, session=session, truth=truth, align=align, offset_s=offset)  # type: ignore[arg-type]
+            for path, session in zip(solutions, session_of, strict=True)
         ]
-    count = Counter(subject.name for subject in found)
-    found = [
+    count = Counter(subject.name for subject in subjects)
+    subjects = [
         replace(subject, name=str(path)) if count[subject.name] > 1 else subject
-        for subject, path in zip(found, solutions, strict=True)
+        for subject, path in zip(subjects, solutions, strict=True)
     ]
-    for subject in found:
+    for subject in subjects:
         if subject.truth and subject.evaluation is None:
-            from locatk.formats.report.evaluation import why_unjudged
+            console.warn(f"{subject.name}: {why_not_evaluated(subject)}")
 
-            console.warn(f"{subject.name}: {why_unjudged(subject)}")
     written = []
     with console.working("Drawing"):
         if page is not None:
             from locatk.formats.report.report import write_report
 
-            write_report(page, found, overwrite=overwrite)
+            write_report(page, subjects, overwrite=overwrite)
             written.append(page)
-        for subject, row in zip(found, pictures, strict=True):
+        for subject, row in zip(subjects, pictures, strict=True):
             for path in row:
-                from locatk.formats.plots.solution import plot_solution
-                from locatk.formats.plots.time_axis import origin_ns
+                # matplotlib, which takes 0.5 s to import, is needed for pictures only.
+                from locatk.formats.plots.picture import write_picture
+                from locatk.formats.plots.series import origin_ns
 
-                plot_solution(
+                write_picture(
                     path,
                     subject.solution,
                     truth=subject.truth,
@@ -116,40 +126,45 @@ def command(
         console.result(f"Wrote {path}")
 
 
-def plan(
-    solutions: tuple[Path, ...], output: Path, kinds: list[str]
+def plan_outputs(
+    solutions: tuple[Path, ...], output: Path, picture_suffixes: list[str]
 ) -> tuple[Path | None, list[list[Path]]]:
-    """The page, None where only pictures are wanted, and the pictures of each solution."""
+    """Return the page, None if only pictures are wanted, and the pictures of each solution."""
     suffix = output.suffix.lower()
-    if suffix not in PAGES + PICTURES:
+    if suffix not in PAGE_SUFFIXES + PICTURE_SUFFIXES:
+        names = ", ".join((PAGE_SUFFIXES[0], *PICTURE_SUFFIXES))
         raise click.UsageError(
-            f"{output.name!r} is neither a page nor a picture: end its name with "
-            f"{', '.join((PAGES[0], *PICTURES))}."
+            f"{output.name!r} is not the name of a page or a picture. Use one of {names}."
         )
-    page = output if suffix in PAGES else None
-    wanted = list(dict.fromkeys(([] if page else [suffix]) + kinds))
-    names = [""]
-    if len(solutions) > 1:
-        count: Counter[str] = Counter()
-        names = []
-        for path in solutions:
-            count[path.stem] += 1
-            twin = f"-{count[path.stem]}" if count[path.stem] > 1 else ""
-            names.append(f"-{path.stem}{twin}")
-    pictures = [
-        [
-            output
-            if not page and not name and kind == suffix
-            else output.with_name(f"{output.stem}{name}{kind}")
-            for kind in wanted
+    if suffix in PICTURE_SUFFIXES:
+        page = None
+        suffixes = list(dict.fromkeys([suffix, *picture_suffixes]))
+    else:
+        page = output
+        suffixes = picture_suffixes
+    if len(solutions) == 1:
+        pictures = [
+            output if not page and each == suffix else output.with_suffix(each) for each in suffixes
         ]
-        for name in names
+        return page, [pictures]
+    return page, [
+        [output.with_name(f"{output.stem}-{name}{each}") for each in suffixes]
+        for name in _unique_stems(solutions)
     ]
-    return page, pictures
 
 
-def _sessions_of(solutions: tuple[Path, ...], sessions: tuple[Path, ...]) -> list[Path | None]:
-    """The session given for each solution: the only one for the only one, else by its name."""
+def _unique_stems(paths: tuple[Path, ...]) -> list[str]:
+    """Return the stem of each file, with a number if an earlier file has the same."""
+    count: Counter[str] = Counter()
+    stems = []
+    for path in paths:
+        count[path.stem] += 1
+        stems.append(path.stem + (f"-{count[path.stem]}" if count[path.stem] > 1 else ""))
+    return stems
+
+
+def _match_sessions(solutions: tuple[Path, ...], sessions: tuple[Path, ...]) -> list[Path | None]:
+    """Return the session given for each solution: the only one, else that with its name."""
     if not sessions:
         return [None] * len(solutions)
     if len(solutions) == len(sessions) == 1:
@@ -158,9 +173,9 @@ def _sessions_of(solutions: tuple[Path, ...], sessions: tuple[Path, ...]) -> lis
 
     by_name = {path.name: path for path in sessions}
     if len(by_name) < len(sessions):
-        raise click.UsageError("Two of the --session have the same name.")
-    found = [by_name.get(Session.open(path).facts.get("source", "")) for path in solutions]
+        raise click.UsageError("Two of the given sessions have the same name.")
+    matched = [by_name.get(Session.open(path).facts.get("source", "")) for path in solutions]
     for path in sessions:
-        if path not in found:
-            raise click.UsageError(f"No solution was made of --session {path.name}.")
-    return found
+        if path not in matched:
+            raise click.UsageError(f"No solution is from the session {path.name}.")
+    return matched

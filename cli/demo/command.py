@@ -164,9 +164,9 @@ def run_system(
     from locatk.core.evaluation import evaluate, pair_devices
     from locatk.formats.pipeline import SolveRequest, solve_session
     from locatk.formats.pipeline.provenance import command_line, source_facts
-    from locatk.formats.plots.solution import plot_solution
-    from locatk.formats.plots.time_axis import origin_ns
-    from locatk.formats.report import subjects
+    from locatk.formats.plots.picture import write_picture
+    from locatk.formats.plots.series import origin_ns
+    from locatk.formats.report.subject import load_subject
     from locatk.formats.sessions import solutions
 
     session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
@@ -180,10 +180,10 @@ def run_system(
         solutions.write_solution(
             solution, solved.solution, source=session, facts=facts, overwrite=overwrite
         )
-    subject = subjects.load(solution, session=session)
+    subject = load_subject(solution, session=session)
     if is_plotted:
         with console.working(f"Drawing {system}"):
-            plot_solution(
+            write_picture(
                 folder / f"{system}.png",
                 solved.solution,
                 truth=truths,

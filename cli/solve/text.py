@@ -88,14 +88,14 @@ def _device_table(report: SolveReport) -> str:
 
 def _detection_table(report: SolveReport) -> str:
     """Format the detected tags or landmarks; empty for the other systems."""
-    from locatk.formats.report import detection_tables
+    from locatk.formats.report.detections import landmark_table, tag_table
 
     if report.system not in ("polaris", "landmarks") or not report.detections:
         return ""
     if report.system == "polaris":
-        detected = detection_tables.tags(report.detections)
+        detected = tag_table(report.detections)
     else:
-        detected = detection_tables.landmarks(report.detections, MAX_LANDMARKS)
+        detected = landmark_table(report.detections, MAX_LANDMARKS)
     table = console.table(detected.header, detected.rows)
-    more = f"\n... and {detected.more} more: see --json" if detected.more else ""
+    more = f"\n... and {detected.omitted} more: see --json" if detected.omitted else ""
     return f"{table}{more}"

@@ -26,7 +26,7 @@ from locatk.core.errors import (
     OutputExistsError,
 )
 from locatk.formats.output import check_output
-from locatk.formats.sessions.mcap_file import DamageError
+from locatk.formats.sessions.mcap_file import SESSION_RECORD, DamageError
 from locatk.formats.sessions.reader import Session, read_index
 
 OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss")

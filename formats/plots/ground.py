@@ -1,7 +1,7 @@
-"""What lies on the ground under a solution's paths, and the view that holds it: no drawing yet.
+"""Trajectories and the artifact under them in one frame and unit, and the view that shows them.
 
-Shared by the pictures (:mod:`locatk.formats.plots.solution`) and the pages
-(:mod:`locatk.formats.report`).
+Nothing is drawn here: :mod:`locatk.formats.plots.picture` (matplotlib) and
+:mod:`locatk.formats.report.trajectory_map` (plotly) draw the same :class:`Ground`.
 """
 
 from __future__ import annotations
@@ -12,43 +12,38 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
 from locatk.core.evaluation import Evaluation, evaluate
 from locatk.core.geometry import Similarity
-from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots import floor as plot_floor
-from locatk.formats.plots.floor import Floor, floor_of
-from locatk.formats.plots.tags import Tag, tags_of
+from locatk.formats.plots.shapes import (
+    STATION,
+    Drawing,
+    Label,
+    Shape,
+    draw_artifact,
+    draw_markers,
+)
 
 Array = NDArray[np.float64]
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D")
-"""Okabe and Ito's, which the colour-blind can tell apart, without yellow."""
+MAX_STATION_DISTANCE_WIDTHS = 1.0
+"""Distance from the trajectories, in widths of the view, up to which the view contains a station.
+Farther stations are indicated by an arrow at the margin."""
 
-IN_LEGEND = 8
-"""Devices that a legend names, at most."""
+MARGIN_FACTOR, LABEL_MARGIN_FACTOR = 1.12, 1.45
+"""Ratio of the view to its contents, without and with labels of far stations at the margin."""
 
-NEAR = 1.0
-"""A station is drawn in its place up to this far outside the paths, in widths of these;
-beyond, at the margin."""
+MIN_VIEW_WIDTH_M = 0.01
+"""Least width of a view; a single pose has no extent."""
 
-TRUTH_COLOR, SCENE_COLOR, FOUND_COLOR, PAPER_COLOR = "#BFBFBF", "#333333", "#D55E00", "#8C8C8C"
+MAX_LABELS = 40
+"""Number of labels in the view up to which they are written; more would overlap."""
 
-BREAK_NS = 500_000_000
-"""A path is not drawn across a longer silence."""
-
-
-@dataclass(frozen=True)
-class Paper:
-    """A sheet of dots: corners of the paper and of its pattern, (4, 3) each."""
-
-    name: str
-    frame: str
-    paper: Array
-    pattern: Array
+POSITION_FORMATS = {"m": ".4f", "mm": ".3f", "unit": ".4f"}
+"""Format of a coordinate in each unit."""
 
 
 @dataclass(frozen=True)
@@ -58,145 +53,104 @@ class Ground:
     Attributes
     ----------
     paths : dict of str to (n, 3) ndarray
-        By device.
+        Positions of each device.
     times : dict of str to (n,) int64 ndarray
         Their stamps in ns.
     truth : tuple of Trajectory
-    scene : Scene
-        Stations and markers; empty for other systems.
-    tags, floor, papers
-        What else the devices can find.
-    unit : str
-        Of all lengths: ``"m"``, or ``"unit"`` where the scene has no scale.
-    to : Similarity
+    stations : tuple of Station
+        Lighthouse base stations; empty for other systems.
+    markers, artifact : Drawing
+        Markers of a Lighthouse scene; sheets, tags or landmarks.
+    unit : {"m", "mm", "unit"}
+        Of all lengths; ``"unit"`` if the scene has no scale.
+    transform : Similarity
         From the solution's frame into this one.
     """
 
     paths: dict[str, Array]
     times: dict[str, NDArray[np.int64]]
     truth: tuple[Trajectory, ...]
-    scene: Scene
-    tags: tuple[Tag, ...]
-    floor: Floor | None
-    papers: tuple[Paper, ...]
+    stations: tuple[Station, ...]
+    markers: Drawing
+    artifact: Drawing
     unit: str
-    to: Similarity
+    transform: Similarity
 
     def scaled(self, factor: float, unit: str) -> Ground:
-        """The same in another unit."""
-        by = Similarity(factor, np.eye(3), np.zeros(3))
-        to = Similarity(factor * self.to.scale, self.to.rotation, factor * self.to.translation)
-        truth = tuple(replace(t, position=factor * t.position) for t in self.truth)
-        moved = _moved(self, by)
-        paths = {name: factor * path for name, path in self.paths.items()}
-        return replace(moved, paths=paths, truth=truth, unit=unit, to=to)
+        """Return the same in another unit."""
+        scaling = Similarity(factor, np.eye(3), np.zeros(3))
+        to = self.transform
+        return replace(
+            self._transformed(scaling),
+            truth=tuple(replace(t, position=factor * t.position) for t in self.truth),
+            unit=unit,
+            transform=Similarity(factor * to.scale, to.rotation, factor * to.translation),
+        )
 
-    def outlines(self) -> list[Array]:
-        """Points (n, 3) that the view must hold, apart from the paths."""
-        points = [t.position for t in self.truth]
-        points += [m.position[None] for m in self.scene.markers]
-        points += [ends for tag in self.tags for ends in (tag.known.tail, tag.known.tip)]
-        points += [paper.paper for paper in self.papers]
-        return points + ([] if self.floor is None else plot_floor.solid(self.floor))
-
-
-def known(t: Trajectory) -> Trajectory:
-    """The poses of a trajectory whose positions are numbers: the others cannot be judged."""
-    whole = np.isfinite(t.position).all(axis=1)
-    if whole.all():
-        return t
-    return replace(
-        t,
-        time_ns=t.time_ns[whole],
-        position=t.position[whole],
-        quaternion=t.quaternion[whole],
-        covariance=t.covariance[whole],
-    )
+    def _transformed(self, to: Similarity) -> Ground:
+        """Return everything but the truth in another frame."""
+        stations = (
+            replace(s, position=to.apply(s.position), rotation=to.rotation @ s.rotation)
+            for s in self.stations
+        )
+        return replace(
+            self,
+            paths={name: to.apply(path) for name, path in self.paths.items()},
+            stations=tuple(stations),
+            markers=self.markers.transformed(to),
+            artifact=self.artifact.transformed(to),
+            transform=to,
+        )
 
 
-def compare(solution: Solution, truth: Sequence[Trajectory]) -> Evaluation | None:
-    """The solution against the truth as it is; None where no pose has truth."""
-    true = {t.device: known(t) for t in truth}
-    solved = [known(t) for t in solution.trajectories]
-    pairs = [(t, true[t.device]) for t in solved if t.device in true and len(t)]
+def finite_poses(trajectory: Trajectory) -> Trajectory:
+    """Return the poses with finite positions, which alone can be compared with the truth."""
+    is_finite = np.asarray(np.isfinite(trajectory.position).all(axis=1))
+    return trajectory if is_finite.all() else trajectory.select(is_finite)
+
+
+def evaluate_unaligned(solution: Solution, truth: Sequence[Trajectory]) -> Evaluation | None:
+    """Evaluate the solution without alignment; None if no pose has truth."""
+    truth_of = {t.device: finite_poses(t) for t in truth}
+    solved = [finite_poses(t) for t in solution.trajectories]
+    pairs = [(t, truth_of[t.device]) for t in solved if t.device in truth_of and len(t)]
     try:
         return evaluate(pairs) if pairs else None
     except InputError:
         return None
 
 
-def has_no_scale(solution: Solution) -> bool:
-    """Whether lengths are in units of the scene, not in metres."""
+def is_unscaled(solution: Solution) -> bool:
+    """Return whether lengths are in units of the scene instead of metres."""
     scene = solution.artifact
     return isinstance(scene, Scene) and solution.system == "lighthouse" and scene.scale == "unit"
 
 
-def ground_of(
+def is_shown_unscaled(solution: Solution, evaluation: Evaluation | None) -> bool:
+    """Return whether lengths are still unscaled after the alignment of the evaluation."""
+    return is_unscaled(solution) and not (evaluation and evaluation.align.startswith("sim"))
+
+
+def build_ground(
     solution: Solution, truth: Sequence[Trajectory] = (), evaluation: Evaluation | None = None
 ) -> Ground:
-    """What a map of the solution shows, with an evaluation in the frame of its truth.
+    """Return the contents of a map, in the frame of the truth if there is an evaluation.
 
-    The truth is left out where the solution has no scale and was not given one.
+    The truth is omitted if the solution has no scale and the evaluation estimated none.
     """
     scene = solution.artifact if isinstance(solution.artifact, Scene) else Scene()
-    unscaled = has_no_scale(solution) and not (evaluation and evaluation.align.startswith("sim"))
+    unscaled = is_shown_unscaled(solution, evaluation)
     ground = Ground(
         paths={t.device: t.position for t in solution.trajectories},
         times={t.device: t.time_ns for t in solution.trajectories},
         truth=() if unscaled else tuple(truth),
-        scene=scene,
-        tags=tags_of(solution),
-        floor=floor_of(solution),
-        papers=_papers(solution),
+        stations=tuple(scene.stations),
+        markers=draw_markers(scene),
+        artifact=draw_artifact(solution),
         unit="unit" if unscaled else "m",
-        to=Similarity.identity(),
+        transform=Similarity.identity(),
     )
-    if evaluation is None:
-        return ground
-    to = evaluation.alignment
-    paths = {name: to.apply(path) for name, path in ground.paths.items()}
-    return replace(_moved(ground, to), paths=paths, to=to)
-
-
-def _moved(ground: Ground, to: Similarity) -> Ground:
-    """All but the paths and the truth in another frame."""
-    scene = replace(
-        ground.scene,
-        stations=tuple(
-            replace(s, position=to.apply(s.position), rotation=to.rotation @ s.rotation)
-            for s in ground.scene.stations
-        ),
-        markers=tuple(replace(m, position=to.apply(m.position)) for m in ground.scene.markers),
-    )
-    return replace(
-        ground,
-        scene=scene,
-        tags=tuple(tag.moved(to) for tag in ground.tags),
-        floor=None if ground.floor is None else ground.floor.moved(to),
-        papers=tuple(
-            replace(p, paper=to.apply(p.paper), pattern=to.apply(p.pattern)) for p in ground.papers
-        ),
-    )
-
-
-def _papers(solution: Solution) -> tuple[Paper, ...]:
-    """The sheets in whose frames there are poses; of tiles on a floor, all."""
-    manifest = solution.artifact
-    if not isinstance(manifest, Manifest):
-        return ()
-    frames = {t.frame for t in solution.trajectories}
-    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    found = []
-    for number, sheet in enumerate(manifest.sheets):
-        if manifest.frame(number) not in frames:
-            continue
-        origin = np.array(sheet.origin, float)
-        paper = origin + (square * sheet.page_mm - sheet.first_mm) / manifest.pitch_mm
-        pattern = origin + square * (np.array(sheet.size) - 1)
-        corners = (manifest.to_metres(number, at) for at in (paper, pattern))
-        flat = [np.column_stack([at, np.zeros(4)]) for at in corners]
-        found.append(Paper(sheet.id, manifest.frame(number), flat[0], flat[1]))
-    return tuple(found)
+    return ground if evaluation is None else ground._transformed(evaluation.alignment)
 
 
 # ---- the view
@@ -204,127 +158,145 @@ def _papers(solution: Solution) -> tuple[Paper, ...]:
 
 @dataclass(frozen=True)
 class View:
-    """A rectangle of the map: its middle (2,) and half its width and height (2,)."""
+    """Rectangle of the map, in the plane of two of its axes.
 
-    middle: Array
-    half: Array
+    Attributes
+    ----------
+    plane : tuple of int
+        Axes to the right and upwards: (0, 1) from above, (0, 2) from the side.
+    centre, half_size : (2,) ndarray
+    """
+
+    plane: tuple[int, int]
+    centre: Array
+    half_size: Array
 
     @property
     def limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Of x and of y."""
-        low, high = self.middle - self.half, self.middle + self.half
+        """Limits of both axes."""
+        low, high = self.centre - self.half_size, self.centre + self.half_size
         return (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
 
-    def outside(self, points: Array) -> int:
-        """How many of the points (n, 2) it does not show."""
-        return int(np.count_nonzero(np.any(np.abs(points - self.middle) > self.half, axis=1)))
+    def project(self, points: Array) -> Array:
+        """Return the two coordinates (..., 2) of points (..., 3) in this plane."""
+        return points[..., list(self.plane)]
+
+    def count_outside(self, points: Array) -> int:
+        """Return how many of the points (n, 3) the view does not contain."""
+        offset = np.abs(self.project(points) - self.centre)
+        return int(np.count_nonzero(np.any(offset > self.half_size, axis=1)))
+
+    def select_labels(self, labels: Sequence[Label]) -> list[Label]:
+        """Return the labels in the view, none if there are more than :data:`MAX_LABELS`."""
+        inside = [label for label in labels if not self.count_outside(label.position[None])]
+        return inside if len(inside) <= MAX_LABELS else []
 
 
-@dataclass(frozen=True)
-class Pointer:
-    """An arrow for a station: from itself the way it looks, or at the margin the way to it."""
+def fit_view(
+    ground: Ground, *, max_aspect: float = 1.0, plane: tuple[int, int] = (0, 1)
+) -> tuple[Ground, View, Drawing]:
+    """Fit a view to a map, and convert a map below a metre to millimetres.
 
-    label: str
-    inside: bool
-    at: Array
-    tip: Array
-    label_at: Array
+    The view contains the artifact, the truth and all solved poses but the outermost percent, which
+    may be outliers. It is at most ``max_aspect`` times as wide as high, and never higher than wide.
 
-
-def framed(
-    ground: Ground, *, widest: float = 1.0, plane: tuple[int, int] = (0, 1)
-) -> tuple[Ground, View, tuple[Pointer, ...]]:
-    """A map in the unit that suits its size (mm below a metre), with what :func:`view_of` says."""
-    view, pointers = view_of(ground, widest=widest, plane=plane)
-    if ground.unit != "m" or 2 * view.half.max() >= 1:
-        return ground, view, pointers
-    ground = ground.scaled(1e3, "mm")
-    return ground, *view_of(ground, widest=widest, plane=plane, least=10.0)
-
-
-def view_of(
-    ground: Ground,
-    *,
-    widest: float = 1.0,
-    plane: tuple[int, int] = (0, 1),
-    least: float = 0.01,
-) -> tuple[View, tuple[Pointer, ...]]:
-    """The rectangle that shows a map, at most ``widest`` times as wide as high, and never higher
-    than wide; and the stations in it or at its margin.
-
-    It holds what is known, and of the solved poses all but the outermost, which may be wild.
-    ``plane`` are the columns that go right and up; ``least`` is the least width.
+    Returns
+    -------
+    ground : Ground
+        In the unit that suits the size of the view.
+    view : View
+    stations : Drawing
+        Stations in the view with an arrow in their viewing direction; other stations as an arrow
+        at the margin that points to them, with their distance.
     """
-    axes = list(plane)
-    box = _box(list(ground.paths.values()), ground.outlines(), axes)
-    places = np.array([s.position[axes] for s in ground.scene.stations]).reshape(-1, 2)
-    middle, half = _rectangle(box, 1.0, least)
-    near = np.max(np.abs(places - middle), axis=1, initial=0.0) <= half.max() * (1 + 2 * NEAR)
-    middle, half = _rectangle(np.vstack([box, places[near]]), widest, least)
-    half = half * (1.12 if np.all(near) else 1.45)  # room for the labels at the margin
-    view = View(middle, half)
-    pointers = []
-    for station, inside in zip(ground.scene.stations, near.tolist(), strict=True):
-        label = f"ch {station.channel}"
-        at = station.position[axes]
-        if inside:
-            # A flat arrow shrinks as the station looks down.
-            tip = at + station.rotation[axes, 0] * 0.22 * float(half.min())
-            pointers.append(Pointer(label, True, at, tip, at))
+    view, is_near = _fit_rectangle(ground, max_aspect, plane, MIN_VIEW_WIDTH_M)
+    if ground.unit == "m" and 2 * view.half_size.max() < 1:
+        ground = ground.scaled(1e3, "mm")
+        view, is_near = _fit_rectangle(ground, max_aspect, plane, 1e3 * MIN_VIEW_WIDTH_M)
+    return ground, view, _draw_stations(ground, view, is_near)
+
+
+def _fit_rectangle(
+    ground: Ground, max_aspect: float, plane: tuple[int, int], min_width: float
+) -> tuple[View, list[bool]]:
+    """Return the view, and for each station whether it is in the view."""
+    view = View(plane, np.zeros(2), np.zeros(2))
+    contents = [t.position for t in ground.truth]
+    contents += [ground.markers.extent, ground.artifact.extent]
+    corners = _corners([view.project(each) for each in contents])
+    solved = [view.project(path) for path in ground.paths.values()]
+    position = np.concatenate(solved) if solved else np.zeros((0, 2))
+    position = position[np.isfinite(position).all(axis=1)]
+    if len(position):
+        corners.extend(np.percentile(position, (1, 99), axis=0))
+    box = np.array(corners) if corners else np.array([[-1.0, -1.0], [1.0, 1.0]])
+
+    stations = np.array([view.project(s.position) for s in ground.stations]).reshape(-1, 2)
+    centre, half = _rectangle(box, 1.0, min_width)
+    distance = np.max(np.abs(stations - centre), axis=1, initial=0.0)
+    is_near = distance <= half.max() * (1 + 2 * MAX_STATION_DISTANCE_WIDTHS)
+    centre, half = _rectangle(np.vstack([box, stations[is_near]]), max_aspect, min_width)
+    factor = MARGIN_FACTOR if np.all(is_near) else LABEL_MARGIN_FACTOR
+    return replace(view, centre=centre, half_size=factor * half), is_near.tolist()
+
+
+def _corners(point_sets: Sequence[Array]) -> list[Array]:
+    """Return the lower and upper corners (2,) of the bounding boxes of points (n, 2)."""
+    return [f(points, axis=0) for points in point_sets if len(points) for f in (np.min, np.max)]
+
+
+def _rectangle(points: Array, max_aspect: float, min_width: float) -> tuple[Array, Array]:
+    """Return centre and half sizes of the rectangle around points (m, 2)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    width, height = (high - low).tolist()
+    width = max(width, height, min_width)
+    height = max(height, width / max_aspect)
+    return (low + high) / 2, np.array([width, height]) / 2
+
+
+def _draw_stations(ground: Ground, view: View, is_near: Sequence[bool]) -> Drawing:
+    """Draw stations at their positions, and far ones as arrows at the margin."""
+    inside, arrows, labels, descriptions = [], [], [], []
+    for station, near in zip(ground.stations, is_near, strict=True):
+        name = f"ch {station.channel}"
+        position = view.project(station.position)
+        if near:
+            # The arrow becomes shorter as the station faces the viewer.
+            direction = view.project(station.rotation[:, 0])
+            tip = position + 0.22 * float(view.half_size.min()) * direction
+            arrows.append((position, tip))
+            inside.append(station.position)
+            source = station.calibration.source
+            descriptions.append(f"station on channel {station.channel}, calibration: {source}")
+            shift_px = -18 if tip[1] > position[1] else 18
+            labels.append(Label(name, station.position, shift_px=shift_px))
             continue
-        away = at - middle
-        far = float(np.linalg.norm(away))
-        tip = middle + away * 0.98 * float(np.min(half / np.maximum(np.abs(away), 1e-300)))
-        tail = tip - 0.09 * float(half.min()) * away / far
-        label_at = middle + (tip - middle) * 0.82
-        pointers.append(
-            Pointer(f"{label}\n{_distance(far, ground.unit)}", False, tail, tip, label_at)
-        )
-    return view, tuple(pointers)
+        offset = position - view.centre
+        distance = float(np.linalg.norm(offset))
+        to_margin = float(np.min(view.half_size / np.maximum(np.abs(offset), 1e-300)))
+        tip = view.centre + 0.98 * to_margin * offset
+        tail = tip - 0.09 * float(view.half_size.min()) * offset / distance
+        arrows.append((tail, tip))
+        at = _lift((view.centre + 0.82 * (tip - view.centre))[None], view.plane)[0]
+        labels.append(Label(f"{name}\n{_format_distance(distance, ground.unit)}", at))
+    shapes = []
+    if arrows:
+        shapes.append(Shape("arrow", _lift(np.array(arrows), view.plane), STATION))
+    if inside:
+        points = np.array(inside)[:, None]
+        shapes.append(Shape("marker", points, STATION, "station", tuple(descriptions)))
+    return Drawing(tuple(shapes), tuple(labels))
 
 
-def _distance(far: float, unit: str) -> str:
-    """To two digits; a station may be metres away, however small the map."""
-    if unit == "mm" and far >= 1e3:
-        far, unit = far / 1e3, "m"
-    return f"{far:.0f} {unit}" if far >= 10 else f"{far:.2g} {unit}"
+def _lift(points: Array, plane: tuple[int, int]) -> Array:
+    """Return points (..., 2) of a view as (..., 3), 0 along the axis that is not visible."""
+    lifted = np.zeros((*points.shape[:-1], 3))
+    lifted[..., list(plane)] = points
+    return lifted
 
 
-def _box(paths: Sequence[Array], solid: Sequence[Array], axes: list[int]) -> Array:
-    """Corners (m, 2) of what the view must hold."""
-    corners = [f(p[:, axes], axis=0) for p in solid if len(p) for f in (np.min, np.max)]
-    solved = np.concatenate([p[:, axes] for p in paths]) if paths else np.zeros((0, 2))
-    solved = solved[np.isfinite(solved).all(axis=1)]
-    if len(solved):
-        corners.extend(np.percentile(solved, (1, 99), axis=0))
-    return np.array(corners) if corners else np.array([[-1.0, -1.0], [1.0, 1.0]])
-
-
-def _rectangle(box: Array, widest: float, least: float) -> tuple[Array, Array]:
-    """Middle and half sizes of the rectangle around points (m, 2)."""
-    low, high = box.min(axis=0), box.max(axis=0)
-    wide, tall = (high - low).tolist()
-    wide = max(wide, tall, least)
-    tall = max(tall, wide / widest)
-    return (low + high) / 2, np.array([wide, tall]) / 2
-
-
-def broken(
-    position: Array, time_ns: NDArray[np.int64], keep: NDArray[np.int64] | None = None
-) -> Array:
-    """Rows (n, k) with one of nan wherever the path is silent for longer than :data:`BREAK_NS`,
-    and longer than three of its usual intervals.
-
-    Of a thinned path the rows are those of ``keep``, while the times are of all: what is left
-    out is no silence.
-    """
-    interval = np.diff(time_ns)
-    silence = max(BREAK_NS, 3 * int(np.median(interval))) if len(interval) else BREAK_NS
-    silences = np.concatenate([[0], np.cumsum(interval > silence)])[: len(time_ns)]
-    gaps = np.flatnonzero(np.diff(silences if keep is None else silences[keep])) + 1
-    return np.insert(position, gaps, np.nan, axis=0)
-
-
-def short(name: str) -> str:
-    """A device's name as a legend has room for it."""
-    return name if len(name) <= 18 else f"{name[:7]}...{name[-8:]}"
+def _format_distance(distance: float, unit: str) -> str:
+    """Format a distance to two digits; a station may be metres from a map in millimetres."""
+    if unit == "mm" and distance >= 1e3:
+        distance, unit = distance / 1e3, "m"
+    return f"{distance:.0f} {unit}" if distance >= 10 else f"{distance:.2g} {unit}"

@@ -1,4 +1,4 @@
-"""Numbers over time that pictures and pages show: errors, and what the solver expects of them."""
+"""Values over time in figures: errors, their expectation by the covariances, and the time axis."""
 
 from __future__ import annotations
 
@@ -9,120 +9,177 @@ from numpy.typing import NDArray
 
 from locatk.core.evaluation import Evaluation
 from locatk.core.solution import Solution
+from locatk.formats.sessions.reader import Session
 
 Array = NDArray[np.float64]
 
-NORMAL_95 = 1.959964
-"""Half the width of the interval that holds 95 % of a normal distribution, in sigmas."""
+ONE_SIDED_95_QUANTILE = 1.644854
+"""95 % quantile of the standard normal distribution."""
 
-_QUANTILE_95 = 1.644854
-"""Below it lie 95 % of a standard normal distribution."""
+MAX_AXIS_EXTENSION = 3
+"""Factor by which a value axis is extended, at most, to include the expected values."""
 
+MAX_EXPECTED_DEVICES = 3
+"""Number of devices up to which expected errors are drawn; of more devices they would cover the
+errors."""
 
-MOST_ROOM = 3
-"""By how much a scale is widened, at most, to show where values were expected to be."""
+MAX_TIME_DIFFERENCE_NS = 5_000_000_000
+"""Time by which poses may precede or follow the messages of their recording: stamps of a device may
+be filtered or delayed."""
 
-MOST_BANDS = 3
-"""Of more devices, what their covariances expect is not drawn: it would cover all else."""
+MIN_GAP_NS = 500_000_000
+"""Time without poses from which a line is interrupted."""
+
+MIN_GAP_INTERVALS = 3
+"""Factor of the median interval from which a line is interrupted, for devices with rare poses."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """One number a pose: times (n,) in ns and values (n,), in metres."""
+    """One value per pose: times (n,) in ns and values (n,)."""
 
     time_ns: NDArray[np.int64]
     value: Array
 
+    def scaled(self, factor: float) -> Series:
+        """Return the series with all values multiplied by ``factor``."""
+        return Series(self.time_ns, factor * self.value)
 
-def errors(evaluation: Evaluation) -> dict[str, Series]:
-    """Errors of each device."""
+
+def split_by_device(
+    evaluation: Evaluation, value: Array, mask: NDArray[np.bool_] | None = None
+) -> dict[str, Series]:
+    """Return values (n,) of the scored poses by device, optionally only those in ``mask`` (n,)."""
     series = {}
-    for k, name in enumerate(evaluation.devices):
-        mine = evaluation.device == k
-        series[name] = Series(evaluation.time_ns[mine], evaluation.errors[mine])
+    for index, name in enumerate(evaluation.devices):
+        selected = evaluation.device == index
+        if mask is not None:
+            selected &= mask
+        series[name] = Series(evaluation.time_ns[selected], value[selected])
     return series
 
 
-def sigmas(solution: Solution) -> dict[str, Series]:
-    """Standard deviations of positions, over the axes that are known; else left out."""
+def position_sigmas(solution: Solution) -> dict[str, Series]:
+    """Return the standard deviation [m] of positions by device, over the known axes."""
     series = {}
     for t in solution.trajectories:
         variances = np.einsum("nii->ni", t.covariance[:, :3, :3])
-        known, variance = np.isfinite(variances).any(axis=1), np.nansum(variances, axis=1)
-        if np.any(known):
-            series[t.device] = Series(t.time_ns[known], np.sqrt(variance[known]))
+        is_known = np.isfinite(variances).any(axis=1)
+        if np.any(is_known):
+            sigma = np.sqrt(np.nansum(variances, axis=1)[is_known])
+            series[t.device] = Series(t.time_ns[is_known], sigma)
     return series
 
 
-def expected(solution: Solution, evaluation: Evaluation) -> dict[str, Series]:
-    """Below what 95 % of the errors of each device should lie, by its covariances."""
-    value = expected_error(scored_covariance(solution, evaluation))
-    found = {}
-    for k, name in enumerate(evaluation.devices):
-        mine = evaluation.device == k
-        found[name] = Series(evaluation.time_ns[mine], value[mine])
-    return found
+def expected_errors(solution: Solution, evaluation: Evaluation) -> dict[str, Series]:
+    """Return the bounds [m] of 95 % of the errors, by device, according to the covariances."""
+    return split_by_device(evaluation, error_quantile_95(scored_covariance(solution, evaluation)))
 
 
 def scored_covariance(solution: Solution, evaluation: Evaluation) -> Array:
-    """(n, 3, 3) covariances of the scored positions in the frame of the truth, in m^2.
+    """Return the covariances (n, 3, 3) in m^2 of the scored positions, in the frame of the truth.
 
-    ``nan`` in the rows and columns of axes that the solver does not know, before the
-    alignment, and where a scored pose is not in the solution.
+    ``nan`` in the rows and columns of unknown axes, and of scored poses that are not in the
+    solution.
     """
-    found = np.full((evaluation.n, 3, 3), np.nan)
+    covariance = np.full((evaluation.n, 3, 3), np.nan)
     by_name = {t.device: t for t in solution.trajectories}
-    for k, name in enumerate(evaluation.devices):
-        mine = np.flatnonzero(evaluation.device == k)
+    for index, name in enumerate(evaluation.devices):
+        rows = np.flatnonzero(evaluation.device == index)
         t = by_name.get(name)
         if t is None or not len(t):
             continue
-        row = np.minimum(np.searchsorted(t.time_ns, evaluation.time_ns[mine]), len(t) - 1)
-        same = t.time_ns[row] == evaluation.time_ns[mine]
-        found[mine[same]] = t.covariance[row[same], :3, :3]
-    to = evaluation.alignment
+        nearest = np.minimum(np.searchsorted(t.time_ns, evaluation.time_ns[rows]), len(t) - 1)
+        is_same = t.time_ns[nearest] == evaluation.time_ns[rows]
+        covariance[rows[is_same]] = t.covariance[nearest[is_same], :3, :3]
     if evaluation.align == "none":
-        return found
-    turn = to.scale * to.rotation
-    # An unknown axis stays unknown where the rotation is about it, and only there.
-    unknown = np.isnan(np.einsum("nii->ni", found))
-    turned = turn @ np.nan_to_num(found) @ turn.T
-    mixed = (unknown.astype(float) @ np.abs(to.rotation).T) > 1e-9
-    turned[mixed] = np.nan
-    turned.swapaxes(1, 2)[mixed] = np.nan
-    return turned
+        return covariance
+    to_truth = evaluation.alignment
+    jacobian = to_truth.scale * to_truth.rotation
+    # An unknown axis stays unknown if the rotation is about it, and only then.
+    is_unknown = np.isnan(np.einsum("nii->ni", covariance))
+    rotated = jacobian @ np.nan_to_num(covariance) @ jacobian.T
+    is_mixed = (is_unknown.astype(float) @ np.abs(to_truth.rotation).T) > 1e-9
+    rotated[is_mixed] = np.nan
+    rotated.swapaxes(1, 2)[is_mixed] = np.nan
+    return rotated
 
 
-def expected_error(covariance: Array) -> Array:
-    """Below what 95 % of position errors should lie, (n,) in metres, by covariances (n, 3, 3).
+def error_quantile_95(covariance: Array) -> Array:
+    """Return the 95 % quantiles (n,) in m of the lengths of normal errors.
 
-    Over the axes that are known; ``nan`` where none is. The squared length of a normal
-    error is taken as a multiple of chi-squared with the same mean and variance (Box, Ann.
-    Math. Stat. 25 (1954) 290), whose quantile is Wilson and Hilferty's (PNAS 17 (1931)
-    684): within 2 % of the length for one axis, 1 % for more.
+    ``covariance`` (n, 3, 3) in m^2; unknown axes are left out, and the quantile is ``nan`` if all
+    are unknown. The squared length is approximated by a multiple of chi-squared with the same mean
+    and variance (Box, Ann. Math. Stat. 25 (1954) 290), whose quantile is that of Wilson and
+    Hilferty (PNAS 17 (1931) 684): within 2 % of the length for one axis, 1 % for more.
     """
     filled = np.nan_to_num(covariance)
     mean = np.einsum("nii->n", filled)
-    spread = np.einsum("nij,nij->n", filled, filled)
-    known = np.isfinite(np.einsum("nii->ni", covariance)).any(axis=1)
+    half_variance = np.einsum("nij,nij->n", filled, filled)
+    is_known = np.isfinite(np.einsum("nii->ni", covariance)).any(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        freedom = mean**2 / spread
-        part = 2 / (9 * freedom)
-        quantile = (1 - part + _QUANTILE_95 * np.sqrt(part)) ** 3
-    squared = np.where(spread > 0, mean * quantile, 0.0)
-    return np.where(known, np.sqrt(squared), np.nan)
+        freedom = mean**2 / half_variance
+        term = 2 / (9 * freedom)
+        quantile = (1 - term + ONE_SIDED_95_QUANTILE * np.sqrt(term)) ** 3
+    squared = np.where(half_variance > 0, mean * quantile, 0.0)
+    return np.where(is_known, np.sqrt(squared), np.nan)
 
 
-def usual_top(values: Array, edges: Array | None = None) -> float:
-    """Upper end of a scale that shows all but wild values; these are named beside it.
+def axis_limit(values: Array, expected: Array | None = None) -> float:
+    """Return the upper limit of an axis that shows all values but extreme outliers.
 
-    Where the ``edges`` of what was expected are not too far above, they are shown too.
+    The ``expected`` values are included if they are not too large.
     """
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 1.0
-    usual = 1.5 * float(np.percentile(finite, 98))
-    top = 1.05 * min(float(finite.max()), usual) or 1.0
-    if edges is None or not np.isfinite(edges).any():
-        return top
-    return max(top, min(1.2 * float(np.nanmedian(edges)), MOST_ROOM * top))
+    limit = 1.05 * min(float(finite.max()), 1.5 * float(np.percentile(finite, 98))) or 1.0
+    if expected is None or not np.isfinite(expected).any():
+        return limit
+    return max(limit, min(1.2 * float(np.nanmedian(expected)), MAX_AXIS_EXTENSION * limit))
+
+
+# ---- time
+
+
+def pose_span_ns(solution: Solution) -> tuple[int, int] | None:
+    """Return the times of the first and the last pose, None if there is no pose."""
+    ends = [(int(t.time_ns[0]), int(t.time_ns[-1])) for t in solution.trajectories if len(t)]
+    return (min(a for a, _ in ends), max(b for _, b in ends)) if ends else None
+
+
+def overlap_in_time(session: Session, solution: Solution) -> bool:
+    """Return whether the poses are from the time of a recording, if both times are known."""
+    poses = pose_span_ns(solution)
+    if poses is None or session.start_ns is None or session.end_ns is None:
+        return True
+    first, last = poses
+    return (
+        last >= session.start_ns - MAX_TIME_DIFFERENCE_NS
+        and first <= session.end_ns + MAX_TIME_DIFFERENCE_NS
+    )
+
+
+def origin_ns(session: Session | None, solution: Solution) -> int:
+    """Return the origin of all time axes: the start of the recording, else the first pose."""
+    if session is not None and session.start_ns is not None and overlap_in_time(session, solution):
+        return session.start_ns
+    poses = pose_span_ns(solution)
+    return 0 if poses is None else poses[0]
+
+
+def interrupt_at_gaps(
+    rows: Array, time_ns: NDArray[np.int64], kept: NDArray[np.int64] | None = None
+) -> Array:
+    """Return rows (n, k) with a row of ``nan`` inserted wherever poses are missing.
+
+    ``time_ns`` are the times of all poses; ``kept`` are the indices of ``rows`` among them if the
+    rows were thinned, so that omitted poses are not mistaken for missing ones.
+    """
+    interval = np.diff(time_ns)
+    longest = MIN_GAP_NS
+    if len(interval):
+        longest = max(longest, MIN_GAP_INTERVALS * int(np.median(interval)))
+    gap_count = np.concatenate([[0], np.cumsum(interval > longest)])[: len(time_ns)]
+    gaps = np.flatnonzero(np.diff(gap_count if kept is None else gap_count[kept])) + 1
+    return np.insert(rows, gaps, np.nan, axis=0)

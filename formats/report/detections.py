@@ -1,305 +1,292 @@
-"""What a system saw, and what it rejected and why: of a solution alone, without its session."""
+"""Detections of each system: the tables that the command line prints, and the panel of a report."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 
 import numpy as np
-from numpy.typing import NDArray
+from plotly.graph_objects import Figure
 
 from locatk.core.dots.results import FrameOutcome
-from locatk.core.lighthouse.results import StationDetection
+from locatk.core.landmarks.results import LandmarkDetection
+from locatk.core.polaris.results import TagDetection
 from locatk.core.solution import Solution
-from locatk.formats.plots.ground import COLORS
-from locatk.formats.plots.units import thousands
-from locatk.formats.report import detection_tables as seen_text
-from locatk.formats.report import signals_drawing as drawing
-from locatk.formats.report.detection_tables import Seen, words
-from locatk.formats.report.figures import label
-from locatk.formats.report.panel import Panel, Table
-from locatk.formats.report.rejection_reasons import Reason, meaning
-from locatk.formats.report.signals_drawing import number, short
+from locatk.formats.plots.units import format_count
+from locatk.formats.report.diagrams import REFUSED, USED, Diagrams
+from locatk.formats.report.panels import Panel, Table, as_float, format_value, reason_text
 
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
+TITLE = "Detections"
 
-MOST_ROWS = 20
-"""Detections that a table lists; ``locatk solve --json`` tells them all."""
+MAX_LISTED = 20
+"""Number of detections in the table of a report; ``locatk solve --json`` lists all."""
 
-SEEN, REJECTED = "What was seen", "What was rejected, and why"
+HISTOGRAM_BINS = 40
+"""Number of bins of a histogram; up to two share the width of a page."""
 
-BINS = 40
-
-BAR_PX = 46
-"""Height of the bar of a reason with its name."""
+DEGREES_PER_RADIAN = math.degrees(1)
 
 
-def panels(solution: Solution) -> list[Panel]:
-    """What was seen, and what was rejected and why; two panels for every system."""
-    return [_seen(solution), _rejected(solution)]
+# ---- tables
 
 
-# ---- what was seen
+def tag_table(
+    detections: Sequence[TagDetection], limit: int | None = None, *, compact: bool = False
+) -> Table:
+    """Return the table of detected tags in the frame of the array.
+
+    Parameters
+    ----------
+    detections : sequence of TagDetection
+    limit : int, optional
+        Number of rows; by default all.
+    compact : bool
+        Write standard deviations after the values instead of in columns of their own.
+    """
+
+    def cells(detection: TagDetection) -> dict[str, str]:
+        return {
+            "array": detection.device,
+            "tag": "-" if detection.tag_id is None else str(detection.tag_id),
+            "margin [steps]": format_value(detection.margin, 1, ".2f"),
+            "magnets": str(len(detection.magnets)),
+            **_pose_cells(detection, compact),
+            "refused": reason_text(detection.refused),
+        }
+
+    return _table([cells(each) for each in detections], limit, device_column="array")
 
 
-def _seen(solution: Solution) -> Panel:
-    makers: dict[str, Callable[[Solution], Panel]] = {
-        "lighthouse": _stations,
-        "dots": _frames,
-        "polaris": _tags,
-        "landmarks": _landmarks,
-    }
-    make = makers.get(solution.system)
+def landmark_table(
+    detections: Sequence[LandmarkDetection], limit: int | None = None, *, compact: bool = False
+) -> Table:
+    """Return the table of detected landmarks with the robot's pose in the frame of each.
+
+    The parameters are those of :func:`tag_table`.
+    """
+
+    def cells(detection: LandmarkDetection) -> dict[str, str]:
+        return {
+            "time (UTC)": format_clock(detection.time_s),
+            "robot": detection.device,
+            "cell": format_cell(detection.cell) or "-",
+            "pattern": detection.pattern or "-",
+            "probability [%]": format_probability(detection.probability),
+            **_pose_cells(detection, compact),
+            "refused": reason_text(detection.refused),
+        }
+
+    return _table([cells(each) for each in detections], limit, device_column="robot")
+
+
+def _table(rows: Sequence[Mapping[str, str]], limit: int | None, device_column: str) -> Table:
+    """Return the first rows, without the column of devices if there is only one device, and
+    without that of refusals if it is empty."""
+    shown = rows[:limit]
+    omitted_columns = set()
+    if len({row[device_column] for row in rows}) < 2:
+        omitted_columns.add(device_column)
+    if not any(row["refused"] for row in shown):
+        omitted_columns.add("refused")
+    header = tuple(name for name in rows[0] if name not in omitted_columns) if rows else ()
+    cells = [tuple(row[name] for name in header) for row in shown]
+    return Table(header, cells, len(rows) - len(shown))
+
+
+def _pose_cells(detection: TagDetection | LandmarkDetection, compact: bool) -> dict[str, str]:
+    """Return the cells of position and heading with their standard deviations."""
+    columns = (
+        ("x", "x_m", 1e3, "mm"),
+        ("y", "y_m", 1e3, "mm"),
+        ("heading", "heading_rad", DEGREES_PER_RADIAN, "deg"),
+    )
+    values, sigmas = {}, {}
+    for name, field, scale, unit in columns:
+        value = format_value(getattr(detection, field), scale, ".2f")
+        sigma = format_value(getattr(detection, f"sigma_{field}"), scale, ".2g")
+        if compact and "-" not in (value, sigma):
+            value = f"{value} \u00b1 {sigma}"
+        values[f"{name} [{unit}]"] = value
+        sigmas[f"sigma {name} [{unit}]"] = sigma
+    return values if compact else values | sigmas
+
+
+def format_cell(cell: Sequence[int] | None) -> str:
+    """Format row and column of a landmark; empty if they are unknown."""
+    return "" if cell is None else ",".join(map(str, cell))
+
+
+def format_probability(probability: float | None) -> str:
+    """Format a probability in percent; less than 1 is never rounded to 100."""
+    if probability is None or not math.isfinite(probability):
+        return "-"
+    percent = 100 * probability
+    return f"{percent:.1f}" if percent < 99.95 else "100" if percent >= 99.9995 else ">99.9"
+
+
+def format_clock(time_s: float) -> str:
+    """Format the time of day to the millisecond."""
+    try:
+        return datetime.fromtimestamp(time_s, UTC).strftime("%H:%M:%S.%f")[:-3]
+    except (OverflowError, ValueError, OSError):
+        return f"{time_s:g} s"
+
+
+# ---- panels
+
+
+def detection_panel(solution: Solution) -> Panel:
+    """Return what the solver detected: stations, frames, tags or landmarks."""
+    make = PANELS.get(solution.system)
     if make is None:
-        return Panel(SEEN, f"{len(solution.detections)} detections of {solution.system}.")
+        return Panel(TITLE, f"{len(solution.detections)} detections of {solution.system}.")
     if not solution.detections and solution.system != "dots":
-        return Panel(SEEN, "Nothing.")
+        return Panel(TITLE, "There are none.")
     return make(solution)
 
 
-def _stations(solution: Solution) -> Panel:
-    detections: tuple[StationDetection, ...] = solution.detections
+def _station_panel(solution: Solution) -> Panel:
     rows = [
         (
-            str(found.channel),
-            found.id or "-",
-            str(found.period_ticks),
-            found.calibration,
-            str(found.sweeps),
-            str(found.rejected),
-            seen_text.number(found.residual_rad, 1e3, ".3f"),
+            str(detection.channel),
+            detection.id or "-",
+            str(detection.period_ticks),
+            detection.calibration,
+            str(detection.sweeps),
+            str(detection.rejected),
+            format_value(detection.residual_rad, 1e3, ".3f"),
         )
-        for found in detections
+        for detection in solution.detections
     ]
     header = ("channel", "id", "period [ticks]", "calibration", "sweeps", "rejected")
     return Panel(
-        SEEN,
-        "The base stations of the recording, with the sweeps that are part of a pose and those of "
-        "moments that were rejected. The residual is what planes miss their meeting point by, "
-        "where redundancy shows it.",
+        TITLE,
+        "Base stations of the recording, with the number of sweeps that are part of a pose and of "
+        "sweeps from rejected moments. The residual is the angle by which light planes miss their "
+        "common point, if there are redundant ones.",
         table=Table((*header, "residual [mrad]"), rows),
     )
 
 
-def _tags(solution: Solution) -> Panel:
-    table = seen_text.tags(solution.detections, MOST_ROWS, compact=True)
-    margins = [number(each.margin) for each in solution.detections if not each.refused]
+def _tag_panel(solution: Solution) -> Panel:
+    detections = solution.detections
+    margins = [as_float(each.margin) for each in detections if not each.refused]
     note = (
-        f"{len(margins)} of {counted(len(solution.detections), 'passes')} over magnets "
-        f"{'was' if len(margins) == 1 else 'were'} read as a tag. Tags are told in the frame of "
-        "the bar, with the standard deviation; the margin is how much nearer the id is than the "
-        "next one, in steps of orientation."
+        f"{len(margins)} of {format_count(len(detections), 'passes')} over magnets "
+        f"{'was' if len(margins) == 1 else 'were'} identified as a tag. Poses of tags are in the "
+        "frame of the bar, with standard deviations. The margin is the difference between the "
+        "distances of the second nearest and the nearest id, in steps of orientation."
     )
-    figure = None
-    if len(margins) > MOST_ROWS:
-        figure = _histogram([("margin [steps]", [("read", margins)])], "passes")
-    return _listed(note, table, figure)
+    table = tag_table(detections, MAX_LISTED, compact=True)
+    return _list_panel(note, table, "margin [steps]", margins, "passes")
 
 
-def _landmarks(solution: Solution) -> Panel:
-    table = seen_text.landmarks(solution.detections, MOST_ROWS, compact=True)
-    refused = sum(bool(each.refused) for each in solution.detections)
+def _landmark_panel(solution: Solution) -> Panel:
+    detections = solution.detections
+    refused = sum(bool(each.refused) for each in detections)
     note = (
-        f"{counted(len(solution.detections), 'visits')} to landmarks, {refused} refused. The robot "
-        "is told in the frame of the landmark, with the standard deviation."
+        f"{format_count(len(detections), 'visits')} to landmarks, {refused} refused. Poses of the "
+        "robot are in the frame of the landmark, with standard deviations."
     )
+    table = landmark_table(detections, MAX_LISTED, compact=True)
+    residuals = [each.residual_sigma for each in detections]
+    return _list_panel(note, table, "residual [sigma]", residuals, "visits")
+
+
+def _list_panel(
+    note: str, table: Table, quantity: str, values: Sequence[float], noun: str
+) -> Panel:
+    """Return a table of detections; if there are many, also a histogram of a quantity."""
+    if table.omitted:
+        note += (
+            f" The first {len(table.rows)} are listed; `locatk solve --json` prints all of them."
+        )
     figure = None
-    if len(solution.detections) > MOST_ROWS:
-        left = [each.residual_sigma for each in solution.detections]
-        figure = _histogram([("residual [sigma]", [("visits", left)])], "visits")
-    return _listed(note, table, figure)
+    if len(values) > MAX_LISTED:
+        figure = _draw_histograms({quantity: {"": np.array(values, float)}}, noun)
+    return Panel(TITLE, note, figure, table)
 
 
-def _listed(note: str, table: Seen, figure: Figure | None) -> Panel:
-    if table.more:
-        note += f" The first {len(table.rows)} are listed; `locatk solve --json` tells all."
-    return Panel(SEEN, note, figure, Table(table.header, table.rows))
-
-
-def _frames(solution: Solution) -> Panel:
+def _frame_panel(solution: Solution) -> Panel:
     frames: tuple[FrameOutcome, ...] = () if solution.facts is None else solution.facts.frames
     if not frames:
-        return Panel(SEEN, f"{len(solution.detections)} frames with a place.")
-    decoded = [each for each in frames if not each.rejected]
-    others = [each for each in frames if each.rejected]
-    groups = (("decoded", decoded), ("rejected", others))
+        return Panel(TITLE, f"{len(solution.detections)} frames with a position.")
+    groups = {
+        "decoded": [frame for frame in frames if not frame.rejected],
+        "rejected": [frame for frame in frames if frame.rejected],
+    }
     rows = [
         (
             name,
             str(len(group)),
             f"{100 * len(group) / len(frames):.1f}",
-            _median(group, "dots", 1, ".0f"),
-            _median(group, "corrected_bits", 1, ".0f"),
-            _median(group, "confidence", 100, ".2f"),
+            _format_median(group, "dots", 1, ".0f"),
+            _format_median(group, "corrected_bits", 1, ".0f"),
+            _format_median(group, "confidence", 100, ".2f"),
         )
-        for name, group in groups
+        for name, group in groups.items()
         if group
     ]
-    header = ("frames", "count", "share [%]", "dots", "bits corrected", "confidence [%]")
-    series = [
-        (
-            what,
-            [(name, [scale * getattr(each, key) for each in group]) for name, group in groups],
-        )
-        for what, key, scale in (
+    header = ("frames", "count", "fraction [%]", "dots", "bits corrected", "confidence [%]")
+    values = {
+        quantity: {
+            f"{name} ({len(group)})": np.array([scale * getattr(each, field) for each in group])
+            for name, group in groups.items()
+        }
+        for quantity, field, scale in (
             ("confidence [%]", "confidence", 100.0),
             ("bits corrected", "corrected_bits", 1.0),
         )
-    ]
+    }
     return Panel(
-        SEEN,
-        f"{counted(len(frames), 'frames')} of the camera. Dots, corrected bits and confidence are "
-        "medians.",
-        _histogram(series, "frames"),
+        TITLE,
+        f"{format_count(len(frames), 'frames')} of the camera. Dots, corrected bits and confidence "
+        "are medians.",
+        _draw_histograms(values, "frames"),
         Table(header, rows),
     )
 
 
-def _median(group: list[FrameOutcome], key: str, scale: float, form: str) -> str:
-    values = np.array([getattr(each, key) for each in group], float)
-    known = values[np.isfinite(values)]
-    return seen_text.number(float(np.median(known)), scale, form) if len(known) else "-"
+def _format_median(group: Sequence[FrameOutcome], field: str, scale: float, spec: str) -> str:
+    values = np.array([getattr(frame, field) for frame in group], float)
+    is_known = np.isfinite(values)
+    return format_value(float(np.median(values[is_known])), scale, spec) if is_known.any() else "-"
 
 
-Series = tuple[str, list[tuple[str, list[float]]]]
-"""What is counted, and its values in named groups."""
+def _draw_histograms(quantities: Mapping[str, Mapping[str, np.ndarray]], noun: str) -> Figure:
+    """Draw histograms of several quantities next to each other.
 
-
-def _histogram(series: list[Series], unit: str) -> Figure:
-    """How often values occur, side by side; counted here, as a page need not hold them all."""
-    from plotly.subplots import make_subplots
-
-    figure = make_subplots(1, len(series), shared_yaxes=True, horizontal_spacing=0.06)
-    several = any(len(groups) > 1 for _, groups in series)
-    for column, (what, groups) in enumerate(series, 1):
-        every = np.array([value for _, values in groups for value in values])
-        every = every[np.isfinite(every)]
-        low, high = _ends(every, percent=what.endswith("[%]"))
-        edges = np.linspace(low, high, BINS + 1)
-        for (name, values), color in zip(groups, (drawing.USED, drawing.REFUSED), strict=False):
-            count = np.histogram([value for value in values if math.isfinite(value)], edges)[0]
-            if not count.any():
-                continue
-            figure.add_bar(
-                x=short((edges[1:] + edges[:-1]) / 2), y=count, width=float(edges[1] - edges[0]),
-                name=f"{name} ({len(values)})", legendgroup=name, showlegend=column == 1,
-                marker_color=color, hovertemplate="%{x:.4g}: %{y}", row=1, col=column,
-            )  # fmt: skip
-        figure.update_xaxes(title=what, row=1, col=column)
-    figure.update_yaxes(title=unit, row=1, col=1)
-    drawing.style(figure, 300, barmode="stack", showlegend=several)
-    return figure
-
-
-def _ends(value: NDArray[np.float64], *, percent: bool) -> tuple[float, float]:
-    """Between which values are counted."""
-    if percent or not len(value):
-        return 0.0, 100.0
-    low, high = float(value.min()), float(value.max())
-    return (low, high) if high > low else (low - 0.5, high + 0.5)
-
-
-# ---- what was rejected
-
-
-def _rejected(solution: Solution) -> Panel:
-    counts = {why: n for why, n in solution.rejected.items() if n}
-    if not counts:
-        return Panel(REJECTED, "Nothing was rejected.")
-    known = {why: meaning(solution.system, why) for why in counts}
-    totals = _totals(solution, known)
-    order = sorted(counts, key=lambda why: (_unit(known[why]), -counts[why]))
-    rows = []
-    for why in order:
-        reason = known[why]
-        total = totals.get(_unit(reason), 0)
-        share = f"{100 * counts[why] / total:.3g} %" if total else "-"
-        rows.append(
-            (
-                words(why),
-                str(counts[why]),
-                f"{share} of {counted(total, _unit(reason))}" if total else share,
-                "" if reason is None else reason.sentence,
-            )
+    The values of a quantity are in named groups, of used and of refused detections.
+    """
+    diagrams = Diagrams(1, len(quantities), shared_yaxes=True, horizontal_spacing=0.06)
+    for column, (quantity, groups) in enumerate(quantities.items(), 1):
+        every = np.concatenate([values[np.isfinite(values)] for values in groups.values()])
+        low, high = 0.0, 100.0
+        if len(every) and not quantity.endswith("[%]"):
+            low, high = float(every.min()), float(every.max())
+            if low == high:
+                low, high = low - 0.5, high + 0.5
+        edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
+        colored = dict(
+            zip(groups, zip(groups.values(), (USED, REFUSED), strict=False), strict=True)
         )
-    header = ("reason", "count", "share", "what it means")
-    figure = _bars(counts, order, {why: _unit(known[why]) for why in order})
-    said = []
-    for unit in dict.fromkeys(_unit(known[why]) for why in order):
-        count = sum(n for why, n in counts.items() if _unit(known[why]) == unit)
-        said.append(
-            f"{thousands(count)} of {counted(totals[unit], unit)}"
-            if unit in totals
-            else counted(count, unit)
-        )
-    return Panel(REJECTED, f"Rejected: {', '.join(said)}.", figure, Table(header, rows))
-
-
-def counted(count: int, unit: str) -> str:
-    """``"1 pass"``, ``"2 passes"``."""
-    return f"{thousands(count)} {unit if count != 1 else {'passes': 'pass'}.get(unit, unit[:-1])}"
-
-
-def _unit(reason: Reason | None) -> str:
-    return "observations" if reason is None else reason.unit
-
-
-def _totals(solution: Solution, known: Mapping[str, Reason | None]) -> dict[str, int]:
-    """How many there were of what reasons are counted in, by unit."""
-    left = Counter[str]()
-    for why, count in solution.rejected.items():
-        left[_unit(known.get(why))] += count
-    seen = solution.detections
-    if solution.system == "lighthouse":
-        used = solution.rejected.get("station_contradicts_others", 0)  # has a pose all the same
-        return {
-            "sweeps": left["sweeps"] + sum(each.sweeps + each.rejected for each in seen),
-            "moments": left["moments"] - used + solution.poses,
-        }
-    if solution.system == "polaris":
-        return {"passes": len(seen) + solution.rejected.get("no_magnets", 0)}
-    if solution.system == "landmarks":
-        return {"visits": len(seen)}
-    if solution.system == "dots":
-        return {"frames": left["frames"] + len(seen)}
-    return {}
-
-
-def _bars(counts: Mapping[str, int], order: list[str], units: Mapping[str, str]) -> Figure | None:
-    """Reasons by how often they were given, each with its name above its bar, where a narrow
-    window has room for it; of a single reason nothing that its table does not say."""
-    from plotly.graph_objects import Figure
-
-    if len(order) < 2:
-        return None
-    figure = Figure()
-    row = {why: k for k, why in enumerate(order)}
-    for k, unit in enumerate(dict.fromkeys(units.values())):
-        mine = [why for why in order if units[why] == unit]
-        figure.add_bar(
-            x=[counts[why] for why in mine], y=[row[why] for why in mine], orientation="h",
-            name=unit, marker_color=COLORS[(1, 5, 3)[k % 3]], width=0.4,
-            text=[thousands(counts[why]) for why in mine], textposition="outside",
-            cliponaxis=False, customdata=[label(words(why)) for why in mine],
-            hovertemplate=f"%{{customdata}}: %{{x}} {unit}<extra></extra>",
-        )  # fmt: skip
-    names = [
-        {
-            "x": 0, "y": row[why], "text": label(words(why)), "showarrow": False,
-            "xanchor": "left", "yanchor": "bottom", "yshift": 0.2 * BAR_PX, "xshift": -3,
-        }
-        for why in order
-    ]  # fmt: skip
-    # Room for the number beside the longest bar.
-    figure.update_xaxes(visible=False, range=[0, 1.12 * max(counts[why] for why in order)])
-    figure.update_yaxes(visible=False, range=[len(order) - 0.5, -0.9])
-    several = len(set(units.values())) > 1
-    figure.update_layout(annotations=names, showlegend=several)
-    figure.update_layout(
-        height=BAR_PX * len(order) + (44 if several else 20),
-        margin={"l": 6, "r": 12, "t": 12, "b": 8},
+        diagrams.add_histogram(column, edges, colored, "%{x:.4g}: %{y}")
+    has_legend = any(len(groups) > 1 for groups in quantities.values())
+    return diagrams.finish(
+        300,
+        [noun],
+        column_titles=list(quantities),
+        barmode="stack",
+        bargap=0,
+        showlegend=has_legend,
     )
-    return figure
+
+
+PANELS: dict[str, Callable[[Solution], Panel]] = {
+    "lighthouse": _station_panel,
+    "dots": _frame_panel,
+    "polaris": _tag_panel,
+    "landmarks": _landmark_panel,
+}
+"""Panel of detections by system."""

@@ -1,316 +1,389 @@
-"""How good a solution is: in one sentence, in key figures, in tables and in figures."""
+"""Quality of a solution: a summary, key figures, and panels of errors and covariances."""
 
 from __future__ import annotations
 
 import numpy as np
+from plotly.graph_objects import Figure
 
 from locatk.core.evaluation import CHI2_95_QUANTILES, Evaluation, Statistics
+from locatk.core.evaluation.consistency import NORMAL_95_QUANTILE
 from locatk.core.solution import Solution
-from locatk.formats.plots import series as plot_series
-from locatk.formats.plots.ground import has_no_scale, known
-from locatk.formats.plots.series import NORMAL_95, Series
-from locatk.formats.plots.time_axis import origin_ns
-from locatk.formats.plots.units import Unit, digits, length, thousands, unit_for
-from locatk.formats.report.figures import colours, sentences
-from locatk.formats.report.figures_time import Row, errors_figure, histogram_figure, rows_figure
-from locatk.formats.report.panel import Panel, Table
-from locatk.formats.report.signals_drawing import listed
+from locatk.formats.plots.ground import finite_poses, is_shown_unscaled, is_unscaled
+from locatk.formats.plots.series import (
+    Series,
+    axis_limit,
+    error_quantile_95,
+    origin_ns,
+    position_sigmas,
+    scored_covariance,
+    split_by_device,
+)
+from locatk.formats.plots.shapes import MAX_LEGEND_DEVICES, device_colors
+from locatk.formats.plots.units import (
+    DEGREES,
+    Unit,
+    abbreviate,
+    format_count,
+    format_length,
+    format_number,
+    select_unit,
+)
+from locatk.formats.report.diagrams import Diagrams, ValueRow, draw_values
+from locatk.formats.report.panels import Panel, Table, escape, join_names, join_sentences
+from locatk.formats.report.style import INK
 from locatk.formats.report.subject import Subject
 
+HISTOGRAM_BINS = 50
+"""Number of bins of the histogram of errors, on an axis of about 900 pixels."""
 
-def unscaled(subject: Subject) -> bool:
-    """Whether lengths of the subject are in units of its scene, not in metres."""
-    evaluation = subject.evaluation
-    fitted = evaluation is not None and evaluation.align.startswith("sim")
-    return has_no_scale(subject.solution) and not fitted
+ALL_DEVICES_COLOR = "#8896a3"
+"""Color of a histogram of more devices than a legend names."""
 
+UNSOLVED_DEVICE_COLOR = "#5b6875"
+"""Color of a device in the evaluation that is not in the solution."""
 
-def verdict(subject: Subject) -> str:
-    """How good it is, in a sentence or two."""
-    solution, evaluation = subject.solution, subject.evaluation
-    if not solution.poses:
-        return "Nothing was solved: there is no pose."
-    if evaluation is None:
-        spread = _sigma(subject)
-        if not len(spread):
-            return sentences(
-                why_unjudged(subject), "The solver tells no covariance either.", _left_out(solution)
-            )
-        middle = length(float(np.median(spread)), unscaled=unscaled(subject))
-        return sentences(
-            why_unjudged(subject),
-            f"The solver itself expects a standard deviation of {middle} (median over all poses, "
-            "all axes together).",
-            _left_out(solution),
-        )
-    unit = unscaled(subject)
-    text = (
-        f"Half of the poses lie within {length(evaluation.median, unscaled=unit)} of the truth, "
-        f"95 % within {length(evaluation.p95, unscaled=unit)}."
-    )
-    fitted = (
-        "Nothing was fitted on the truth."
-        if evaluation.align == "none"
-        else f"The alignment {evaluation.align} was fitted on the truth, on these same poses."
-    )
-    if evaluation.offset_s:
-        fitted += (
-            f" Time offset: {evaluation.offset_s:.4f} s ({evaluation.time_offset.describe()})."
-        )
-    consistency = evaluation.consistency
-    judged = "" if consistency is None else f"{consistency.describe().capitalize()}."
-    return sentences(text, fitted, judged, _left_out(solution))
-
-
-def _left_out(solution: Solution) -> str:
-    """A sentence on poses that are no numbers."""
-    count = solution.poses - sum(len(known(t)) for t in solution.trajectories)
-    if not count:
-        return ""
-    said = "1 pose is not a number: it is" if count == 1 else f"{thousands(count)} poses are not "
-    return f"{said}{'' if count == 1 else 'numbers: they are'} neither drawn nor scored."
-
-
-def why_unjudged(subject: Subject) -> str:
-    """Why there are no errors."""
-    if subject.truth:
-        if has_no_scale(subject.solution):
-            return (
-                "The scene has no scale (its unit is the distance of the first two stations), so "
-                "that it is not compared with the truth in metres; --align sim3 compares them."
-            )
-        if not any(len(known(t)) for t in subject.solution.trajectories):
-            return "No pose is a number, so that there are no errors."
-        return "No pose has truth at its time for its device, so that there are no errors."
-    if subject.session is not None:
-        return "The session holds no truth, so that there are no errors; --truth FILE gives it."
-    return "No truth is at hand, so that there are no errors; --truth FILE gives it."
-
-
-def _sigma(subject: Subject) -> np.ndarray:
-    found = [s.value for s in plot_series.sigmas(subject.solution).values()]
-    return np.concatenate(found) if found else np.zeros(0)
-
-
-def key_figures(subject: Subject) -> list[tuple[str, str]]:
-    """Values and what they are, for the head."""
-    solution, evaluation = subject.solution, subject.evaluation
-    unit = unscaled(subject)
-    devices = len(solution.trajectories)
-    found = [(thousands(solution.poses), _of(devices))]
-    if evaluation is not None:
-        found += [
-            (length(getattr(evaluation, name), unscaled=unit), f"APE {name}")
-            for name in ("median", "rmse", "p95", "max")
-        ]
-        if evaluation.ape_rotation is not None:
-            found.append((f"{digits(evaluation.ape_rotation.median)}\u00b0", "APE rotation median"))
-        if evaluation.coverage.fraction is not None:
-            found.append((f"{100 * evaluation.coverage.fraction:.1f} %", "of the time solved"))
-    else:
-        spread = _sigma(subject)
-        if len(spread):
-            middle, high = np.percentile(spread, (50, 95)).tolist()
-            found.append((length(middle, unscaled=unit), "median sigma"))
-            found.append((length(high, unscaled=unit), "95 % of sigmas below"))
-    rejected = sum(solution.rejected.values())
-    found.append((thousands(rejected), "observations rejected"))
-    return found
-
-
-def _of(devices: int) -> str:
-    return f"poses of {devices} {'device' if devices == 1 else 'devices'}"
-
-
-def error_panels(subject: Subject) -> list[Panel]:
-    """Errors against time, how often they occur, by axis, in a table; none without truth."""
-    evaluation = subject.evaluation
-    if evaluation is None:
-        return []
-    colors = colours([t.device for t in subject.solution.trajectories])
-    for name in evaluation.devices:
-        colors.setdefault(name, "#5b6875")
-    series = plot_series.errors(evaluation)
-    expected = plot_series.expected(subject.solution, evaluation)
-    unit = unit_for(evaluation.p95, unscaled=unscaled(subject))
-    figure, note = errors_figure(
-        series,
-        expected,
-        colors,
-        unit,
-        "error",
-        origin_ns(subject.session, subject.solution),
-        "where 95 % of the errors should be below, by the solver's covariance",
-    )
-    edges = np.concatenate([s.value for s in expected.values()])
-    below = evaluation.errors <= edges
-    told = np.isfinite(edges)
-    if told.any() and evaluation.consistency is None:
-        share = 100 * np.count_nonzero(below[told]) / np.count_nonzero(told)
-        note = sentences(note, f"{share:.0f} % of the errors are below what it expects of 95 %.")
-    panels = [Panel("Error against time", note, figure)]
-    lines = {"median": evaluation.median, "95 %": evaluation.p95}
-    shown = histogram_figure(series, colors, unit, "error", lines)
-    panels.append(Panel("How often errors occur", "", shown))
-    panels.append(_by_axis(subject, evaluation, colors, unit))
-    panels += _rotation(subject, evaluation, colors)
-    panels += _nees(subject, evaluation, colors)
-    panels.append(
-        Panel("Statistics", _how(subject.solution, evaluation), table=_statistics(evaluation, unit))
-    )
-    return panels
-
-
-def _by_axis(subject: Subject, evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Panel:
-    covariance = plot_series.scored_covariance(subject.solution, evaluation)
-    band = NORMAL_95 * np.sqrt(np.einsum("nii->ni", covariance)) * unit.per_metre
-    rows = []
-    for k, name in enumerate("xyz"):
-        value = evaluation.residuals[:, k] * unit.per_metre
-        if k == 2 and not np.abs(value).max() > 1e-9 * unit.per_metre:
-            continue  # all on the plane of the truth
-        values, bands = {}, {}
-        for i, device in enumerate(evaluation.devices):
-            mine = evaluation.device == i
-            if mine.any():
-                values[device] = Series(evaluation.time_ns[mine], value[mine])
-                if np.isfinite(band[mine, k]).any():
-                    bands[device] = Series(evaluation.time_ns[mine], band[mine, k])
-        rows.append(Row(f"{name} [{unit.name}]", values, bands))
-    start = origin_ns(subject.session, subject.solution)
-    figure, note = rows_figure(rows, colors, start, signed=True)
-    drawn = [len(row.bands) for row in rows if 0 < len(row.bands) <= plot_series.MOST_BANDS]
-    within = "shade" if max(drawn, default=0) == 1 else "thin lines"
-    expected = f"95 % should lie within the {within}, by the solver's covariance."
-    return Panel(
-        "Error by axis", sentences("Solved minus true.", expected if drawn else "", note), figure
-    )
-
-
-def _rotation(subject: Subject, evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
-    told = np.isfinite(evaluation.rotation_errors_deg)
-    if not told.any():
-        return []
-    series = {}
-    for k, name in enumerate(evaluation.devices):
-        mine = told & (evaluation.device == k)
-        series[name] = Series(evaluation.time_ns[mine], evaluation.rotation_errors_deg[mine])
-    start = origin_ns(subject.session, subject.solution)
-    figure, note = errors_figure(series, {}, colors, Unit("\u00b0", 1.0), "rotation error", start)
-    return [Panel("Rotation error against time", note, figure)]
-
-
-def _nees(subject: Subject, evaluation: Evaluation, colors: dict[str, str]) -> list[Panel]:
-    told = np.isfinite(evaluation.nees) & (evaluation.nees_dof > 0)
-    if evaluation.consistency is None or not told.any():
-        return []
-    ratio = evaluation.nees / np.array(CHI2_95_QUANTILES)[evaluation.nees_dof]
-    series = {}
-    for k, name in enumerate(evaluation.devices):
-        mine = told & (evaluation.device == k)
-        series[name] = Series(evaluation.time_ns[mine], ratio[mine])
-    start = origin_ns(subject.session, subject.solution)
-    figure, note = errors_figure(
-        series, {}, colors, Unit("of its 95 % edge", 1.0), "NEES", start, reference=1.0
-    )
-    consistency = evaluation.consistency
-    said = (
-        "Normalised estimation error squared: the error measured by the covariance that comes "
-        "with it, here over the value below which 95 % should be. "
-        f"{100 * consistency.inside:.0f} % of {thousands(consistency.n)} poses are below 1; the "
-        f"mean over its expectation is {digits(consistency.mean)} (1 where the covariances are "
-        "right)."
-    )
-    return [Panel("Does the covariance fit the error?", sentences(said, note), figure)]
-
+MIN_HEIGHT_ERROR_M = 1e-9
+"""Largest error in z up to which estimate and truth are in one plane, and z is not drawn."""
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "p95")
+
 ERRORS = (
     ("ape_translation", "APE translation"),
     ("ape_rotation", "APE rotation"),
     ("rpe_translation", "RPE translation"),
     ("rpe_rotation", "RPE rotation"),
 )
+"""Fields of an evaluation and their titles."""
 
 
-def _statistics(evaluation: Evaluation, unit: Unit) -> Table:
-    """APE and RPE; of several devices also each of them."""
-    rows: list[tuple[str, ...]] = []
+# ---- the summary
 
-    def add(what: str, device: str, of: Statistics | None, unit: str, factor: float) -> None:
-        if of is not None:
-            values = (digits(factor * getattr(of, name)) for name in STATISTICS)
-            rows.append((what, device, unit, str(of.n), *values))
 
-    every = {name: getattr(evaluation, name) for name, _ in ERRORS}
-    of_each = {name: evaluation.device_statistics(k) for k, name in enumerate(evaluation.devices)}
-    if len(of_each) > 1:
-        of_each = {"all": every, **of_each}
+def summarize(subject: Subject) -> str:
+    """Return one or two sentences on the quality of the solution."""
+    solution, evaluation = subject.solution, subject.evaluation
+    if not solution.poses:
+        return "Nothing was solved: there is no pose."
+    unscaled = is_shown_unscaled(solution, evaluation)
+    if evaluation is None:
+        sigma = _all_sigmas(solution)
+        covariance = "The solver reports no covariance."
+        if len(sigma):
+            median = format_length(float(np.median(sigma)), unscaled=unscaled)
+            covariance = (
+                f"The solver reports a standard deviation of {median} (median over all poses, all "
+                "axes together)."
+            )
+        reason = why_not_evaluated(subject)
+        return join_sentences(reason, covariance, _invalid_poses_note(solution))
+    median, p95 = (
+        format_length(value, unscaled=unscaled) for value in (evaluation.median, evaluation.p95)
+    )
+    alignment = (
+        "No alignment was fitted."
+        if evaluation.align == "none"
+        else f"The alignment {evaluation.align} was fitted to the truth at these same poses."
+    )
+    offset = consistency = ""
+    if evaluation.offset_s:
+        origin = evaluation.time_offset.describe()
+        offset = f"Time offset: {evaluation.offset_s:.4f} s ({origin})."
+    if evaluation.consistency is not None:
+        consistency = f"{evaluation.consistency.describe().capitalize()}."
+    return join_sentences(
+        f"Half of the poses are within {median} of the truth, 95 % within {p95}.",
+        alignment,
+        offset,
+        consistency,
+        _invalid_poses_note(solution),
+    )
+
+
+def _invalid_poses_note(solution: Solution) -> str:
+    """Return a sentence on poses that are not finite, empty without any."""
+    count = solution.poses - sum(len(finite_poses(t)) for t in solution.trajectories)
+    if not count:
+        return ""
+    verb = "is" if count == 1 else "are"
+    return f"{format_count(count, 'poses')} {verb} not finite and neither drawn nor evaluated."
+
+
+def why_not_evaluated(subject: Subject) -> str:
+    """Return a sentence on why there are no errors."""
+    if subject.truth:
+        if is_unscaled(subject.solution):
+            return (
+                "The scene has no scale (its unit is the distance of the first two stations) and "
+                "is not compared with the truth in metres; --align sim3 estimates the scale."
+            )
+        if not any(len(finite_poses(t)) for t in subject.solution.trajectories):
+            return "No pose is finite: there are no errors."
+        return "No pose has truth of its device at its time: there are no errors."
+    if subject.session is not None:
+        return "The session contains no truth: there are no errors. --truth FILE adds it."
+    return "No truth is available: there are no errors. --truth FILE adds it."
+
+
+def _all_sigmas(solution: Solution) -> np.ndarray:
+    sigmas = [s.value for s in position_sigmas(solution).values()]
+    return np.concatenate(sigmas) if sigmas else np.zeros(0)
+
+
+def key_figures(subject: Subject) -> list[tuple[str, str]]:
+    """Return the most important values, each with its name."""
+    solution, evaluation = subject.solution, subject.evaluation
+    unscaled = is_shown_unscaled(solution, evaluation)
+    devices = format_count(len(solution.trajectories), "devices")
+    figures = [(format_count(solution.poses), f"poses of {devices}")]
+    sigma = _all_sigmas(solution)
+    if evaluation is not None:
+        figures += [
+            (format_length(getattr(evaluation, name), unscaled=unscaled), f"APE {name}")
+            for name in ("median", "rmse", "p95", "max")
+        ]
+        if evaluation.ape_rotation is not None:
+            angle = format_number(evaluation.ape_rotation.median)
+            figures.append((f"{angle}\u00b0", "APE rotation median"))
+        if evaluation.coverage.fraction is not None:
+            figures.append((f"{100 * evaluation.coverage.fraction:.1f} %", "of the time solved"))
+    elif len(sigma):
+        median, p95 = np.percentile(sigma, (50, 95)).tolist()
+        figures.append((format_length(median, unscaled=unscaled), "median sigma"))
+        figures.append((format_length(p95, unscaled=unscaled), "95 % of sigmas below"))
+    rejected = sum(solution.rejected.values())
+    return [*figures, (format_count(rejected), "observations rejected")]
+
+
+# ---- errors
+
+
+def error_panels(subject: Subject) -> list[Panel]:
+    """Return panels of errors over time, by axis, of rotations and NEES; none without truth."""
+    solution, evaluation = subject.solution, subject.evaluation
+    if evaluation is None:
+        return []
+    colors = dict.fromkeys(evaluation.devices, UNSOLVED_DEVICE_COLOR)
+    colors |= device_colors([t.device for t in solution.trajectories])
+    start_ns = origin_ns(subject.session, solution)
+    unscaled = is_shown_unscaled(solution, evaluation)
+    unit = select_unit(evaluation.p95, unscaled=unscaled)
+    covariance = scored_covariance(solution, evaluation)
+    panels = [
+        _error_panel(evaluation, covariance, colors, unit, start_ns),
+        Panel("Histogram of errors", "", _draw_histogram(evaluation, colors, unit)),
+        _axis_panel(evaluation, covariance, colors, unit, start_ns),
+    ]
+    has_rotation = np.isfinite(evaluation.rotation_errors_deg)
+    if has_rotation.any():
+        values = split_by_device(evaluation, evaluation.rotation_errors_deg, has_rotation)
+        row = ValueRow(f"rotation error [{DEGREES.name}]", values, {})
+        figure, note = draw_values([row], colors, start_ns, as_marks=True)
+        panels.append(Panel("Rotation error over time", note, figure))
+    panels += _nees_panels(evaluation, colors, start_ns)
+    statistics = _statistics_table(evaluation, unit)
+    panels.append(Panel("Statistics", _statistics_note(solution, evaluation), table=statistics))
+    return panels
+
+
+def _error_panel(
+    evaluation: Evaluation,
+    covariance: np.ndarray,
+    colors: dict[str, str],
+    unit: Unit,
+    start_ns: int,
+) -> Panel:
+    """Return the errors over time with their 95 % bounds by the covariances (n, 3, 3)."""
+    bound = error_quantile_95(covariance)
+    row = ValueRow(
+        f"error [{unit.name}]",
+        split_by_device(evaluation, evaluation.errors * unit.per_si),
+        split_by_device(evaluation, bound * unit.per_si),
+    )
+    figure, note = draw_values([row], colors, start_ns, as_marks=True)
+    is_known = np.isfinite(bound)
+    if is_known.any() and evaluation.consistency is None:
+        inside = evaluation.errors <= bound
+        percent = 100 * np.count_nonzero(inside) / np.count_nonzero(is_known)
+        note = join_sentences(note, f"{percent:.0f} % of the errors are.")
+    return Panel("Error over time", note, figure)
+
+
+def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Figure:
+    """Draw how often errors occur, with outliers in the last bin, and mark two quantiles."""
+    series = split_by_device(evaluation, evaluation.errors * unit.per_si)
+    every = np.concatenate([s.value for s in series.values()])
+    limit = axis_limit(every)
+    edges = np.linspace(0, limit, HISTOGRAM_BINS + 1)
+    if len(series) <= MAX_LEGEND_DEVICES:
+        groups = {
+            escape(abbreviate(name)): (np.minimum(s.value, limit), colors[name])
+            for name, s in series.items()
+        }
+    else:
+        groups = {"all": (np.minimum(every, limit), ALL_DEVICES_COLOR)}
+    diagrams = Diagrams(1)
+    diagrams.add_histogram(1, edges, groups, f"%{{y}} poses around %{{x:.3g}} {escape(unit.name)}")
+    for name, value, side, shift_px in (
+        ("median", evaluation.median, "right", -4),
+        ("95 %", evaluation.p95, "left", 4),
+    ):
+        if value * unit.per_si <= limit:
+            diagrams.add_vertical_line(
+                value * unit.per_si,
+                1,
+                1,
+                INK,
+                "dash",
+                annotation={
+                    "text": name,
+                    "yref": "paper",
+                    "y": 1.0,
+                    "yanchor": "top",
+                    "xanchor": side,
+                    "xshift": shift_px,
+                    "bgcolor": "rgba(255,255,255,0.8)",
+                    "showarrow": False,
+                },
+            )
+    highest = np.histogram(np.minimum(every, limit), edges)[0].max()
+    diagrams.figure.update_xaxes(range=[0, limit])
+    diagrams.figure.update_yaxes(range=[0, 1.3 * float(highest)])  # Space for the line names.
+    title = f"error [{unit.name}]"
+    return diagrams.finish(
+        280,
+        ["poses"],
+        column_titles=[title],
+        barmode="stack",
+        bargap=0,
+        legend={
+            **{"orientation": "h", "x": 0, "xanchor": "left", "y": 1.0, "yanchor": "bottom"},
+            "traceorder": "normal",
+        },
+    )
+
+
+def _axis_panel(
+    evaluation: Evaluation,
+    covariance: np.ndarray,
+    colors: dict[str, str],
+    unit: Unit,
+    start_ns: int,
+) -> Panel:
+    """Return the errors along each axis with their 95 % intervals by the covariances."""
+    residual = evaluation.residuals * unit.per_si
+    bound = NORMAL_95_QUANTILE * np.sqrt(np.einsum("nii->ni", covariance)) * unit.per_si
+    rows = []
+    for axis, name in enumerate("xyz"):
+        if axis == 2 and not np.abs(evaluation.residuals[:, 2]).max() > MIN_HEIGHT_ERROR_M:
+            continue
+        values = split_by_device(evaluation, residual[:, axis])
+        expected = split_by_device(evaluation, bound[:, axis])
+        rows.append(ValueRow(f"{name} [{unit.name}]", values, expected))
+    figure, note = draw_values(rows, colors, start_ns, signed=True)
+    return Panel("Error by axis", join_sentences("Estimate minus truth.", note), figure)
+
+
+def _nees_panels(evaluation: Evaluation, colors: dict[str, str], start_ns: int) -> list[Panel]:
+    """Return the normalized errors squared, none if there are no covariances."""
+    consistency = evaluation.consistency
+    is_known = np.isfinite(evaluation.nees) & (evaluation.nees_dof > 0)
+    if consistency is None or not is_known.any():
+        return []
+    ratio = evaluation.nees / np.array(CHI2_95_QUANTILES)[evaluation.nees_dof]
+    row = ValueRow("NEES / 95 % quantile", split_by_device(evaluation, ratio, is_known), {})
+    figure, note = draw_values([row], colors, start_ns, as_marks=True, reference=1.0)
+    explanation = (
+        "Normalized estimation error squared (NEES), divided by its 95 % quantile. "
+        f"{100 * consistency.inside:.0f} % of {format_count(consistency.n, 'poses')} are below 1. "
+        f"The mean NEES is {format_number(consistency.mean)} times the expected one (1 if the "
+        "covariances are right)."
+    )
+    return [Panel("Consistency of the covariance", join_sentences(explanation, note), figure)]
+
+
+def _statistics_table(evaluation: Evaluation, unit: Unit) -> Table:
+    """Return APE and RPE of all devices together and, if there are several, of each device."""
+    statistics = {
+        name: evaluation.device_statistics(k) for k, name in enumerate(evaluation.devices)
+    }
+    if len(statistics) > 1:
+        statistics = {"all": {name: getattr(evaluation, name) for name, _ in ERRORS}, **statistics}
+    rows = []
     for name, title in ERRORS:
-        of, factor = (unit.name, unit.per_metre) if "translation" in name else ("\u00b0", 1.0)
-        for k, (device, found) in enumerate(of_each.items()):
-            add(title if k == 0 else "", device, found[name], of, factor)
+        row_unit = unit if "translation" in name else DEGREES
+        for k, (device, errors) in enumerate(statistics.items()):
+            error: Statistics | None = errors[name]
+            if error is not None:
+                values = (format_number(row_unit.per_si * getattr(error, s)) for s in STATISTICS)
+                rows.append((title if k == 0 else "", device, row_unit.name, str(error.n), *values))
     return Table(("", "device", "unit", "n", *STATISTICS), rows)
 
 
-def _how(solution: Solution, evaluation: Evaluation) -> str:
-    """What the statistics mean, and what was left out."""
-    out = ", ".join(
-        f"{thousands(count)} {why}" for why, count in evaluation.unscored.items() if count
+def _statistics_note(solution: Solution, evaluation: Evaluation) -> str:
+    """Return definitions of the statistics, and what was not scored."""
+    unscored = ", ".join(
+        f"{format_count(count)} {reason}" for reason, count in evaluation.unscored.items() if count
     )
-    alone = [t.device for t in solution.trajectories if len(t)]
-    alone = [name for name in alone if name not in evaluation.devices]
-    parts = [
-        "APE: each pose against the truth at its time. "
-        f"RPE: the motion from each pose to {_apart(evaluation.rpe_delta)}, against the true one.",
+    without_truth = [
+        t.device for t in solution.trajectories if len(t) and t.device not in evaluation.devices
+    ]
+    scored = "" if without_truth else "All poses are scored."
+    path = ""
+    if evaluation.path_m:
+        true, solved = (
+            format_length(value) for value in (evaluation.path_m, evaluation.path_estimate_m)
+        )
+        path = f"Path length: {true} (truth), {solved} (estimate)"
+        if evaluation.drift_percent is not None:
+            path += f"; drift {format_number(evaluation.drift_percent)} %"
+        path += "."
+    return join_sentences(
+        "APE: each pose compared with the truth at its time. RPE: the motion from each pose to the "
+        f"{_describe_delta(evaluation.rpe_delta)}, compared with the true motion.",
         f"Alignment: {evaluation.align}; time offset: {evaluation.offset_s:g} s "
         f"({evaluation.time_offset.describe()}).",
-        f"Not scored: {out}." if out else "" if alone else "All poses are scored.",
-        f"There is no truth for {listed(alone)}." if alone else "",
-    ]
-    if evaluation.path_m:
-        path = f"The true path is {length(evaluation.path_m)} long"
-        path += f", the solved one {length(evaluation.path_estimate_m)}"
-        if evaluation.drift_percent is not None:
-            path += f"; drift {digits(evaluation.drift_percent)} % of it"
-        parts.append(path + ".")
-    return sentences(*parts)
+        f"Not scored: {unscored}." if unscored else scored,
+        f"There is no truth for {join_names(without_truth)}." if without_truth else "",
+        path,
+    )
 
 
-def _apart(delta: str) -> str:
-    """How far apart the poses of a pair are, in words."""
-    frames = delta.removesuffix("f")
-    if frames != delta:
-        return "the next" if frames == "1" else f"the one {frames} poses on"
-    return f"the one {delta} on"
+def _describe_delta(delta: str) -> str:
+    """Return the distance between the poses of a pair in words."""
+    poses = delta.removesuffix("f")
+    if poses == delta:
+        return f"pose {delta} later"
+    return "next one" if poses == "1" else f"pose {poses} poses later"
 
 
-def sigma_panels(subject: Subject) -> list[Panel]:
-    """Standard deviations as the solver tells them, against time; none where it tells none."""
+# ---- covariances
+
+
+def covariance_panels(subject: Subject) -> list[Panel]:
+    """Return the standard deviations of the solver over time; none if it reports none."""
     solution = subject.solution
-    colors = colours([t.device for t in solution.trajectories])
-    moved = [t for t in solution.trajectories if len(t)]
-    spreads = [t.sigma[:, :3][np.isfinite(t.sigma[:, :3])] for t in moved]
-    every = np.concatenate(spreads) if spreads else np.zeros(0)
+    trajectories = [t for t in solution.trajectories if len(t)]
+    sigmas = [t.sigma[:, :3][np.isfinite(t.sigma[:, :3])] for t in trajectories]
+    every = np.concatenate(sigmas) if sigmas else np.zeros(0)
     size = float(np.percentile(every, 90)) if len(every) else 0.0
-    unit = unit_for(size, unscaled=has_no_scale(solution))
+    unit = select_unit(size, unscaled=is_unscaled(solution))
     rows = []
-    for column, name, factor, of in (
-        (0, "x", unit.per_metre, unit.name),
-        (1, "y", unit.per_metre, unit.name),
-        (2, "z", unit.per_metre, unit.name),
-        (5, "heading", 180 / np.pi, "\u00b0"),
+    for column, name, scale, unit_name in (
+        (0, "x", unit.per_si, unit.name),
+        (1, "y", unit.per_si, unit.name),
+        (2, "z", unit.per_si, unit.name),
+        (5, "heading", 180 / np.pi, DEGREES.name),
     ):
         values = {}
-        for t in moved:
-            sigma = t.sigma[:, column] * factor
+        for t in trajectories:
+            sigma = t.sigma[:, column] * scale
             if np.isfinite(sigma).any() and np.nanmax(sigma) > 0:
                 values[t.device] = Series(t.time_ns, sigma)
         if values:
-            rows.append(Row(f"\u03c3 {name} [{of}]", values, {}))
+            rows.append(ValueRow(f"\u03c3 {name} [{unit_name}]", values, {}))
     if not rows:
         return []
-    start = origin_ns(subject.session, solution)
-    figure, note = rows_figure(rows, colors, start, signed=False)
-    said = "Standard deviations as the solver tells them, in its own frame."
-    return [Panel("Covariance against time", sentences(said, note), figure)]
+    colors = device_colors([t.device for t in solution.trajectories])
+    figure, note = draw_values(rows, colors, origin_ns(subject.session, solution))
+    frame = "Standard deviations reported by the solver, in its own frame."
+    return [Panel("Standard deviation over time", join_sentences(frame, note), figure)]

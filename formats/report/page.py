@@ -1,8 +1,7 @@
-"""The page: panels as HTML that needs nothing else, neither a network nor another file.
+"""HTML of a report: one page that needs neither a network nor another file.
 
-Text is escaped here and nowhere else. The security policy of the page names its two scripts by
-their hashes, so that no other script runs, wherever it may come from, and forbids all loading
-but that of pictures inside the page.
+All text is escaped here. The content security policy of the page lists its two scripts by their
+hashes, so that no other script runs, and forbids loading anything but the pictures in the page.
 """
 
 from __future__ import annotations
@@ -19,18 +18,21 @@ from plotly.graph_objects import Figure
 from plotly.io.json import to_json_plotly
 from plotly.offline import get_plotlyjs
 
-from locatk.formats.report.panel import Panel, Picture, Table
+from locatk.formats.report.panels import Panel, Picture, Table
 from locatk.formats.report.style import CONFIG, SCRIPT, STYLE, TEMPLATE
 
-_NUMBER = re.compile(r"[<>=~+\-\u2212]? ?\d[\d.,\u202f]*(e[+-]?\d+)?( ?\S{1,5})?")
+NUMBER = re.compile(r"[<>=~+\-\u2212]? ?\d[\d.,\u202f]*(e[+-]?\d+)?( ?\S{1,5})?")
+"""A number with an optional sign and unit; columns of numbers are aligned to the right."""
 
+MAX_UNBROKEN_CHARACTERS = 28
+"""Length of a cell of a table up to which it stays on one line."""
 
-SHORT = 28
-"""Characters up to which a cell of a table stays on one line."""
+DEFAULT_FIGURE_HEIGHT_PX = 380
+"""Height of a figure whose layout has none."""
 
 
 def document(title: str, body: Sequence[str]) -> str:
-    """The whole page around its parts, which are HTML."""
+    """Return the complete page around its parts, which are HTML."""
     scripts = (get_plotlyjs(), SCRIPT)
     allowed = " ".join(f"'sha256-{_digest(script)}'" for script in scripts)
     policy = (
@@ -52,7 +54,7 @@ def document(title: str, body: Sequence[str]) -> str:
             "<body>",
             *body,
             f'<script type="application/json" id="shared">{shared}</script>',
-            # Nothing between the tags but the script: the hash is of every byte.
+            # The hash covers every byte between the tags.
             *(f"<script>{script}</script>" for script in scripts),
             "</body>",
             "</html>",
@@ -62,19 +64,19 @@ def document(title: str, body: Sequence[str]) -> str:
 
 
 def text(plain: object) -> str:
-    """Text as it shall appear, for HTML."""
+    """Escape text for HTML."""
     return html.escape(str(plain))
 
 
 def paragraph(plain: str, style: str = "") -> str:
-    """A paragraph of text, or nothing where there is none."""
+    """Return a paragraph, empty for an empty text."""
     if not plain:
         return ""
     return f'<p class="{style}">{text(plain)}</p>' if style else f"<p>{text(plain)}</p>"
 
 
 def notes(title: str, lines: Sequence[str]) -> str:
-    """A box of things to know, or nothing where there are none."""
+    """Return a box with a list of notes, empty without notes."""
     if not lines:
         return ""
     items = "".join(f"<li>{text(line)}</li>" for line in lines)
@@ -82,16 +84,16 @@ def notes(title: str, lines: Sequence[str]) -> str:
 
 
 def tiles(figures: Sequence[tuple[str, str]]) -> str:
-    """Key figures: a value and what it is, each."""
-    made = "".join(
-        f'<div class="tile"><b>{text(value)}</b><span>{text(what)}</span></div>'
-        for value, what in figures
+    """Return key figures, each a value and its name."""
+    boxes = "".join(
+        f'<div class="tile"><b>{text(value)}</b><span>{text(name)}</span></div>'
+        for value, name in figures
     )
-    return f'<div class="tiles">{made}</div>' if made else ""
+    return f'<div class="tiles">{boxes}</div>' if boxes else ""
 
 
 def command(line: str, ident: str) -> str:
-    """A command line with a button that copies it."""
+    """Return a command line with a button that copies it."""
     return (
         f'<div class="command"><pre id="{ident}">{text(line)}</pre>'
         f'<button class="copy" data-of="{ident}" hidden>Copy</button></div>'
@@ -99,7 +101,7 @@ def command(line: str, ident: str) -> str:
 
 
 def panel(part: Panel, ident: str) -> str:
-    """A panel as a section with this id."""
+    """Return a panel as a section with this id."""
     inner = [f"<h3>{text(part.title)}</h3>", paragraph(part.note)]
     if part.figure is not None:
         inner.append(figure(part.figure, f"{ident}-figure"))
@@ -111,51 +113,59 @@ def panel(part: Panel, ident: str) -> str:
 
 
 def section(inner: Sequence[str], ident: str) -> str:
-    """A box around HTML."""
+    """Return HTML in a box."""
     return "\n".join([f'<section class="panel" id="{ident}">', *filter(None, inner), "</section>"])
 
 
 def figure(drawn: Figure, ident: str) -> str:
-    """The place of a figure, as high as it will be, and its data beside it."""
+    """Return an empty element of the figure's height, and the data that a script draws in it."""
     spec = drawn.to_dict()
     layout = spec.setdefault("layout", {})
-    layout.pop("template", None)  # the page has one for all
-    # Of its place, not of the figure: it is as wide as its window, which scrolls it where that
-    # is narrower, and a map is lower in a narrow one.
-    least = layout.pop("width", None)
-    height = int(layout.pop("height", None) or 380)
-    wide = f";min-width:{int(least)}px" if least else ""
+    layout.pop("template", None)  # All figures share the template of the page.
+    # A figure is as wide as the window. A window narrower than its width scrolls it, and in a
+    # narrow window a map becomes lower. Both are therefore properties of the element.
+    width = layout.pop("width", None)
+    height = int(layout.pop("height", None) or DEFAULT_FIGURE_HEIGHT_PX)
+    min_width = f";min-width:{int(width)}px" if width else ""
     data = to_json_plotly({"data": spec.get("data", []), "layout": layout}, engine="json")
     return (
-        f'<div class="wide"><div class="figure" id="{ident}" style="height:{height}px{wide}">'
-        "</div></div>\n"
+        f'<div class="wide"><div class="figure" id="{ident}" '
+        f'style="height:{height}px{min_width}"></div></div>\n'
         f'<script type="application/json" id="{ident}-data">{_inert(data)}</script>'
     )
 
 
-def table(of: Table) -> str:
-    """A table; columns that hold nothing but numbers are set to the right, and short cells are
-    never broken into lines."""
-    columns = list(zip(*of.rows, strict=True)) if of.rows else []
-    right = [all(cell in ("", "-") or _NUMBER.fullmatch(cell) for cell in c) for c in columns]
-    right += [False] * (len(of.header) - len(right))
+def table(content: Table, links: Sequence[str] = ()) -> str:
+    """Return a table; columns of numbers are right-aligned, and short cells are never wrapped.
 
-    def cell(words: str, number: bool, tag: str) -> str:
-        kind = "number" if number else "short" if len(words) <= SHORT else ""
-        start = f'<{tag} class="{kind}">' if kind else f"<{tag}>"
-        return f"{start}{text(words)}</{tag}>"
+    ``links`` are the targets of the first cells of the rows.
+    """
+    columns = list(zip(*content.rows, strict=True)) if content.rows else []
+    is_number = [all(cell in ("", "-") or NUMBER.fullmatch(cell) for cell in c) for c in columns]
+    is_number += [False] * (len(content.header) - len(is_number))
 
-    def row(cells: Sequence[str], tag: str) -> str:
-        made = (cell(words, number, tag) for words, number in zip(cells, right, strict=True))
-        return f"<tr>{''.join(made)}</tr>"
+    def row(cells: Sequence[str], tag: str, link: str = "") -> str:
+        parts: list[str] = []
+        for cell, number in zip(cells, is_number, strict=True):
+            is_short = len(cell) <= MAX_UNBROKEN_CHARACTERS
+            kind = "number" if number else "short" if is_short else ""
+            inner = text(cell)
+            if link and not parts:
+                inner = f'<a href="{text(link)}">{inner}</a>'
+            parts.append(f'<{tag} class="{kind}">' if kind else f"<{tag}>")
+            parts.append(f"{inner}</{tag}>")
+        return f"<tr>{''.join(parts)}</tr>"
 
-    head = f"<thead>{row(of.header, 'th')}</thead>" if any(of.header) else ""
-    rows = "".join(row(cells, "td") for cells in of.rows)
+    head = f"<thead>{row(content.header, 'th')}</thead>" if any(content.header) else ""
+    targets = links or [""] * len(content.rows)
+    rows = "".join(
+        row(cells, "td", link) for cells, link in zip(content.rows, targets, strict=True)
+    )
     return f'<div class="table"><table>{head}<tbody>{rows}</tbody></table></div>'
 
 
 def picture(shown: Picture) -> str:
-    """An image inside the page."""
+    """Return an image that is contained in the page."""
     data = base64.b64encode(shown.png).decode()
     caption = text(shown.caption)
     return (
@@ -169,7 +179,7 @@ def _json(value: Any) -> str:
 
 
 def _inert(data: str) -> str:
-    """JSON in which no character can end the script element that holds it."""
+    """Escape the characters with which JSON could end its script element."""
     return data.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 

@@ -1,4 +1,4 @@
-"""Reports: one HTML file of one or several solutions, that opens anywhere, offline."""
+"""Reports: one HTML file on one or several solutions, which needs no network."""
 
 from __future__ import annotations
 
@@ -7,32 +7,39 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from locatk.core.errors import LocatkError
-from locatk.core.solution import Solution
 from locatk.formats.output import atomic_write, check_output, tool_version
-from locatk.formats.plots.ground import ground_of
-from locatk.formats.plots.time_axis import of_one_time, origin_ns, span, when
-from locatk.formats.plots.units import length, thousands
-from locatk.formats.report import detections as seen
-from locatk.formats.report import evaluation as judgement
-from locatk.formats.report import page, run_facts, signals
-from locatk.formats.report.figures_map import map_panels
-from locatk.formats.report.panel import Panel
+from locatk.formats.plots.ground import build_ground, is_shown_unscaled
+from locatk.formats.plots.series import origin_ns, overlap_in_time, pose_span_ns
+from locatk.formats.plots.units import format_count, format_length, format_time
+from locatk.formats.report import page
+from locatk.formats.report.detections import detection_panel
+from locatk.formats.report.evaluation import (
+    covariance_panels,
+    error_panels,
+    key_figures,
+    summarize,
+)
+from locatk.formats.report.panels import Panel, Table
+from locatk.formats.report.rejections import rejection_panel
+from locatk.formats.report.run import run_panels
+from locatk.formats.report.signals import signal_panels
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.trajectory_map import map_panels
 
-GIVE_SESSION = "--session FILE gives it."
+SIGNALS_TITLE = "Signals"
 
 
 def write_report(
     path: str | os.PathLike[str], subjects: Sequence[Subject], *, overwrite: bool = False
 ) -> None:
-    """Write a report; the same subjects give the same bytes.
+    """Write a report; the same subjects result in the same bytes.
 
     Parameters
     ----------
     path : path
-        The output, an HTML file that needs nothing else.
+        The output, an HTML file.
     subjects : sequence of Subject
-        In this order; see :func:`locatk.formats.report.subjects.load`.
+        In the order of the page; see :func:`locatk.formats.report.subject.load_subject`.
     overwrite : bool
         Replace an existing file.
 
@@ -42,149 +49,138 @@ def write_report(
         See :func:`locatk.formats.output.atomic_write`.
     """
     check_output(path, overwrite=overwrite)
-    written = render(subjects).encode()
+    content = render_report(subjects).encode()
     with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(written)
+        stream.write(content)
 
 
-def render(subjects: Sequence[Subject]) -> str:
-    """The page as text."""
-    one = len(subjects) == 1
-    title = subjects[0].name if one else f"{len(subjects)} solutions"
+def render_report(subjects: Sequence[Subject]) -> str:
+    """Return the page as text."""
+    is_single = len(subjects) == 1
+    title = subjects[0].name if is_single else f"{len(subjects)} solutions"
     body = [
         "<header>",
         page.paragraph("locatk report", "brand"),
         f"<h1>{page.text(title)}</h1>",
-        *([] if one else [overview(subjects)]),
+        "" if is_single else _overview(subjects),
         "</header>",
         "<main>",
     ]
     for k, subject in enumerate(subjects, start=1):
         body.append(f'<article class="subject" id="s{k}">')
-        if not one:
+        if not is_single:
             body.append(f"<h2>{page.text(subject.name)}</h2>")
         body += _article(subject, f"s{k}")
         body.append("</article>")
     body.append("</main>")
     body.append(
-        f"<footer>Made by locatk {page.text(tool_version())}. Drag to zoom, double-click to see "
-        "all, click a name in a legend to hide it. This file holds all it needs.</footer>"
+        f"<footer>Made by locatk {page.text(tool_version())}. Drag to zoom, double-click to show "
+        "everything, click a name in a legend to hide it. This file is complete.</footer>"
     )
     return page.document(f"{title} - locatk report", body)
 
 
+def _overview(subjects: Sequence[Subject]) -> str:
+    """Return a table of all subjects with links to them."""
+    header = ("solution", "system", "method", "poses", "APE median", "APE p95", "rejected")
+    rows = []
+    for subject in subjects:
+        solution, evaluation = subject.solution, subject.evaluation
+        unscaled = is_shown_unscaled(solution, evaluation)
+        errors = ["-", "-"]
+        if evaluation is not None:
+            lengths = (evaluation.median, evaluation.p95)
+            errors = [format_length(value, unscaled=unscaled) for value in lengths]
+        poses = format_count(solution.poses)
+        rejected = format_count(sum(solution.rejected.values()))
+        rows.append((subject.name, solution.system, solution.method, poses, *errors, rejected))
+    links = [f"#s{k}" for k in range(1, len(rows) + 1)]
+    return f"<nav>{page.table(Table(header, rows), links)}</nav>"
+
+
 def _article(subject: Subject, ident: str) -> Iterator[str]:
-    """What the page says of one subject."""
-    yield page.paragraph(_what(subject), "sub")
-    yield page.paragraph(judgement.verdict(subject), "verdict")
-    yield page.tiles(judgement.key_figures(subject))
-    yield page.notes(
-        "What the poses stand on", [each.message for each in subject.solution.warnings]
-    )
-    for k, panel in enumerate(panels(subject), start=1):
+    """Yield the parts of the page on one subject."""
+    yield page.paragraph(_describe_run(subject), "sub")
+    yield page.paragraph(summarize(subject), "verdict")
+    yield page.tiles(key_figures(subject))
+    yield page.notes("Warnings", [each.message for each in subject.solution.warnings])
+    for k, panel in enumerate(report_panels(subject), start=1):
         yield page.panel(panel, f"{ident}-{k}")
-    line = subject.facts.get("command")
-    if line:
-        inner = ["<h3>The command that made it</h3>", page.command(line, f"{ident}-line")]
+    command = subject.facts.get("command")
+    if command:
+        inner = ["<h3>Command</h3>", page.command(command, f"{ident}-line")]
         yield page.section(inner, f"{ident}-command")
 
 
-def panels(subject: Subject) -> list[Panel]:
-    """All panels of a subject, in their order."""
-    found = _maps(subject)
-    found += judgement.error_panels(subject)
-    found += judgement.sigma_panels(subject)
-    found += seen.panels(subject.solution)
-    found += _signals(subject)
-    return found + run_facts.run_panels(subject)
+def report_panels(subject: Subject) -> list[Panel]:
+    """Return all panels of a subject in their order."""
+    return [
+        *_map_panels(subject),
+        *error_panels(subject),
+        *covariance_panels(subject),
+        detection_panel(subject.solution),
+        rejection_panel(subject.solution),
+        *_signal_panels(subject),
+        *run_panels(subject),
+    ]
 
 
-def _signals(subject: Subject) -> list[Panel]:
-    """What was recorded, or why it is not shown."""
-    source = subject.facts.get("source", "")
-    if subject.session is None:
-        missing = f"The session {source} is not beside" if source else "No session is named in"
+def _map_panels(subject: Subject) -> list[Panel]:
+    """Return a map for each frame with poses; positions in two frames cannot share a map."""
+    start_ns = origin_ns(subject.session, subject.solution)
+    frames = list(dict.fromkeys(t.frame for t in subject.solution.trajectories))
+    panels = []
+    for frame in frames or [""]:
+        trajectories = tuple(t for t in subject.solution.trajectories if t.frame == frame)
+        devices = {t.device for t in trajectories}
+        is_single = len(frames) < 2
+        truth = [t for t in subject.truth if is_single or t.device in devices]
+        solution = replace(subject.solution, trajectories=trajectories)
+        ground = build_ground(solution, truth, subject.evaluation)
+        title = "Trajectory" if is_single else f"Trajectory in {frame}"
+        panels += map_panels(solution, ground, start_ns, title)
+    return panels
+
+
+def _signal_panels(subject: Subject) -> list[Panel]:
+    """Return the signals of the recording, or why they are not shown."""
+    session = subject.session
+    if session is None:
+        source = subject.facts.get("source")
+        problem = (
+            f"The session {source} is not in the folder of the solution"
+            if source
+            else "The solution does not name its session"
+        )
+        note = f"{problem}: its signals are not shown. --session FILE adds them."
+        return [Panel(SIGNALS_TITLE, note)]
+    if not overlap_in_time(session, subject.solution):
         return [
-            Panel("Signals", f"{missing} the solution: its signals are not shown. {GIVE_SESSION}")
-        ]
-    if not of_one_time(subject.session, subject.solution):
-        other = "The session is of another time than the poses: its signals are not shown."
-        return [Panel("Signals", f"{other} It begins {when(subject.session.start_ns or 0)}.")]
-    try:
-        return signals.panels(subject.session, subject.solution)
-    except LocatkError as error:
-        # The report is of the solution, which is whole.
-        return [Panel("Signals", f"The session cannot be shown: {error}. {error.hint or ''}")]
-
-
-def _maps(subject: Subject) -> list[Panel]:
-    """A map for each frame in which there are poses: places in two frames share no map."""
-    solution = subject.solution
-    start = origin_ns(subject.session, solution)
-    frames = list(dict.fromkeys(t.frame for t in solution.trajectories))
-    if len(frames) < 2:
-        ground = ground_of(solution, subject.truth, subject.evaluation)
-        return map_panels(solution, ground, start)
-    found = []
-    for frame in frames:
-        part = _in_frame(solution, frame)
-        names = {t.device for t in part.trajectories}
-        truth = [t for t in subject.truth if t.device in names]
-        ground = ground_of(part, truth, subject.evaluation)
-        found += map_panels(part, ground, start, f"Path in {frame}")
-    return found
-
-
-def _in_frame(solution: Solution, frame: str) -> Solution:
-    return replace(
-        solution, trajectories=tuple(t for t in solution.trajectories if t.frame == frame)
-    )
-
-
-def _what(subject: Subject) -> str:
-    """A line on what was solved."""
-    solution = subject.solution
-    parts = [f"{solution.system} by {solution.method}"]
-    source = subject.facts.get("source")
-    if source:
-        parts[0] += f", from {source}"
-    times = span(solution)
-    if times is not None:
-        parts.append(f"{(times[1] - times[0]) * 1e-9:.1f} s of poses")
-    start = origin_ns(subject.session, solution)
-    if start:
-        of_session = subject.session is not None and subject.session.start_ns == start
-        what = "the start of the recording" if of_session else "the first pose"
-        parts.append(f"time 0 is {what}, {when(start)}")
-    return " \u00b7 ".join(parts)
-
-
-def overview(subjects: Sequence[Subject]) -> str:
-    """A table of all subjects, each a link to its part of the page."""
-    head = "".join(f"<th>{name}</th>" for name in ("solution", "system", "method"))
-    head += "".join(
-        f'<th class="number">{name}</th>' for name in ("poses", "APE median", "APE p95", "rejected")
-    )
-    rows = []
-    for k, subject in enumerate(subjects, start=1):
-        solution, evaluation = subject.solution, subject.evaluation
-        unit = judgement.unscaled(subject)
-        errors = (
-            ("-", "-")
-            if evaluation is None
-            else tuple(
-                length(value, unscaled=unit) for value in (evaluation.median, evaluation.p95)
+            Panel(
+                SIGNALS_TITLE,
+                "The session is from another time than the poses: its signals are not shown. It "
+                f"begins {format_time(session.start_ns or 0)}.",
             )
-        )
-        rejected = sum(solution.rejected.values())
-        numbers = (thousands(solution.poses), *errors, thousands(rejected))
-        rows.append(
-            f'<tr><td><a href="#s{k}">{page.text(subject.name)}</a></td>'
-            f"<td>{page.text(solution.system)}</td><td>{page.text(solution.method)}</td>"
-            + "".join(f'<td class="number">{page.text(number)}</td>' for number in numbers)
-            + "</tr>"
-        )
-    return (
-        f'<nav class="table"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></nav>"
-    )
+        ]
+    try:
+        return signal_panels(session, subject.solution)
+    except LocatkError as error:
+        # The report is on the solution, which is complete.
+        note = f"The session cannot be shown: {error}. {error.hint or ''}"
+        return [Panel(SIGNALS_TITLE, note)]
+
+
+def _describe_run(subject: Subject) -> str:
+    """Return a line on system, method, source and time."""
+    solution = subject.solution
+    source = subject.facts.get("source")
+    parts = [f"{solution.system} by {solution.method}" + (f", from {source}" if source else "")]
+    span_ns = pose_span_ns(solution)
+    if span_ns is not None:
+        parts.append(f"{(span_ns[1] - span_ns[0]) * 1e-9:.1f} s of poses")
+    start_ns = origin_ns(subject.session, solution)
+    if start_ns:
+        is_session = subject.session is not None and subject.session.start_ns == start_ns
+        origin = "the start of the recording" if is_session else "the first pose"
+        parts.append(f"time 0 is {origin}, {format_time(start_ns)}")
+    return " \u00b7 ".join(parts)

@@ -1,49 +1,233 @@
-"""Raw signals of a recording with what was seen in them, whichever the system is."""
+"""Panels of the recorded signals: which messages are read, and which system draws them.
+
+The modules of :mod:`locatk.formats.report.systems` draw the signals of one device each.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
 from importlib import import_module
+from typing import Any, Generic, TypeVar
 
-from locatk.core.errors import LocatkError
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from locatk.core.errors import FormatError, LocatkError
 from locatk.core.solution import Solution
-from locatk.formats.report.panel import Panel
-from locatk.formats.sessions.reader import Session
-
-MODULES = {
-    system: f"locatk.formats.report.signals_{system}"
-    for system in ("lighthouse", "dots", "polaris", "landmarks")
-}
+from locatk.formats.report.panels import Panel, join_names, join_sentences
+from locatk.formats.sessions import capture_record
+from locatk.formats.sessions.field_samples import SensorKind
+from locatk.formats.sessions.mcap_file import DamageError, Segment, read_messages
+from locatk.formats.sessions.messages import BatchError
+from locatk.formats.sessions.reader import Session, open_mcap
 
 TITLE = "Raw signals"
 
+MODULES = {
+    system: f"locatk.formats.report.systems.{system}"
+    for system in ("lighthouse", "dots", "polaris", "landmarks")
+}
+"""Modules with a function ``signal_panels(session, solution)``. They are imported when needed,
+because OpenCV (dots) takes 0.1 s."""
 
-def panels(session: Session, solution: Solution) -> list[Panel]:
-    """Raw signals of ``session`` with the detections of ``solution`` marked.
+MAX_READ_BYTES = 8 << 20
+"""Size of a recording up to which it is read completely; of a larger one, parts are read that are
+spread over its duration."""
 
-    Parameters
-    ----------
-    session : Session
-        The recording; damaged, empty, or of something else than what was solved, it gives a
-        panel that says so.
-    solution : Solution
-        What was made of it.
+MAX_DEVICES = 4
+"""Number of devices that are drawn; the others are listed."""
 
-    Returns
-    -------
-    list of Panel
-        One at least. Figures hold traces that browsers draw as SVG, no WebGL.
+T = TypeVar("T")
+
+
+def signal_panels(session: Session, solution: Solution) -> list[Panel]:
+    """Return at least one panel of the signals of a recording with the detections of a solution.
+
+    The recording may be damaged, empty, or of another system; the panel describes the problem.
+    Figures have no WebGL traces: browsers limit their number.
     """
     module = MODULES.get(solution.system)
     if module is None:
         return [Panel(TITLE, f"Signals of the system {solution.system!r} cannot be drawn.")]
-    draw: Callable[[Session, Solution], list[Panel]] = import_module(module).panels
+    draw: Callable[[Session, Solution], list[Panel]] = import_module(module).signal_panels
     try:
-        found = draw(session, solution)
+        panels = draw(session, solution)
     except LocatkError as error:
         return [Panel(TITLE, f"The recording cannot be drawn: {error.message}.")]
-    if found:
-        return found
-    recorded = session.facts.get("system")
-    what = f"it is one of {recorded}" if recorded not in (None, solution.system) else "it has none"
-    return [Panel(TITLE, f"No signals of {solution.system} in the recording: {what}.")]
+    if panels:
+        return panels
+    system = session.facts.get("system")
+    problem = f"it is of {system}" if system not in (None, solution.system) else "it has none"
+    return [Panel(TITLE, f"No signals of {solution.system} in the recording: {problem}.")]
+
+
+@dataclass(frozen=True)
+class SignalSource(Generic[T]):
+    """Signals of one kind in a session.
+
+    Attributes
+    ----------
+    title : str
+        Of a panel, before the name of the device.
+    topic, schema : str
+        Prefix of the topics before the name of the device, and schema of the messages.
+    decode : callable
+        Return the samples of a session's topic from its messages; raises FormatError.
+    draw : callable
+        Return the panels of a device, given its name, title, samples and notes.
+    note : str
+        Explanation for the first device.
+    """
+
+    title: str
+    topic: str
+    schema: str
+    decode: Callable[[Session, str, list[bytes]], T]
+    draw: Callable[[str, str, T, str], list[Panel]]
+    note: str
+
+
+def device_panels(session: Session, solution: Solution, source: SignalSource[T]) -> list[Panel]:
+    """Return the panels of up to :data:`MAX_DEVICES` devices.
+
+    Notes on the whole recording are in the first panel. A device without readable samples has a
+    panel that describes the problem.
+    """
+    topics = session.topics(source.topic, source.schema)
+    read = read_excerpt(session, topics[:MAX_DEVICES])
+    devices = [topic.removeprefix(source.topic) for topic in topics]
+    notes = [source.note, *read.notes, missing_devices_note(solution, devices)]
+    if len(devices) > MAX_DEVICES:
+        notes.append(f"Not drawn: {join_names(devices[MAX_DEVICES:])}.")
+    note = join_sentences(*notes)
+    panels: list[Panel] = []
+    for topic, payloads in read.payloads.items():
+        device = topic.removeprefix(source.topic)
+        title = f"{source.title} {device}"
+        try:
+            samples = source.decode(session, topic, payloads)
+        except FormatError as error:
+            panels.append(Panel(title, join_sentences(f"Not drawn: {error.message}.", note)))
+            note = ""
+        else:
+            panels += source.draw(device, title, samples, note)
+            note = "Drawn as above."
+    return panels
+
+
+def missing_devices_note(solution: Solution, recorded: Iterable[str]) -> str:
+    """Return a sentence on devices with poses that are not in the recording, empty without any."""
+    # The trajectory of a photodiode is named DEVICE/SENSOR, that over one sheet DEVICE-SHEET.
+    names = tuple(recorded)
+    prefixes = tuple(f"{name}{separator}" for name in names for separator in "/-")
+    missing = [
+        t.device
+        for t in solution.trajectories
+        if t.device not in names and not t.device.startswith(prefixes)
+    ]
+    if not missing:
+        return ""
+    return f"The recording has no signals of {join_names(missing)}, although there are poses."
+
+
+# ---- reading
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """Messages of some topics.
+
+    Attributes
+    ----------
+    payloads : dict of str to list of bytes
+        By topic, in the order of the file.
+    notes : tuple of str
+        Sentences on parts that were left out or are damaged.
+    """
+
+    payloads: dict[str, list[bytes]]
+    notes: tuple[str, ...]
+
+
+def read_excerpt(session: Session, topics: Collection[str]) -> Excerpt:
+    """Read messages of ``topics`` from about :data:`MAX_READ_BYTES` of a file.
+
+    Damaged parts are left out and counted in the notes.
+    """
+    names = {
+        entry.id: entry.topic for entry in session.index.channels.values() if entry.topic in topics
+    }
+    segments = [
+        segment
+        for segment in session.index.segments
+        if segment.channels is None or not segment.channels.isdisjoint(names)
+    ]
+    chosen = _select_segments(segments, MAX_READ_BYTES)
+    payloads: dict[str, list[bytes]] = {topic: [] for topic in sorted(topics)}
+    damaged = 0
+    with open_mcap(session.path) as stream:
+        for segment in chosen:
+            try:
+                for channel, _, payload in read_messages(stream, segment, names):
+                    payloads[names[channel]].append(payload)
+            except DamageError:
+                damaged += 1
+    notes = []
+    if len(chosen) < len(segments):
+        size_mb = capture_record.held_bytes(session, topics) / 1e6
+        notes.append(
+            f"The recording is large ({size_mb:.0f} MB): {len(chosen)} of {len(segments)} parts "
+            "are drawn, spread over its duration."
+        )
+    if damaged:
+        notes.append(f"{damaged} of {len(chosen)} parts of the recording are damaged and missing.")
+    return Excerpt(payloads, tuple(notes))
+
+
+def _select_segments(segments: list[Segment], limit_bytes: int) -> list[Segment]:
+    """Return segments of about this size, evenly spread over the file, at least one."""
+    total = sum(segment.length for segment in segments)
+    if total <= limit_bytes:
+        return segments
+    count = max(1, len(segments) * limit_bytes // total)
+    chosen = np.linspace(0, len(segments) - 1, count).round().astype(int)
+    return [segments[k] for k in np.unique(chosen)]
+
+
+@dataclass(frozen=True)
+class FieldSamples:
+    """Samples of magnetic sensors: ascending times (n,) in ns, fields (n, sensors * axes) in T."""
+
+    time_ns: NDArray[np.int64]
+    field_t: NDArray[np.float32]
+
+
+def decode_field_samples(
+    kind: SensorKind[Any], session: Session, topic: str, payloads: list[bytes]
+) -> FieldSamples:
+    """Decode the samples of one device; the positions of its sensors need not be known.
+
+    Raises
+    ------
+    FormatError
+        There are no samples, or a message is damaged.
+    """
+    try:
+        first: Any = kind.layout(1).message.FromString(payloads[0]) if payloads else None
+        if first is None or not first.sensors:
+            raise FormatError("no samples", file=session.path, where=topic)
+        columns = kind.layout(int(first.sensors)).unpack(payloads).columns
+    except (DecodeError, BatchError):
+        raise FormatError("a message is damaged", file=session.path, where=topic) from None
+    time_ns = columns["time_ns"]
+    if not len(time_ns):
+        raise FormatError("no samples", file=session.path, where=topic)
+    order = np.argsort(time_ns, kind="stable")
+    return FieldSamples(time_ns[order], columns["b_tesla"].reshape(len(time_ns), -1)[order])
+
+
+def seconds_since(time_ns: NDArray[Any], start_ns: int) -> NDArray[np.float64]:
+    """Return times on the time axis, which begins at ``start_ns`` in the whole report."""
+    return np.asarray((time_ns - start_ns) * 1e-9, np.float64)

@@ -1,4 +1,4 @@
-"""How a report looks: colours, letters, the frame of figures, and the script that draws them."""
+"""Look of a report: colors, fonts, the template of figures, and the script that draws them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import Any
 
 FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
 
-INK, FAINT, RULE, GRID = "#1d2733", "#5b6875", "#d5dbe1", "#e9edf1"
+INK, GRID = "#1d2733", "#e9edf1"
+"""Colors of text and of grid lines."""
 
 _AXIS: dict[str, Any] = {
     "gridcolor": GRID,
@@ -41,7 +42,7 @@ TEMPLATE: dict[str, Any] = {
         "modebar": {"bgcolor": "rgba(255,255,255,0.7)", "color": "#8896a3"},
     }
 }
-"""Of all figures of a page, in it once."""
+"""Layout that all figures share; a page contains it once."""
 
 CONFIG: dict[str, Any] = {
     "responsive": True,
@@ -60,7 +61,7 @@ SCRIPT = """\
   // A finger on a figure scrolls the page.
   const touch = !window.matchMedia("(hover: hover)").matches;
   shared.config.displayModeBar = touch ? false : "hover";
-  // One after the other, so that the page can be read while they are drawn.
+  // One after another, so that the page can be read in the meantime.
   function draw(k) {
     if (k >= figures.length) {
       document.documentElement.dataset.drawn = String(figures.length);
@@ -74,7 +75,7 @@ SCRIPT = """\
     Plotly.newPlot(figure, spec.data, spec.layout, shared.config)
       .then(function () { setTimeout(draw, 0, k + 1); });
   }
-  // Legends go above, which takes room, and maps are as high as what they show.
+  // In a narrow window legends move above the figure, and maps become lower.
   function narrow(figure, spec) {
     const legend = spec.layout.legend || {};
     if (legend.orientation === "v") {
@@ -93,7 +94,7 @@ SCRIPT = """\
       const shape = (y.range[1] - y.range[0]) / (x.range[1] - x.range[0]);
       height = Math.min(height, Math.max(140, width * shape) + 70 + 19 * rows);
     }
-    // Names of diagrams stand between them and the legend.
+    // Titles of diagrams are between them and the legend.
     const titled = (spec.layout.annotations || []).some(function (words) {
       return words.yref === "paper" && words.y > 0.99 && words.yanchor === "bottom";
     });

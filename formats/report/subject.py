@@ -1,14 +1,24 @@
-"""What a report is about: a solution, and all that is at hand to judge it."""
+"""Subject of a report: a solution with its session, truth and evaluation, loaded from files."""
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
 
-from locatk.core.evaluation import Evaluation
+from locatk.core.errors import FormatError, InputError, LocatkError
+from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
+from locatk.formats.importers import trajectories
+from locatk.formats.plots.ground import finite_poses, is_unscaled
+from locatk.formats.plots.series import overlap_in_time
 from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.solutions import read_solution
+from locatk.formats.sessions.trajectories import read_truth
 
 
 @dataclass(frozen=True)
@@ -18,16 +28,16 @@ class Subject:
     Attributes
     ----------
     name : str
-        How the report calls it, as in ``"run-solved.mcap"``.
+        Name in the report, as in ``"run-solved.mcap"``.
     solution : Solution
     facts : mapping of str to str
-        The metadata record of its file: tool version, command, source.
+        Metadata record of its file: tool version, command, source.
     session : Session or None
-        The recording that was solved, for raw signals; None where it is not at hand.
+        The recording that was solved, for its signals; None if it is not available.
     truth : tuple of Trajectory
-        Reference poses; empty where there are none.
+        Reference poses; empty if there are none.
     evaluation : Evaluation or None
-        Against that truth.
+        Errors with respect to the truth.
     """
 
     name: str
@@ -36,3 +46,125 @@ class Subject:
     session: Session | None = None
     truth: tuple[Trajectory, ...] = ()
     evaluation: Evaluation | None = None
+
+
+def load_subject(
+    path: str | os.PathLike[str],
+    *,
+    session: str | os.PathLike[str] | None = None,
+    truth: str | os.PathLike[str] | None = None,
+    align: str = "none",
+    offset_s: float | Literal["auto"] = 0.0,
+) -> Subject:
+    """Read a solution, its session and the truth, and evaluate it.
+
+    Parameters
+    ----------
+    path : path
+        The solution.
+    session : path, optional
+        The recording that was solved; by default the session with the name that the solution
+        contains, in the folder of the solution.
+    truth : path, optional
+        Reference poses in any format that `locatk eval` reads; by default those of the session.
+    align : str
+        One of :data:`locatk.core.evaluation.ALIGNMENTS`.
+    offset_s : float or "auto"
+        Added to the stamps of the solution, see :class:`locatk.core.evaluation.EvaluationOptions`.
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        ``path`` is no solution, ``session`` no session, or ``truth`` contains no poses.
+    InputError
+        ``session`` is of another system.
+    DegenerateError
+        The poses do not determine the alignment or the offset.
+    """
+    solution = _sort_devices(read_solution(path))
+    facts = Session.open(path).facts
+    if session is not None:
+        recording: Session | None = _open_session(session, solution)
+    else:
+        recording = _find_session(Path(path), facts, solution)
+    if truth is not None:
+        reference = tuple(trajectories.read(Path(truth), role="truth"))
+    else:
+        reference = () if recording is None else _session_truth(recording)
+    evaluation = _evaluate(solution, reference, align, offset_s)
+    return Subject(Path(path).name, solution, facts, recording, reference, evaluation)
+
+
+def _sort_devices(solution: Solution) -> Solution:
+    """Return the solution with its devices in natural order, ``robot-2`` before ``robot-10``."""
+
+    def key(t: Trajectory) -> list[tuple[bool, int, str]]:
+        parts = re.findall(r"([0-9]+)|([^0-9]+)", t.device)
+        return [(not digits, int(digits or 0), text) for digits, text in parts]
+
+    return replace(solution, trajectories=tuple(sorted(solution.trajectories, key=key)))
+
+
+def _open_session(path: str | os.PathLike[str], solution: Solution) -> Session:
+    """Open the given recording of a solution; a damaged one is accepted."""
+    session = Session.open(path, damaged_ok=True)
+    if session.facts.get("kind") == "solution":
+        raise FormatError(
+            "a solution, not a session", file=path, hint="Give the recording that was solved"
+        )
+    system = session.facts.get("system", solution.system)
+    if system != solution.system:
+        raise InputError(
+            f"a session of {system}, but the solution is of {solution.system}",
+            file=path,
+            hint="Give the recording that was solved",
+        )
+    return session
+
+
+def _find_session(path: Path, facts: Mapping[str, str], solution: Solution) -> Session | None:
+    """Return the session that the solution names, in its folder; None if there is none.
+
+    A file of this name from another time is another recording.
+    """
+    source = facts.get("source", "")
+    if not source or Path(source).name != source:
+        return None
+    candidate = path.parent / source
+    try:
+        if not candidate.is_file() or candidate.samefile(path):
+            return None
+        session = Session.open(candidate, damaged_ok=True)
+    except (LocatkError, OSError):
+        return None
+    is_session = session.facts.get("kind") != "solution"
+    return session if is_session and overlap_in_time(session, solution) else None
+
+
+def _session_truth(session: Session) -> tuple[Trajectory, ...]:
+    """Return the truth of a session, none if it is damaged: the report is on the solution."""
+    try:
+        return tuple(read_truth(session))
+    except LocatkError:
+        return ()
+
+
+def _evaluate(
+    solution: Solution,
+    truth: tuple[Trajectory, ...],
+    align: str,
+    offset_s: float | Literal["auto"],
+) -> Evaluation | None:
+    """Evaluate the solution; None if no pose has truth, or lengths cannot be compared."""
+    if is_unscaled(solution) and not align.startswith("sim"):
+        return None
+    solved = [t for t in map(finite_poses, solution.trajectories) if len(t)]
+    pairs, _ = pair_devices(solved, [t for t in map(finite_poses, truth) if len(t)])
+    if not pairs:
+        return None
+    try:
+        return evaluate(pairs, EvaluationOptions(align=align, offset_s=offset_s))
+    except InputError:
+        if align == "none" and offset_s == 0.0:
+            return None
+        raise

@@ -11,7 +11,7 @@ import pytest
 from click.testing import Result
 
 from locatk.cli.eval.command import ALIGNMENTS
-from locatk.cli.report import plan
+from locatk.cli.report import plan_outputs
 from locatk.core.evaluation import ALIGNMENTS as CORE
 from locatk.formats.pipeline import systems
 
@@ -33,14 +33,16 @@ def test_a_page_is_written(solution: Path, locatk: Locatk) -> None:
     assert done.exit_code == 0, done.stderr
     assert done.stdout == f"Wrote {page}\n"
     text = page.read_text(encoding="utf-8")
-    assert "Half of the poses lie within 1.00 mm" in text
+    assert "Half of the poses are within 1.00 mm" in text
     assert "3.00" not in done.stderr
     assert "jump" in text
     assert page.stat().st_size < 12e6
 
 
 @pytest.mark.slow
-def test_pictures_are_written_beside_it(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
+def test_pictures_are_written_next_to_the_page(
+    solution: Path, locatk: Locatk, tmp_path: Path
+) -> None:
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--png", "--svg", "--json")
     assert done.exit_code == 0, done.stderr
     files = [str(tmp_path / name) for name in ("r.html", "r.png", "r.svg")]
@@ -69,7 +71,7 @@ def test_several_solutions_share_a_page(solution: Path, locatk: Locatk, tmp_path
     assert "2 solutions" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
-def test_solutions_of_one_name_are_told_apart(
+def test_solutions_of_one_name_have_their_paths_as_titles(
     solution: Path, locatk: Locatk, tmp_path: Path
 ) -> None:
     (tmp_path / "again").mkdir()
@@ -83,16 +85,18 @@ def test_solutions_of_one_name_are_told_apart(
 
 def test_names_of_outputs() -> None:
     one, two = Path("a.mcap"), Path("b/a.mcap")
-    assert plan((one,), Path("r.html"), []) == (Path("r.html"), [[]])
-    assert plan((one,), Path("r.PNG"), [".png"]) == (None, [[Path("r.PNG")]])
-    assert plan((one,), Path("r.png"), [".pdf"]) == (None, [[Path("r.png"), Path("r.pdf")]])
-    assert plan((one, two), Path("x/r.svg"), []) == (
+    assert plan_outputs((one,), Path("r.html"), []) == (Path("r.html"), [[]])
+    assert plan_outputs((one,), Path("r.PNG"), [".png"]) == (None, [[Path("r.PNG")]])
+    assert plan_outputs((one,), Path("r.png"), [".pdf"]) == (None, [[Path("r.png"), Path("r.pdf")]])
+    assert plan_outputs((one, two), Path("x/r.svg"), []) == (
         None,
         [[Path("x/r-a.svg")], [Path("x/r-a-2.svg")]],
     )
 
 
-def test_nothing_is_replaced_unasked(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
+def test_nothing_is_replaced_without_overwrite(
+    solution: Path, locatk: Locatk, tmp_path: Path
+) -> None:
     """Not even the page is begun where a picture is in the way."""
     (tmp_path / "r.png").write_text("mine")
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--png")
@@ -139,14 +143,14 @@ def test_what_is_no_solution_is_one_line(session: Path, locatk: Locatk, tmp_path
     assert done.stderr.count("\n") == 1
 
 
-def test_the_session_can_be_elsewhere(
+def test_the_session_can_be_in_another_folder(
     solution: Path, session: Path, locatk: Locatk, tmp_path: Path
 ) -> None:
     (tmp_path / "far").mkdir()
     far = session.rename(tmp_path / "far" / "run.mcap")
     page = tmp_path / "r.html"
     assert locatk("report", solution, "-o", page).exit_code == 0
-    assert "--session FILE gives it" in page.read_text(encoding="utf-8")
+    assert "--session FILE adds them" in page.read_text(encoding="utf-8")
     assert locatk("report", solution, "-o", page, "--session", far, "--overwrite").exit_code == 0
     assert "Half of the poses" in page.read_text(encoding="utf-8")
 
@@ -165,16 +169,18 @@ def test_sessions_belong_to_solutions_by_name(
     assert text.count("Half of the poses") == 2
     done = locatk(*both, "--session", solution, "--overwrite")
     assert done.exit_code == 2
-    assert "No solution was made of" in done.stderr
+    assert "No solution is from the session" in done.stderr
 
 
 @pytest.mark.slow
-def test_truth_that_fits_nothing_is_told(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
+def test_truth_of_another_time_is_reported(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
     (tmp_path / "old.tum").write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     done = locatk("report", solution, "-o", tmp_path / "r.html", "--truth", tmp_path / "old.tum")
     assert done.exit_code == 0
-    assert "No pose has truth at its time" in done.stderr
-    assert "No pose has truth at its time" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "No pose has truth of its device at its time" in done.stderr
+    assert "No pose has truth of its device at its time" in (tmp_path / "r.html").read_text(
+        encoding="utf-8"
+    )
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Reports in a real browser: plots are drawn, nothing is loaded, nothing is complained of."""
+"""Reports in a real browser: figures are drawn, nothing is loaded, and there are no errors."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.report.report import write_report
 from locatk.formats.report.subject import Subject
 
+pytestmark = pytest.mark.slow
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 EVIL = "</script><img src=http://example.invalid/x onerror=alert(1)><script>alert(2)</script>"
 
@@ -37,7 +39,7 @@ def browser() -> str:
 
 @dataclass(frozen=True)
 class Opened:
-    """What a page became: its elements as HTML, and what the browser said."""
+    """An opened page: its elements as HTML, messages of the console, and requests."""
 
     dom: str
     console: list[str]
@@ -56,7 +58,7 @@ def opened(browser: str, page: Path, profile: Path, *more: str) -> Opened:
             "--disable-dev-shm-usage",
             "--disable-background-networking",
             f"--user-data-dir={profile}",
-            # Where it asks for an address it fails, and the log says so.
+            # Any request fails and is logged.
             "--host-resolver-rules=MAP * ~NOTFOUND",
             f"--log-net-log={log}",
             "--enable-logging=stderr",
@@ -135,7 +137,7 @@ def test_all_figures_are_drawn(page: tuple[str, Opened]) -> None:
         assert drawn, figure[:300]
 
 
-def test_nothing_is_complained_of(page: tuple[str, Opened]) -> None:
+def test_the_console_has_no_errors(page: tuple[str, Opened]) -> None:
     assert page[1].console == []
 
 
@@ -152,8 +154,8 @@ def test_names_of_devices_run_nothing(page: tuple[str, Opened]) -> None:
     assert "&lt;/script&gt;" in dom  # it is shown as it is
 
 
-def test_the_policy_stops_what_slips_through(browser: str, tmp_path: Path) -> None:
-    """A script and a picture that get into the page all the same neither run nor load."""
+def test_the_policy_blocks_injected_scripts_and_pictures(browser: str, tmp_path: Path) -> None:
+    """A script and a picture that get into the page nevertheless neither run nor load."""
     path = tmp_path / "report.html"
     write_report(path, [subject()])
     text = path.read_text(encoding="utf-8")
@@ -171,7 +173,7 @@ def test_the_policy_stops_what_slips_through(browser: str, tmp_path: Path) -> No
     assert any("example.invalid" in url for url in shown.requests)
 
 
-def test_it_can_be_looked_at(browser: str, tmp_path: Path) -> None:
+def test_the_page_is_not_blank(browser: str, tmp_path: Path) -> None:
     """Colours of all parts are in a picture of the page: it is not blank."""
     cv2 = pytest.importorskip("cv2")
     path, picture = tmp_path / "report.html", tmp_path / "page.png"

@@ -1,4 +1,4 @@
-"""Raw signals in reports: what is drawn, thinned, left out and told."""
+"""Signals in reports: panels of each system, and damaged, large or missing recordings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 pytest.importorskip("plotly")
 
@@ -24,8 +24,9 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.simulation import session as polaris_simulate
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.report import signals, signals_drawing, signals_lighthouse, signals_reading
-from locatk.formats.report.panel import Panel
+from locatk.formats.report import diagrams, signals
+from locatk.formats.report.panels import Panel
+from locatk.formats.report.systems import lighthouse as lighthouse_signals
 from locatk.formats.sessions import field_samples, frames, observations
 from locatk.formats.sessions.reader import Session
 
@@ -104,57 +105,6 @@ def landmarks_solution(*detections: LandmarkDetection, device: str = "robot") ->
     return Solution("landmarks", "field", (nothing,), detections=detections)
 
 
-# ---- thinning
-
-
-def test_peaks_of_a_long_signal_are_drawn() -> None:
-    rng = np.random.default_rng(1)
-    value = rng.normal(size=123_457)
-    value[[7, 60_001, 123_456]] = 50, -40, 30
-    value[1000:5000] = np.nan
-    time = np.arange(len(value)) * 0.01
-    x, y = signals_drawing.envelope(time, value)
-    assert len(x) <= 2.1 * signals_drawing.COLUMNS
-    assert {50.0, -40.0, 30.0} <= set(y.tolist())
-    assert np.all(np.diff(x) >= 0)
-    kept = np.isfinite(y)
-    assert_array_equal(value[np.round(x[kept] / 0.01).astype(int)], y[kept])
-    assert not np.any(kept & (x > 12) & (x < 48))  # nothing is drawn over what is missing
-
-
-def test_a_short_signal_stays_as_it_is_and_breaks_at_gaps() -> None:
-    time = np.r_[np.arange(10) * 0.1, 5 + np.arange(10) * 0.1]
-    x, y = signals_drawing.envelope(time, np.ones(20))
-    assert len(x) == 21
-    assert np.isnan(y[10])
-    assert_allclose(x[[9, 10, 11]], [0.9, 5, 5])
-    for n in range(3):
-        assert len(signals_drawing.envelope(np.arange(float(n)), np.arange(float(n)))[0]) == n
-
-
-def test_marks_that_hide_each_other_are_drawn_once() -> None:
-    time = np.linspace(0, 100, 50_000)
-    value = np.sin(time)
-    value[25_000] = 30.0
-    kept = signals_drawing.one_a_pixel(time, value)
-    assert len(kept) <= signals_drawing.MOST_MARKS
-    assert 25_000 in kept
-    assert_array_equal(signals_drawing.one_a_pixel(time[:10], value[:10]), np.arange(10))
-    noise = np.random.default_rng(0).normal(size=50_000)
-    assert 500 < len(signals_drawing.one_a_pixel(time, noise)) <= signals_drawing.MOST_MARKS
-    assert len(signals_drawing.one_a_pixel(np.zeros(9000), np.zeros(9000))) == 1
-
-
-def test_the_telling_detections_are_those_refused_the_least_sure_and_the_surest() -> None:
-    refused = ["", "", "a", "a", "b", "", ""]
-    sure = [0.9, 0.2, 0.0, 0.0, 0.0, 0.5, 0.99]
-    assert signals_drawing.telling(refused, sure, 4) == [1, 2, 4, 6]
-    assert signals_drawing.telling(refused, sure, 20) == [0, 1, 2, 4, 5, 6]
-    assert signals_drawing.telling([], [], 3) == []
-    assert signals_drawing.telling(["a", "b", "c", "d"], [0.0] * 4, 3) == [0]
-    assert signals_drawing.telling(["", ""], [np.nan, 1.0], 1) == [1]
-
-
 # ---- systems
 
 
@@ -165,7 +115,7 @@ def test_every_panel_has_words_and_draws_without_webgl(
     session, _ = hall_session(tmp_path / "halls.mcap")
     robot = landmarks_solution(landmark(20), landmark(50, refused="misread"))
     for recording, solution in (lighthouse, polaris, (session, robot)):
-        for panel in signals.panels(recording, solution):
+        for panel in signals.signal_panels(recording, solution):
             assert panel.title
             assert panel.note.endswith(".")
             assert {each["type"] for each in traces(panel)} <= {"scatter", "heatmap"}
@@ -175,16 +125,16 @@ def test_every_panel_has_words_and_draws_without_webgl(
             assert "[s]" in titles
 
 
-def test_sweeps_are_told_apart_as_the_solver_did(lighthouse: tuple[Session, Solution]) -> None:
+def test_sweeps_are_classified_as_by_the_solver(lighthouse: tuple[Session, Solution]) -> None:
     session, solution = lighthouse
-    found = signals.panels(session, solution)
+    found = signals.signal_panels(session, solution)
     assert [panel.title for panel in found] == ["Sweeps of robot-1", "Sweeps of robot-2"]
     left_out, no_pose = 0, 0
     for panel in found:
         names = [each["name"] for each in traces(panel)]
         assert {"channel 1", "channel 2", "poses"} <= set(names)
         for name in names:
-            if name.startswith("left out"):
+            if name.startswith("rejected"):
                 left_out += int(name.split("(")[1][:-1])
             if name.startswith("no pose"):
                 no_pose += int(name.split("(")[1][:-1])
@@ -203,15 +153,15 @@ def test_sweeps_of_several_photodiodes_belong_to_their_own_moments(
     solution = lighthouse_solver.solve(one)
     assert [each.device for each in solution.trajectories] == ["deck/0", "deck/1"]
     deck = Session.open(tmp_path / "deck.mcap")
-    (panel,) = signals.panels(deck, solution)
+    (panel,) = signals.signal_panels(deck, solution)
     assert "no signals" not in panel.note
-    held, posed = signals_lighthouse._used(one, solution)
+    held, posed = lighthouse_signals._classify(one, solution)
     assert np.count_nonzero(held & ~posed) == sum(each.rejected for each in solution.detections)
 
 
 def test_tags_are_marked_where_their_field_is(polaris: tuple[Session, Solution]) -> None:
     session, solution = polaris
-    whole, near = signals.panels(session, solution)
+    whole, near = signals.signal_panels(session, solution)
     assert whole.title == "Magnetic field along bar"
     (image,) = (each for each in whole.figure.data if each.type == "heatmap")
     assert image.z.shape[0] == 9
@@ -223,19 +173,19 @@ def test_tags_are_marked_where_their_field_is(polaris: tuple[Session, Solution])
         row = np.abs(image.y - y).argmin()
         around = image.z[row, max(0, column - 6) : column + 7]
         assert around.max() > 0.3 * np.nanmax(image.z)
-    (read,) = (each for each in whole.figure.data if each.name == "read (1)")
+    (read,) = (each for each in whole.figure.data if each.name == "identified (1)")
     assert str(solution.detections[0].tag_id) in read.text[0]
     assert len(near.figure.data) == 3 * 9
     assert "There was one." in near.note
 
 
-def test_a_bar_whose_sensors_are_nowhere_is_drawn_by_numbers(
+def test_sensors_without_known_positions_are_numbered(
     polaris: tuple[Session, Solution], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session, solution = polaris
     monkeypatch.setattr(session, "attachment", lambda name: None)
-    whole, _ = signals.panels(session, solution)
-    assert "not known: they are numbered" in whole.note
+    whole, _ = signals.signal_panels(session, solution)
+    assert "unknown: they are numbered" in whole.note
     assert any(each.get("name") == "sensor 9" for each in traces(whole))
 
 
@@ -247,38 +197,42 @@ def test_a_dead_sensor_and_a_short_recording_are_drawn(tmp_path: Path) -> None:
         tmp_path / "run.mcap", [Samples("bar", made.array, made.time_ns[:30], field)]
     )
     nothing = Solution("polaris", "joint", ())
-    (panel,) = signals.panels(Session.open(tmp_path / "run.mcap"), nothing)
-    assert "Nothing was found in it." in panel.note
+    (panel,) = signals.signal_panels(Session.open(tmp_path / "run.mcap"), nothing)
+    assert "No magnet was detected." in panel.note
     (image,) = (each for each in panel.figure.data if each.type == "heatmap")
     assert np.isnan(image.z[4]).all()
     assert np.isfinite(np.delete(image.z, 4, axis=0)).all()
 
 
-def test_halls_are_drawn_with_their_peaks_and_sightings(tmp_path: Path) -> None:
+def test_hall_signals_have_their_peaks_and_detections(tmp_path: Path) -> None:
     session, field = hall_session(tmp_path / "run.mcap")
     solution = landmarks_solution(
         landmark(20), landmark(50, refused="misread"), landmark(90, cell=None, pattern=None)
     )
-    whole, near = signals.panels(session, solution)
+    whole, near = signals.signal_panels(session, solution)
     (left,) = (each for each in whole.figure.data if each.name == "left")
     assert np.nanmax(values(left)) == pytest.approx(31.0)
-    assert len(left.x) <= 2.1 * signals_drawing.COLUMNS
+    assert len(left.x) <= 2.1 * diagrams.SIGNAL_COLUMNS
     assert "Thinned" in whole.note
     (refused,) = (each for each in whole.figure.data if each.name == "refused (1)")
     assert refused.x[0] == pytest.approx(50, abs=0.01)
     assert refused.text[0] == "misread<br>2,3<br>NNNS"
     assert "refused: misread" in refused.customdata[0]
     assert "All 3 visits are drawn." in near.note
+    lines = [shape.x0 for shape in near.figure.layout.shapes]
+    assert_allclose(lines, [20, 50, 90], atol=0.01)  # the time of each detection
     assert len(field) == 30_000
 
 
-def test_names_of_sensors_are_no_html(tmp_path: Path) -> None:
+def test_names_of_sensors_are_escaped(tmp_path: Path) -> None:
     sensors = HallSensors(names=("<b>x</b>", "b", "c", "d"))
     time_ns = START_NS + np.arange(50) * 5_000_000
     samples = HallSamples("robot", sensors, time_ns, np.zeros((50, 4)))
     field_samples.write_halls(tmp_path / "run.mcap", [samples])
     bad = landmark(0.1, refused="<i>why</i>", pattern="<u>")
-    for panel in signals.panels(Session.open(tmp_path / "run.mcap"), landmarks_solution(bad)):
+    for panel in signals.signal_panels(
+        Session.open(tmp_path / "run.mcap"), landmarks_solution(bad)
+    ):
         text = panel.figure.to_json()
         assert "<b>" not in text
         assert "<i>" not in text
@@ -298,7 +252,7 @@ def test_frames_are_shown_decoded_and_rejected(tmp_path: Path, camera: bool) -> 
     frames.write_session(tmp_path / "run.mcap", [spoiled], made.manifest, camera=lens)
     options = dots_solver.SolveOptions(camera=lens)
     solution = dots_solver.solve([spoiled], made.manifest, options)
-    shown, over_time = signals.panels(Session.open(tmp_path / "run.mcap"), solution)
+    shown, over_time = signals.signal_panels(Session.open(tmp_path / "run.mcap"), solution)
     assert len(shown.pictures) == 8
     assert all(each.png.startswith(PNG) for each in shown.pictures)
     captions = [each.caption for each in shown.pictures]
@@ -321,26 +275,26 @@ def colours(png: bytes) -> int:
     return int(np.count_nonzero(np.ptp(picture.astype(int), axis=2) > 20))
 
 
-# ---- what is missing, damaged or too much
+# ---- missing, damaged and large recordings
 
 
-def test_a_large_recording_is_drawn_in_parts_and_says_so(
+def test_a_large_recording_is_drawn_in_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(0)
-    n = 400_000
+    n = 200_000
     time_ns = START_NS + np.arange(n) * 5_000_000
     field = 1e-3 * rng.normal(size=(n, 4))
     field_samples.write_halls(
         tmp_path / "run.mcap", [HallSamples("robot", HallSensors(), time_ns, field)]
     )
     session = Session.open(tmp_path / "run.mcap")
-    monkeypatch.setattr(signals_reading, "MOST_READ", 2 << 20)
-    read = signals_reading.excerpt(session, session.topics("/halls/"))
+    monkeypatch.setattr(signals, "MAX_READ_BYTES", 2 << 20)
+    read = signals.read_excerpt(session, session.topics("/halls/"))
     size = sum(map(len, read.payloads["/halls/robot"]))
-    assert size < 6 << 20  # of 9.6 MB unpacked
-    solution = landmarks_solution(*(landmark(at) for at in np.arange(1.0, 1999.0)))
-    whole, near = signals.panels(session, solution)
+    assert size < 3.5 * (1 << 20)  # of 4.8 MB unpacked
+    solution = landmarks_solution(*(landmark(at) for at in np.arange(1.0, 999.0)))
+    whole, near = signals.signal_panels(session, solution)
     assert "The recording is large" in whole.note
     front = next(each for each in whole.figure.data if each.name == "front")
     assert front.x[0] == pytest.approx(0, abs=1)
@@ -351,16 +305,16 @@ def test_a_large_recording_is_drawn_in_parts_and_says_so(
     assert all(len(each.x) > 10 for each in drawn)  # only where samples were read
 
 
-def test_damaged_parts_are_left_out_and_told(tmp_path: Path) -> None:
-    session, _ = hall_session(tmp_path / "run.mcap", n=400_000)
+def test_damaged_parts_are_left_out_and_counted(tmp_path: Path) -> None:
+    session, _ = hall_session(tmp_path / "run.mcap", n=100_000)
     segment = session.index.segments[1]
     data = bytearray((tmp_path / "run.mcap").read_bytes())
     middle = segment.offset + segment.length // 2
     data[middle : middle + 8] = b"\xff" * 8
     (tmp_path / "run.mcap").write_bytes(data)
-    whole, *_ = signals.panels(Session.open(tmp_path / "run.mcap"), landmarks_solution())
+    whole, *_ = signals.signal_panels(Session.open(tmp_path / "run.mcap"), landmarks_solution())
     assert f"1 of {len(session.index.segments)} parts of the recording are damaged" in whole.note
-    assert "No landmark was found in it." in whole.note
+    assert "No landmark was detected." in whole.note
 
 
 def test_a_recording_cut_short_shows_what_is_left(
@@ -371,46 +325,46 @@ def test_a_recording_cut_short_shows_what_is_left(
     for share in (0.2, 0.5, 0.9):
         (tmp_path / "cut.mcap").write_bytes(data[: int(share * len(data))])
         cut = Session.open(tmp_path / "cut.mcap", damaged_ok=True)
-        found = signals.panels(cut, solution)
+        found = signals.signal_panels(cut, solution)
         assert found
         assert all(panel.note for panel in found)
 
 
-def test_other_recordings_say_what_they_lack(
+def test_recordings_of_other_systems_have_a_note(
     tmp_path: Path, polaris: tuple[Session, Solution], lighthouse: tuple[Session, Solution]
 ) -> None:
-    (panel,) = signals.panels(polaris[0], lighthouse[1])
-    assert panel.note == "No signals of lighthouse in the recording: it is one of polaris."
-    (panel,) = signals.panels(lighthouse[0], replace(lighthouse[1], system="sonar"))
+    (panel,) = signals.signal_panels(polaris[0], lighthouse[1])
+    assert panel.note == "No signals of lighthouse in the recording: it is of polaris."
+    (panel,) = signals.signal_panels(lighthouse[0], replace(lighthouse[1], system="sonar"))
     assert "'sonar' cannot be drawn" in panel.note
     for system in signals.MODULES:
         other = polaris[0] if system != "polaris" else lighthouse[0]
-        (panel,) = signals.panels(other, Solution(system, "x", ()))
+        (panel,) = signals.signal_panels(other, Solution(system, "x", ()))
         assert panel.figure is None
         assert panel.note
     session, _ = hall_session(tmp_path / "run.mcap", n=500)
-    whole, *_ = signals.panels(session, landmarks_solution(device="another"))
-    assert "The recording has no signals of another, of which the solution has poses." in whole.note
+    whole, *_ = signals.signal_panels(session, landmarks_solution(device="another"))
+    assert "The recording has no signals of another, although there are poses." in whole.note
 
 
-def test_many_devices_are_named_where_they_are_not_drawn(tmp_path: Path) -> None:
+def test_devices_that_are_not_drawn_are_listed(tmp_path: Path) -> None:
     time_ns = START_NS + np.arange(50) * 5_000_000
     samples = [
         HallSamples(f"robot-{k}", HallSensors(), time_ns, np.zeros((50, 4))) for k in range(6)
     ]
     field_samples.write_halls(tmp_path / "run.mcap", samples)
-    found = signals.panels(Session.open(tmp_path / "run.mcap"), Solution("landmarks", "field", ()))
-    assert len(found) == signals_reading.MOST_DEVICES
+    found = signals.signal_panels(
+        Session.open(tmp_path / "run.mcap"), Solution("landmarks", "field", ())
+    )
+    assert len(found) == signals.MAX_DEVICES
     assert "Not drawn: robot-4, robot-5." in found[0].note
 
 
-def test_a_recording_that_is_gone_is_told(
-    tmp_path: Path, polaris: tuple[Session, Solution]
-) -> None:
+def test_a_missing_recording_has_a_note(tmp_path: Path, polaris: tuple[Session, Solution]) -> None:
     session, solution = polaris
     data = Path(session.path).read_bytes()
     (tmp_path / "gone.mcap").write_bytes(data)
     gone = Session.open(tmp_path / "gone.mcap")
     (tmp_path / "gone.mcap").unlink()
-    (panel,) = signals.panels(gone, solution)
+    (panel,) = signals.signal_panels(gone, solution)
     assert "cannot be drawn: no such file" in panel.note

@@ -1,4 +1,4 @@
-"""Subjects of reports: which session and which truth are taken, and what is refused."""
+"""Subjects of reports: the session and truth that are used, and refused files."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters.tum import write_tum
-from locatk.formats.report.subjects import _beside, load
+from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.report.subject import _find_session, load_subject
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.solutions import write_solution
 
@@ -61,8 +61,8 @@ def solved(path: Path, solution: Solution = SOLUTION, source: str = "run.mcap") 
     return path
 
 
-def test_the_session_beside_it_gives_the_truth(session: Path, tmp_path: Path) -> None:
-    subject = load(solved(tmp_path / "solved.mcap"))
+def test_truth_is_read_from_the_session_in_the_same_folder(session: Path, tmp_path: Path) -> None:
+    subject = load_subject(solved(tmp_path / "solved.mcap"))
     assert subject.name == "solved.mcap"
     assert subject.session is not None
     assert Path(subject.session.path) == session
@@ -71,8 +71,8 @@ def test_the_session_beside_it_gives_the_truth(session: Path, tmp_path: Path) ->
     assert subject.evaluation.median == pytest.approx(2e-3)
 
 
-def test_without_it_there_is_no_truth(tmp_path: Path) -> None:
-    subject = load(solved(tmp_path / "solved.mcap"))
+def test_without_session_there_is_no_truth(tmp_path: Path) -> None:
+    subject = load_subject(solved(tmp_path / "solved.mcap"))
     assert (subject.session, subject.truth, subject.evaluation) == (None, (), None)
 
 
@@ -82,26 +82,26 @@ def test_other_names_are_not_followed(session: Path, tmp_path: Path, source: str
     (tmp_path / "in").mkdir()
     path = solved(tmp_path / "in" / "solved.mcap")
     named = source if source != "/run.mcap" else str(session)
-    assert _beside(path, {"source": named}, SOLUTION) is None
+    assert _find_session(path, {"source": named}, SOLUTION) is None
     there = solved(tmp_path / "solved.mcap")
-    assert _beside(there, {"source": "run.mcap"}, SOLUTION) is not None
+    assert _find_session(there, {"source": "run.mcap"}, SOLUTION) is not None
 
 
 def test_a_session_of_another_system_is_refused(session: Path, tmp_path: Path) -> None:
     path = solved(tmp_path / "solved.mcap", replace(SOLUTION, system="dots"))
     with pytest.raises(InputError, match="of lighthouse, but the solution is of dots"):
-        load(path, session=session)
+        load_subject(path, session=session)
 
 
 def test_a_recording_of_another_time_is_another_recording(tmp_path: Path) -> None:
     record(tmp_path / "run.mcap", late_s=3600.0)
-    assert load(solved(tmp_path / "solved.mcap")).session is None
+    assert load_subject(solved(tmp_path / "solved.mcap")).session is None
 
 
-def test_a_session_elsewhere_can_be_named(tmp_path: Path) -> None:
+def test_a_session_in_another_folder_can_be_given(tmp_path: Path) -> None:
     (tmp_path / "far").mkdir()
     far = record(tmp_path / "far" / "other.mcap")
-    subject = load(solved(tmp_path / "solved.mcap"), session=far)
+    subject = load_subject(solved(tmp_path / "solved.mcap"), session=far)
     assert subject.session is not None
     assert subject.evaluation is not None
 
@@ -111,7 +111,7 @@ def test_a_solution_is_no_session(tmp_path: Path) -> None:
     twin = tmp_path / "twin.mcap"
     shutil.copy(path, twin)
     with pytest.raises(FormatError, match="a solution, not a session"):
-        load(path, session=twin)
+        load_subject(path, session=twin)
 
 
 def test_a_damaged_session_does_not_stop_the_report(session: Path, tmp_path: Path) -> None:
@@ -120,49 +120,51 @@ def test_a_damaged_session_does_not_stop_the_report(session: Path, tmp_path: Pat
         session.write_bytes(broken)
         path = tmp_path / "solved.mcap"
         path.unlink(missing_ok=True)
-        assert load(solved(path)).solution.poses == 60
+        assert load_subject(solved(path)).solution.poses == 60
 
 
-def test_truth_from_a_file_goes_first(session: Path, tmp_path: Path) -> None:
-    write_tum(tmp_path / "camera.tum", track(off_m=5e-3))
-    subject = load(solved(tmp_path / "solved.mcap"), truth=tmp_path / "camera.tum")
+def test_a_truth_file_replaces_the_truth_of_the_session(session: Path, tmp_path: Path) -> None:
+    trajectories.write_tum(tmp_path / "camera.tum", track(off_m=5e-3))
+    subject = load_subject(solved(tmp_path / "solved.mcap"), truth=tmp_path / "camera.tum")
     assert subject.evaluation is not None
     assert subject.evaluation.median == pytest.approx(3e-3)
 
 
-def test_alignment_and_offset_are_those_asked_for(session: Path, tmp_path: Path) -> None:
-    subject = load(solved(tmp_path / "solved.mcap"), align="se2")
+def test_alignment_and_offset_are_the_requested_ones(session: Path, tmp_path: Path) -> None:
+    subject = load_subject(solved(tmp_path / "solved.mcap"), align="se2")
     assert subject.evaluation is not None
     assert subject.evaluation.align == "se2"
     assert subject.evaluation.max < 1e-6
-    late = load(solved(tmp_path / "b.mcap"), offset_s=0.1).evaluation
+    late = load_subject(solved(tmp_path / "b.mcap"), offset_s=0.1).evaluation
     assert late is not None
     assert late.time_offset.source == "given"
     assert late.median > 0.05
 
 
-def test_a_scene_without_scale_is_compared_only_when_asked(session: Path, tmp_path: Path) -> None:
+def test_a_scene_without_scale_is_evaluated_only_with_scaling_alignment(
+    session: Path, tmp_path: Path
+) -> None:
     unit = replace(SOLUTION, artifact=Scene(scale="unit"))
     path = solved(tmp_path / "solved.mcap", unit)
-    subject = load(path)
+    subject = load_subject(path)
     assert subject.truth
     assert subject.evaluation is None
-    assert load(path, align="sim3").evaluation is not None
+    assert load_subject(path, align="sim3").evaluation is not None
 
 
 def test_truth_of_nothing_that_was_solved(session: Path, tmp_path: Path) -> None:
     two = replace(SOLUTION, trajectories=(track("green"), track("blue")))
-    assert load(solved(tmp_path / "a.mcap", two)).evaluation is None
+    assert load_subject(solved(tmp_path / "a.mcap", two)).evaluation is None
     none = replace(SOLUTION, trajectories=())
-    assert load(solved(tmp_path / "b.mcap", none)).evaluation is None
+    assert load_subject(solved(tmp_path / "b.mcap", none)).evaluation is None
 
 
 def test_a_session_is_no_solution(session: Path, tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no solution") as caught:
-        load(session)
+        load_subject(session)
     assert "locatk solve" in str(caught.value.hint)
     with pytest.raises(MissingDataError):
-        load(tmp_path / "nowhere.mcap")
+        load_subject(tmp_path / "nowhere.mcap")
 
 
 def test_a_damaged_solution_is_one_line(tmp_path: Path) -> None:
@@ -170,25 +172,23 @@ def test_a_damaged_solution_is_one_line(tmp_path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(FormatError) as caught:
-        load(path)
+        load_subject(path)
     assert "\n" not in str(caught.value)
 
 
 def test_devices_are_in_the_order_of_their_names(tmp_path: Path) -> None:
     names = ("robot-10", "robot-9", "a/2", "robot", "7", "a/11")
     many = replace(SOLUTION, trajectories=tuple(track(name) for name in names))
-    found = load(solved(tmp_path / "solved.mcap", many)).solution.trajectories
+    found = load_subject(solved(tmp_path / "solved.mcap", many)).solution.trajectories
     assert [t.device for t in found] == ["7", "a/2", "a/11", "robot", "robot-9", "robot-10"]
 
 
-def test_poses_that_are_no_numbers_do_not_cost_the_others_their_errors(
-    session: Path, tmp_path: Path
-) -> None:
+def test_poses_that_are_not_finite_are_not_evaluated(session: Path, tmp_path: Path) -> None:
     some = replace(SOLUTION, trajectories=(track(off_m=2e-3),))
     some.trajectories[0].position[3] = np.nan
-    subject = load(solved(tmp_path / "solved.mcap", some))
+    subject = load_subject(solved(tmp_path / "solved.mcap", some))
     assert subject.evaluation is not None
     assert subject.evaluation.n == 59
     assert subject.solution.poses == 60
     some.trajectories[0].position[:] = np.inf
-    assert load(solved(tmp_path / "none.mcap", some)).evaluation is None
+    assert load_subject(solved(tmp_path / "none.mcap", some)).evaluation is None

@@ -21,7 +21,7 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots.solution import SUFFIXES, draw, plot_solution
+from locatk.formats.plots.picture import SUFFIXES, draw_picture, write_picture
 
 START_NS = 1_767_225_600_000_000_000
 ROTATION = rotation_exp([0.0, 0.6, 0.0])
@@ -77,34 +77,35 @@ def texts(figure: Figure) -> list[str]:
 def test_every_kind_of_picture_is_written_the_same_twice(tmp_path: Path, suffix: str) -> None:
     first, second = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     for path in (first, second):
-        plot_solution(path, solution(), truth=TRUTH)
+        write_picture(path, solution(), truth=TRUTH)
     head = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}[suffix.lower()]
     assert first.read_bytes().startswith(head)
     assert first.read_bytes() == second.read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == [first.name, second.name]
 
 
+@pytest.mark.slow
 def test_png_is_1200_by_600(tmp_path: Path) -> None:
-    plot_solution(tmp_path / "a.png", solution(), truth=TRUTH)
+    write_picture(tmp_path / "a.png", solution(), truth=TRUTH)
     data = (tmp_path / "a.png").read_bytes()
     assert struct.unpack(">II", data[16:24]) == (1200, 600)
 
 
-def test_what_exists_is_not_replaced_unasked(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_text("mine")
     with pytest.raises(OutputExistsError) as caught:
-        plot_solution(path, solution())
+        write_picture(path, solution())
     assert caught.value.hint
     assert path.read_text() == "mine"
-    plot_solution(path, solution(), overwrite=True)
+    write_picture(path, solution(), overwrite=True)
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a", ".png", "a.png.txt"])
 def test_an_unknown_kind_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="no picture") as caught:
-        plot_solution(tmp_path / name, solution())
+    with pytest.raises(InputError, match="not the name of a picture") as caught:
+        write_picture(tmp_path / name, solution())
     assert "\n" not in str(caught.value)
     assert ".png, .svg, .pdf" in str(caught.value.hint)
     assert list(tmp_path.iterdir()) == []
@@ -112,7 +113,7 @@ def test_an_unknown_kind_is_refused_in_one_line(tmp_path: Path, name: str) -> No
 
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(MissingDataError, match="nowhere"):
-        plot_solution(tmp_path / "nowhere" / "a.png", solution())
+        write_picture(tmp_path / "nowhere" / "a.png", solution())
 
 
 def test_nothing_is_left_behind_when_drawing_fails(
@@ -123,15 +124,15 @@ def test_nothing_is_left_behind_when_drawing_fails(
 
     monkeypatch.setattr(Figure, "savefig", full)
     with pytest.raises(Exception, match="No space left"):
-        plot_solution(tmp_path / "a.png", solution())
+        write_picture(tmp_path / "a.png", solution())
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
 def test_users_settings_neither_change_the_picture_nor_are_changed(tmp_path: Path) -> None:
-    plot_solution(tmp_path / "a.png", solution())
+    write_picture(tmp_path / "a.png", solution())
     with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "lines.linewidth": 9}):
-        plot_solution(tmp_path / "b.png", solution())
+        write_picture(tmp_path / "b.png", solution())
         assert mpl.rcParams["font.size"] == 30
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
@@ -139,7 +140,7 @@ def test_users_settings_neither_change_the_picture_nor_are_changed(tmp_path: Pat
 @pytest.mark.slow
 def test_pyplot_is_never_imported() -> None:
     """It would choose a window system and keep every figure."""
-    code = "import sys, locatk.formats.plots.solution; print('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, locatk.formats.plots.picture; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 
@@ -148,7 +149,7 @@ def test_pyplot_is_never_imported() -> None:
 
 
 def test_errors_are_those_of_the_evaluation() -> None:
-    figure = draw(solution(), TRUTH)
+    figure = draw_picture(solution(), TRUTH)
     said = "\n".join(texts(figure))
     assert "240 poses of 2 devices" in said
     assert "APE rmse 3.16 mm, mean 3.00 mm" in said  # 2 mm and 4 mm
@@ -177,7 +178,7 @@ def test_an_alignment_brings_all_into_the_frame_of_the_truth() -> None:
         ),
     )
     pairs = list(zip(moved.trajectories, TRUTH, strict=True))
-    figure = draw(moved, TRUTH, evaluate(pairs, EvaluationOptions(align="sim3")))
+    figure = draw_picture(moved, TRUTH, evaluate(pairs, EvaluationOptions(align="sim3")))
     ground = figure.axes[0]
     assert ground.get_xlabel() == "x [m]"
     paths = [line.get_xydata() for line in ground.lines if len(line.get_xydata()) == 120]
@@ -188,14 +189,14 @@ def test_an_alignment_brings_all_into_the_frame_of_the_truth() -> None:
     np.testing.assert_allclose(dots, [[-2.0, 0.0]], atol=1e-9)
 
 
-def test_without_truth_it_shows_what_the_solver_expects() -> None:
-    said = texts(draw(solution()))
+def test_without_truth_sigmas_are_shown() -> None:
+    said = texts(draw_picture(solution()))
     assert "solver's sigma [mm]" in said
     assert not any("MAE" in text for text in said)
 
 
 def test_a_solution_without_scale_is_not_compared_with_metres() -> None:
-    said = texts(draw(solution(scene=replace(SCENE, scale="unit")), TRUTH))
+    said = texts(draw_picture(solution(scene=replace(SCENE, scale="unit")), TRUTH))
     assert "x [unit]" in said
     assert "truth" not in said
     assert not any("MAE" in text or "[mm]" in text for text in said)
@@ -204,11 +205,11 @@ def test_a_solution_without_scale_is_not_compared_with_metres() -> None:
 def test_truth_of_other_devices_or_times_is_no_error() -> None:
     later = replace(track("red"), time_ns=track("red").time_ns + 10**12)
     for truth in ((track("green"),), (later,)):
-        assert "solver's sigma [mm]" in texts(draw(solution(), truth))
+        assert "solver's sigma [mm]" in texts(draw_picture(solution(), truth))
 
 
 def test_stations_are_in_view_or_named_at_the_margin() -> None:
-    figure = draw(solution(), TRUTH)
+    figure = draw_picture(solution(), TRUTH)
     ground = figure.axes[0]
     (low, high), (bottom, top) = ground.get_xlim(), ground.get_ylim()
     assert low < -2.0
@@ -224,32 +225,32 @@ def test_stations_are_in_view_or_named_at_the_margin() -> None:
 @pytest.mark.parametrize(
     ("far_m", "said"), [(0.46, "ch 1\n460 mm"), (1.24, "ch 1\n1.2 m"), (87.3, "ch 1\n87 m")]
 )
-def test_a_small_map_tells_how_far_stations_are(far_m: float, said: str) -> None:
+def test_a_small_map_shows_the_distance_of_stations(far_m: float, said: str) -> None:
     small = replace(track("red"), position=0.01 * track("red").position)
     station = Station(1, np.array([0.0, far_m, 0.0]), np.eye(3), IDEAL_CALIBRATION)
     scene = Scene(stations=(station,), scale="markers")
-    figure = draw(Solution("lighthouse", "bundle", (small,), artifact=scene))
+    figure = draw_picture(Solution("lighthouse", "bundle", (small,), artifact=scene))
     assert figure.axes[0].get_xlabel() == "x [mm]"
     assert said in texts(figure)
 
 
-def test_paths_break_where_nothing_was_seen() -> None:
+def test_paths_break_at_gaps() -> None:
     whole = track("red")
     keep = np.r_[0:40, 60:120]
     part = Trajectory.from_positions("red", "floor", whole.time_ns[keep], whole.position[keep])
-    figure = draw(Solution("lighthouse", "bundle", (part,), artifact=SCENE))
+    figure = draw_picture(Solution("lighthouse", "bundle", (part,), artifact=SCENE))
     x = next(line for line in figure.axes[0].lines if len(line.get_xdata()) > 50).get_xdata()
     assert len(x) == 101
     assert np.flatnonzero(np.isnan(x)).tolist() == [40]
 
 
-def test_wild_poses_do_not_hide_the_others() -> None:
+def test_outliers_do_not_hide_the_other_poses() -> None:
     wild = track("red")
     wild.position[50] = [700.0, -300.0, 0.0]
-    figure = draw(Solution("lighthouse", "bundle", (wild,), artifact=SCENE), TRUTH)
+    figure = draw_picture(Solution("lighthouse", "bundle", (wild,), artifact=SCENE), TRUTH)
     assert figure.axes[0].get_xlim()[1] < 10
     said = texts(figure)
-    assert "1 pose lies outside this view" in said
+    assert "1 pose outside this view" in said
     assert any("1 of 120 beyond this scale (triangles)" in text for text in said)
 
 
@@ -279,7 +280,7 @@ LONG = tuple(f"robot-with-a-very-long-name-{k}" for k in range(30))
 def test_every_word_is_inside_the_picture(
     tmp_path: Path, shown: Solution, truth: tuple[Trajectory, ...]
 ) -> None:
-    figure = draw(shown, truth)
+    figure = draw_picture(shown, truth)
     figure.savefig(tmp_path / "a.png", dpi=100)
     frame = figure.bbox
     undrawn = set()
@@ -298,17 +299,20 @@ def test_every_word_is_inside_the_picture(
         assert box.y1 <= frame.y1 + 1, text
 
 
-def test_what_the_covariance_expects_is_drawn() -> None:
-    figure = draw(solution(names=("red",)), TRUTH)
+def test_expected_errors_are_drawn() -> None:
+    figure = draw_picture(solution(names=("red",)), TRUTH)
     over_time = next(a for a in figure.axes if a.get_ylabel() == "error [mm]")
-    assert over_time.get_title(loc="left") == "line: 95 % expected by the covariance"
+    assert (
+        over_time.get_title(loc="left")
+        == "line: 95 % of errors expected below it, by the covariance"
+    )
     edges = [line.get_ydata() for line in over_time.lines if line.get_linestyle() == "-"]
     np.testing.assert_allclose(np.concatenate(edges), 2.7955, rtol=4e-3)  # chi-squared of three
     assert over_time.get_ylim()[1] > 2.8
-    many = draw(solution(names=("a", "b", "c", "d")), tuple(track(name) for name in "abcd"))
-    assert not any("95 % expected" in text for text in texts(many))
+    many = draw_picture(solution(names=("a", "b", "c", "d")), tuple(track(name) for name in "abcd"))
+    assert not any("95 % of errors" in text for text in texts(many))
 
 
-def test_the_title_tells_how_much_was_solved() -> None:
-    said = "\n".join(texts(draw(solution(), TRUTH)))
+def test_the_title_contains_the_solved_fraction() -> None:
+    said = "\n".join(texts(draw_picture(solution(), TRUTH)))
     assert "100.0 % of the time solved" in said

@@ -1,0 +1,1 @@
+"""Raw signals of each system in a report: one module per system."""
