@@ -307,15 +307,15 @@ def _files(output: Path, format_name: str, manifest: Manifest) -> list[Path]:
 
 
 def _tell_cramped(manifest: Manifest, wanted: bool) -> None:
-    from locatk.formats.printing.page import NEEDED_MM
-    from locatk.formats.printing.pattern import cramped
+    from locatk.formats.printing.page import MIN_MARGIN_MM
+    from locatk.formats.printing.pattern import sheets_without_margin
 
-    bare = cramped(manifest) if wanted else []
+    bare = sheets_without_margin(manifest) if wanted else []
     if bare:
         others = f" and {len(bare) - 1} more" if len(bare) > 1 else ""
         console.warn(
             f"No rulers, marks and words on {bare[0]}{others}: they need a margin of "
-            f"{NEEDED_MM:g} mm."
+            f"{MIN_MARGIN_MM:g} mm."
         )
 
 

@@ -152,20 +152,15 @@ def _files(output: Path, format_name: str, pages: int) -> list[Path]:
 def _write(files: Sequence[Path], format_name: str, drawn: TagPages, *, overwrite: bool) -> None:
     """All is written whole before anything appears."""
     from locatk.formats.output import atomic_write
+    from locatk.formats.printing.drawings import render_pages, render_svg
 
     ids = {item.tag_id for item in drawn.tags}
     title = f"locatk tag {min(ids)}" if len(ids) == 1 else f"locatk, {len(ids)} tags"
     if format_name == "pdf":
-        from locatk.formats.printing.drawings import (
-            render_pages,  # reportlab: not for the other format
-        )
-
         hint = "Use a smaller paper, or --format svg"
         contents = [render_pages(drawn.pages, title, hint=hint)]
     else:
-        from locatk.formats.printing import tag_svg
-
-        contents = [tag_svg.render(page, title) for page in drawn.pages]
+        contents = [render_svg(page, title) for page in drawn.pages]
     with contextlib.ExitStack() as stack:
         for path, data in zip(files, contents, strict=True):
             stack.enter_context(atomic_write(path, overwrite=overwrite)).write(data)

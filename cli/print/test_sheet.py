@@ -46,12 +46,12 @@ def testsheet(
     """
     from locatk.core.dots.drawing.test_sheet import printer_sheet
     from locatk.formats.output import atomic_write
-    from locatk.formats.printing.test_sheet import render
+    from locatk.formats.printing.pattern import render_test_sheet
 
     options.guard_output(output, overwrite=overwrite)
     sheet = printer_sheet(size, int(dpi), codec)
     with atomic_write(output, overwrite=overwrite) as stream:
-        stream.write(render(sheet))
+        stream.write(render_test_sheet(sheet))
     pitches = sorted({field.pitch_mm for field in sheet.fields})
     dots = sorted({field.dot_mm for field in sheet.fields})
     console.result(

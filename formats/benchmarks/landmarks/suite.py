@@ -8,8 +8,9 @@ from the data folder.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,15 +206,12 @@ def _position_rows(
         for lines in (1, 2, 3)
         if (group := [result for result in results if result.lines == lines])
     )
-    for (label, statistic, detail), target in zip(
-        (
-            ("mean", np.mean, f"{how}{remarks}; mean {by_lines} lines of sensors"),
-            ("p95", lambda mm: np.quantile(mm, 0.95), "of the same visits"),
-            ("largest", np.max, f"visits {_list([r.number for r in worst])} of seed {seed}"),
-        ),
-        targets_mm,
-        strict=True,
-    ):
+    statistics: tuple[tuple[str, Callable[[Array], Any], str], ...] = (
+        ("mean", np.mean, f"{how}{remarks}; mean {by_lines} lines of sensors"),
+        ("p95", lambda mm: np.quantile(mm, 0.95), "of the same visits"),
+        ("largest", np.max, f"visits {_list([r.number for r in worst])} of seed {seed}"),
+    )
+    for (label, statistic, detail), target in zip(statistics, targets_mm, strict=True):
         peer_value = None if peer_errors_mm is None else float(statistic(peer_errors_mm))
         yield Figure(f"{name}: {label}", float(statistic(errors)), "mm", detail, target,
                      peer=peer, peer_value=peer_value)  # fmt: skip

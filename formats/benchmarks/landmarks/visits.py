@@ -364,7 +364,8 @@ def solve_stops(count: int, seed: int, anywhere: bool = False) -> StaticErrors:
         strength=STATIC_ERRORS.bar_strength, bar_position_m=STATIC_ERRORS.bar_place_m,
         noise_t=STATIC_ERRORS.noise_t, model_error_t=STATIC_ERRORS.noise_t,
     )  # fmt: skip
-    errors = StaticErrors(*np.full((3, count, 3), np.nan), np.full(count, np.nan))
+    by_field, linear, newton = np.full((3, count, 3), np.nan)
+    errors = StaticErrors(by_field, linear, newton, np.full(count, np.nan))
     for k, code in enumerate(codes.tolist()):
         trace = Trace(
             np.zeros((1, 3)), np.zeros((1, 3, 0)), field[k][None], lever_arm, np.ones(1), 0
