@@ -11,8 +11,10 @@ from typing import IO
 
 from locatk.core.dots.design.ledger import Area
 from locatk.core.dots.drawing.layout import Raster, SheetLayout, lay_out
+from locatk.core.dots.drawing.tiles import SheetTiling, tiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
+from locatk.core.paper_sizes import paper_size
 from locatk.formats.artifacts.ledger import Ledger
 from locatk.formats.artifacts.sheets import dumps_manifest
 from locatk.formats.output import atomic_write
@@ -37,7 +39,31 @@ class DrawnSheets:
     losses: tuple[str, ...] = ()
 
 
-def page_layouts(document: Path, margin_mm: float, raster: Raster) -> list[SheetLayout]:
+def paper_layouts(
+    paper: str,
+    margin_mm: float,
+    raster: Raster,
+    *,
+    landscape: bool | None,
+    count: int,
+    tiles: tuple[int, int] | None,
+    overlap_mm: float,
+) -> Sequence[SheetLayout | SheetTiling]:
+    """Return the layouts of ``count`` equal sheets, or of one floor of (columns, rows) tiles.
+
+    Raises
+    ------
+    InputError
+        The paper is unknown or too small for dots.
+    """
+    _, size_mm = paper_size(paper, landscape=landscape)
+    layout = lay_out(size_mm, margin_mm, raster)
+    return [layout] * count if tiles is None else [tiling(layout, tiles, overlap_mm)]
+
+
+def page_layouts(
+    document: Path, margin_mm: float, raster: Raster
+) -> Sequence[SheetLayout | SheetTiling]:
     """Return the layouts of sheets that are printed over the pages of a PDF.
 
     Raises
