@@ -8,9 +8,8 @@ from the data folder.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,20 +199,21 @@ def _position_rows(
     remarks = f"; not detected or refused: {_list(missing)} of seed {seed}" if missing else ""
     if divided := [result.number for result in results if result.visits > 1]:
         remarks += f"; divided into several visits, of which the last counts: {_list(divided)}"
-    worst = sorted((r for r in results if r.error_m > 0), key=lambda r: -r.error_m)[:3]
+    by_error = sorted((r for r in results if r.error_m > 0), key=lambda r: -r.error_m)
+    worst = [result.number for result in by_error[:3]]
     by_lines = ", ".join(
         f"{errors_mm(group).mean():.2f} by {lines}"
         for lines in (1, 2, 3)
         if (group := [result for result in results if result.lines == lines])
     )
-    statistics: tuple[tuple[str, Callable[[Array], Any], str], ...] = (
-        ("mean", np.mean, f"{how}{remarks}; mean {by_lines} lines of sensors"),
-        ("p95", lambda mm: np.quantile(mm, 0.95), "of the same visits"),
-        ("largest", np.max, f"visits {_list([r.number for r in worst])} of seed {seed}"),
-    )
-    for (label, statistic, detail), target in zip(statistics, targets_mm, strict=True):
-        peer_value = None if peer_errors_mm is None else float(statistic(peer_errors_mm))
-        yield Figure(f"{name}: {label}", float(statistic(errors)), "mm", detail, target,
+    target_mean, target_p95, target_largest = targets_mm
+    for label, statistic, target, detail in (
+        ("mean", _mean, target_mean, f"{how}{remarks}; mean {by_lines} lines of sensors"),
+        ("p95", _p95, target_p95, "of the same visits"),
+        ("largest", _largest, target_largest, f"visits {_list(worst)} of seed {seed}"),
+    ):
+        peer_value = None if peer_errors_mm is None else statistic(peer_errors_mm)
+        yield Figure(f"{name}: {label}", statistic(errors), "mm", detail, target,
                      peer=peer, peer_value=peer_value)  # fmt: skip
     yield Figure(f"{name}: heading", rms_deg([result.heading_rad for result in results]), "deg",
                  "rms, of the same visits")  # fmt: skip
@@ -224,6 +224,18 @@ def _position_rows(
                  f"{np.median(known):.2f} (2.37 expected), "
                  f"{100 * np.mean(known > 11.34):.1f} % above 11.34 (1 % expected)",
                  peer="consistent", peer_value=3.0)  # fmt: skip
+
+
+def _mean(errors: Array) -> float:
+    return float(errors.mean())
+
+
+def _p95(errors: Array) -> float:
+    return float(np.quantile(errors, 0.95))
+
+
+def _largest(errors: Array) -> float:
+    return float(errors.max())
 
 
 def _correct_row(
