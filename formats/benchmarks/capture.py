@@ -263,7 +263,7 @@ def kill_figures(recordings: int = KILLED_RECORDINGS) -> list[Figure]:
 
 @dataclass(frozen=True)
 class ChunkSpan:
-    """Bytes ``start`` to ``end`` of a file that hold a chunk with these messages."""
+    """Chunk of messages in the bytes ``start`` to ``end`` of a file."""
 
     start: int
     end: int

@@ -402,7 +402,7 @@ def _identification() -> list[Figure]:
 
 
 def count_wrong_windows(polynomial: int) -> int:
-    """Count the windows of one sequence whose polynomial or index is identified wrongly."""
+    """Count the windows of one sequence with a wrong polynomial or index."""
     index = np.arange(lfsr.SEQUENCE_LENGTH)
     words = lfsr.bits_at(index, polynomial, CLEAN_WINDOW_BITS)
     shift = np.arange(CLEAN_WINDOW_BITS - 1, -1, -1, dtype=np.uint64)

@@ -93,10 +93,10 @@ def _rows(layout: SheetLayout, rows: Iterator[NDArray[np.uint8]]) -> Iterator[by
     raster, (width, height) = layout.raster, layout.page
     left, top = (start - raster.offset for start in layout.first)
     cells = _cells(raster)
-    at = 0
+    line = 0
     step = max(1, MAX_BAND_PIXELS // (width * raster.pitch))
     yield from _packed(np.ones((top, width), np.uint8), step * raster.pitch)
-    at = top
+    line = top
     for band in rows:
         for start in range(0, len(band), step):
             part = band[start : start + step]
@@ -104,9 +104,9 @@ def _rows(layout: SheetLayout, rows: Iterator[NDArray[np.uint8]]) -> Iterator[by
             lines = np.ones((len(ink), width), np.uint8)
             lines[:, left : left + ink.shape[1]] -= ink[:, : width - left]
             # The last cell may be higher than the rest of the page.
-            yield from _packed(lines[: height - at], len(lines))
-            at = min(height, at + len(lines))
-    yield from _packed(np.ones((height - at, width), np.uint8), step * raster.pitch)
+            yield from _packed(lines[: height - line], len(lines))
+            line = min(height, line + len(lines))
+    yield from _packed(np.ones((height - line, width), np.uint8), step * raster.pitch)
 
 
 def _packed(lines: NDArray[np.uint8], step: int) -> Iterator[bytes]:

@@ -34,7 +34,7 @@ INKS = ("/Cyan", "/Magenta", "/Yellow", "/Black")
 
 @dataclass(frozen=True)
 class ColourSpace:
-    """Colour space whose colours can be converted to inks without black.
+    """Colour space with a conversion to inks without black.
 
     Attributes
     ----------
@@ -82,52 +82,52 @@ BY_COMPONENTS = {1: GREY, 3: RGB, 4: CMYK}
 
 
 def read_colour_space(
-    found: pikepdf.Object | None, named: pikepdf.Object | None = None
+    definition: pikepdf.Object | None, named: pikepdf.Object | None = None
 ) -> ColourSpace | None:
     """Read a colour space; return None if it cannot be converted to inks without black.
 
     Parameters
     ----------
-    found : Name or Array
+    definition : Name or Array
     named : Dictionary, optional
         ``ColorSpace`` of the resources, in which names are looked up.
     """
-    if isinstance(found, Name):
-        if str(found) in COMPONENTS_BY_NAME:
-            return BY_COMPONENTS[COMPONENTS_BY_NAME[str(found)]]
-        inner = None if named is None else named.get(str(found))
+    if isinstance(definition, Name):
+        if str(definition) in COMPONENTS_BY_NAME:
+            return BY_COMPONENTS[COMPONENTS_BY_NAME[str(definition)]]
+        inner = None if named is None else named.get(str(definition))
         # Names that refer to names are resolved once only, which excludes endless loops.
-        return read_colour_space(inner) if inner is not None and inner != found else None
-    if not isinstance(found, pikepdf.Array) or len(found) == 0:
+        return read_colour_space(inner) if inner is not None and inner != definition else None
+    if not isinstance(definition, pikepdf.Array) or len(definition) == 0:
         return None
-    family = str(found[0])
+    family = str(definition[0])
     if family in COMPONENTS_BY_NAME:
         return BY_COMPONENTS[COMPONENTS_BY_NAME[family]]
     if family == "/ICCBased":
-        return _profile(found)
+        return _profile(definition)
     if family in ("/Indexed", "/I"):
-        return _indexed(found, named)
+        return _indexed(definition, named)
     if family == "/Separation":
-        return _tint(found, named)
+        return _tint(definition, named)
     if family == "/DeviceN":
-        return _inks(found)
+        return _inks(definition)
     return None
 
 
-def _profile(found: pikepdf.Array) -> ColourSpace | None:
-    stream = found[1]
+def _profile(definition: pikepdf.Array) -> ColourSpace | None:
+    stream = definition[1]
     alternate = stream.get("/Alternate")
     if isinstance(alternate, pikepdf.Array) and str(alternate[0]) == "/Lab":
         return None
     return BY_COMPONENTS.get(int(stream.get("/N", 0)))
 
 
-def _indexed(found: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
-    base = read_colour_space(found[1], named)
+def _indexed(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
+    base = read_colour_space(definition[1], named)
     if base is None or base.kind == "indexed":
         return None
-    high = int(found[2])
-    table = found[3]
+    high = int(definition[2])
+    table = definition[3]
     data = table.read_bytes() if isinstance(table, pikepdf.Stream) else bytes(table)
     wanted = (high + 1) * base.components
     entries = np.frombuffer(data[:wanted].ljust(wanted, b"\0"), np.uint8) / 255.0
@@ -139,16 +139,16 @@ def _indexed(found: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace 
     return ColourSpace("indexed", 1, (0.0,), look_up, high)
 
 
-def _tint(found: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
+def _tint(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
     """Read a single ink: black itself, or a spot colour by its alternate space."""
-    name = str(found[1])
+    name = str(definition[1])
     if name in ("/Black", "/All"):  # /All is printed with all inks, including black
         return ColourSpace("tint", 1, (1.0,), lambda v: np.repeat(np.clip(v, 0, 1), 3, axis=1))
     if name in INKS:
         plate = np.eye(4)[INKS.index(name), :3]
         return ColourSpace("tint", 1, (1.0,), lambda v: np.clip(v, 0, 1) * plate)
-    alternate = read_colour_space(found[2], named)
-    transform = read_function(found[3])
+    alternate = read_colour_space(definition[2], named)
+    transform = read_function(definition[3])
     if alternate is None or transform is None:
         return None
     return ColourSpace(
@@ -156,33 +156,33 @@ def _tint(found: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | N
     )
 
 
-def _inks(found: pikepdf.Array) -> ColourSpace | None:
+def _inks(definition: pikepdf.Array) -> ColourSpace | None:
     """Read several inks if all of them are process inks."""
-    names = [str(name) for name in found[1]]
+    names = [str(name) for name in definition[1]]
     if not set(names) <= {*INKS, "/None"}:
         return None
     to_cmyk = np.array([[float(ink == name) for ink in INKS] for name in names])
     return ColourSpace("inks", len(names), (1.0,) * len(names), lambda v: from_cmyk(v @ to_cmyk))
 
 
-def read_function(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
+def read_function(definition: pikepdf.Object) -> Callable[[Floats], Floats] | None:
     """Read a function of one number, (n,) to (n, outputs); return None for unsupported types.
 
     Supported are sampled (type 0), exponential (2) and stitched (3) functions, and lists of them
     with one output each.
     """
-    if isinstance(found, pikepdf.Array):
-        parts = [read_function(item) for item in found]
+    if isinstance(definition, pikepdf.Array):
+        parts = [read_function(item) for item in definition]
         if any(part is None for part in parts):
             return None
         return lambda x: np.hstack([part(x) for part in parts if part is not None])
-    kind = int(found.get("/FunctionType", -1))
+    kind = int(definition.get("/FunctionType", -1))
     read = {0: _sampled, 2: _exponential, 3: _stitched}.get(kind)
-    inner = read(found) if read is not None else None
+    inner = read(definition) if read is not None else None
     if inner is None:
         return None
-    low, high = numbers(found.Domain)[:2]
-    ends = numbers(found.Range).reshape(-1, 2) if "/Range" in found else None
+    low, high = numbers(definition.Domain)[:2]
+    ends = numbers(definition.Range).reshape(-1, 2) if "/Range" in definition else None
 
     def evaluate(x: Floats) -> Floats:
         result = inner(np.clip(x, low, high))
@@ -191,24 +191,24 @@ def read_function(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
     return evaluate
 
 
-def numbers(found: Any) -> Floats:
+def numbers(definition: Any) -> Floats:
     """Convert a PDF array of numbers."""
-    return np.array([float(item) for item in found])
+    return np.array([float(item) for item in definition])
 
 
-def _exponential(found: pikepdf.Object) -> Callable[[Floats], Floats]:
-    first = numbers(found.C0) if "/C0" in found else np.zeros(1)
-    last = numbers(found.C1) if "/C1" in found else np.ones(1)
-    power = float(found.N)
+def _exponential(definition: pikepdf.Object) -> Callable[[Floats], Floats]:
+    first = numbers(definition.C0) if "/C0" in definition else np.zeros(1)
+    last = numbers(definition.C1) if "/C1" in definition else np.ones(1)
+    power = float(definition.N)
     return lambda x: first + (x**power)[:, None] * (last - first)
 
 
-def _stitched(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
-    parts = [read_function(item) for item in found.Functions]
+def _stitched(definition: pikepdf.Object) -> Callable[[Floats], Floats] | None:
+    parts = [read_function(item) for item in definition.Functions]
     if any(part is None for part in parts):
         return None
-    domain, bounds = numbers(found.Domain)[:2], numbers(found.Bounds)
-    encode = numbers(found.Encode).reshape(-1, 2)
+    domain, bounds = numbers(definition.Domain)[:2], numbers(definition.Bounds)
+    encode = numbers(definition.Encode).reshape(-1, 2)
     edges = np.concatenate([domain[:1], bounds, domain[1:]])
 
     def evaluate(x: Floats) -> Floats:
@@ -224,17 +224,17 @@ def _stitched(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
     return evaluate
 
 
-def _sampled(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
-    size, bits = numbers(found.Size), int(found.BitsPerSample)
-    if len(size) != 1 or bits not in (8, 16, 32) or not isinstance(found, pikepdf.Stream):
+def _sampled(definition: pikepdf.Object) -> Callable[[Floats], Floats] | None:
+    size, bits = numbers(definition.Size), int(definition.BitsPerSample)
+    if len(size) != 1 or bits not in (8, 16, 32) or not isinstance(definition, pikepdf.Stream):
         return None
-    ends = numbers(found.Range).reshape(-1, 2)
-    samples = np.frombuffer(found.read_bytes(), f">u{bits // 8}")[: int(size[0]) * len(ends)]
+    ends = numbers(definition.Range).reshape(-1, 2)
+    samples = np.frombuffer(definition.read_bytes(), f">u{bits // 8}")[: int(size[0]) * len(ends)]
     samples = samples.reshape(int(size[0]), len(ends)) / (2.0**bits - 1)
-    decode = numbers(found.Decode).reshape(-1, 2) if "/Decode" in found else ends
+    decode = numbers(definition.Decode).reshape(-1, 2) if "/Decode" in definition else ends
     table = decode[:, 0] + samples * (decode[:, 1] - decode[:, 0])
-    low, high = numbers(found.Domain)[:2]
-    start, end = numbers(found.Encode)[:2] if "/Encode" in found else (0.0, size[0] - 1)
+    low, high = numbers(definition.Domain)[:2]
+    start, end = numbers(definition.Encode)[:2] if "/Encode" in definition else (0.0, size[0] - 1)
 
     def evaluate(x: Floats) -> Floats:
         position = np.clip(start + (x - low) / (high - low) * (end - start), 0, size[0] - 1)

@@ -49,7 +49,7 @@ class PatternSpace:
 INHERITED = "inherited"
 """Current colour space of a form that has not set one: that of its caller."""
 
-UNKNOWN = None
+NOT_CONVERTIBLE = None
 """Current colour space that cannot be converted."""
 
 CurrentSpace = ColourSpace | PatternSpace | str | None
@@ -217,52 +217,52 @@ class BlackRemover:
             The content cannot be parsed.
         """
 
-        def fill(made: Stream) -> None:
+        def fill(converted: Stream) -> None:
             own = stream.get("/Resources")
             scope = outer if own is None and outer else self._scope(own or Dictionary())
-            made.Resources = scope.converted
+            converted.Resources = scope.converted
             if "/Group" in stream and "/CS" in stream.Group:
                 # Blending in RGB converts all colours to RGB, which the printer converts to black.
-                made.Group = copy.copy(stream.Group)
-                made.Group.CS = Name.DeviceCMYK
+                converted.Group = copy.copy(stream.Group)
+                converted.Group.CS = Name.DeviceCMYK
             data = self._content(stream, scope, starts)
-            made.write(INITIAL_COLOURS + data if starts else data)
+            converted.write(INITIAL_COLOURS + data if starts else data)
 
-        made: Stream = self._once("form", stream, fill)
-        return made
+        converted: Stream = self._once("form", stream, fill)
+        return converted
 
-    def _once(self, role: str, found: Any, fill: Callable[[Any], None]) -> Any:
-        """Return a copy of ``found`` that is completed by ``fill``; the same one each time."""
-        key = (role, found.objgen)
-        if found.is_indirect and key in self._converted:
+    def _once(self, role: str, original: Any, fill: Callable[[Any], None]) -> Any:
+        """Return a copy of ``original`` that is completed by ``fill``; the same one each time."""
+        key = (role, original.objgen)
+        if original.is_indirect and key in self._converted:
             return self._converted[key]
-        made = self._pdf.make_indirect(copy.copy(found))
-        if found.is_indirect:
-            self._converted[key] = made  # before it is completed: it may contain itself
-        fill(made)
-        return made
+        converted = self._pdf.make_indirect(copy.copy(original))
+        if original.is_indirect:
+            self._converted[key] = converted  # before it is completed: it may contain itself
+        fill(converted)
+        return converted
 
-    def _try(self, kind: str, found: Any, convert: Callable[[], Any]) -> Any:
-        """Return the result of ``convert``, or ``found`` (and count it) if it fails."""
-        key = (kind, found.objgen)
-        if found.is_indirect and key in self._converted:
+    def _try(self, kind: str, original: Any, convert: Callable[[], Any]) -> Any:
+        """Return the result of ``convert``, or ``original`` (and count it) if it fails."""
+        key = (kind, original.objgen)
+        if original.is_indirect and key in self._converted:
             return self._converted[key]
         try:
-            made = convert()
+            converted = convert()
         except NotConvertible as reason:
             self.left[str(reason)] += 1
-            made = found
+            converted = original
         except DAMAGE_ERRORS:
             self.left[f"{kind} that are damaged"] += 1
-            made = found
-        if found.is_indirect:
-            made = self._pdf.make_indirect(made)
-            self._converted[key] = made
-        return made
+            converted = original
+        if original.is_indirect:
+            converted = self._pdf.make_indirect(converted)
+            self._converted[key] = converted
+        return converted
 
-    def _scope(self, found: pikepdf.Object) -> ResourceScope:
-        def fill(made: pikepdf.Object) -> None:
-            scope = ResourceScope(found, made)
+    def _scope(self, original: pikepdf.Object) -> ResourceScope:
+        def fill(converted: pikepdf.Object) -> None:
+            scope = ResourceScope(original, converted)
             jobs = {
                 "/Shading": self._shading,
                 "/Pattern": self._pattern,
@@ -271,17 +271,17 @@ class BlackRemover:
             }
             # Copy all first, since content may add to resources that are not converted yet.
             for key in jobs:
-                made[key] = copy.copy(found.get(key, Dictionary()))
+                converted[key] = copy.copy(original.get(key, Dictionary()))
             for key, convert in jobs.items():
-                for name, item in found.get(key, Dictionary()).items():
+                for name, item in original.get(key, Dictionary()).items():
                     if isinstance(item, Dictionary | Stream):
-                        made[key][name] = convert(item, scope)
-            spaces = found.get("/ColorSpace")
+                        converted[key][name] = convert(item, scope)
+            spaces = original.get("/ColorSpace")
             if spaces is not None:
                 kept = {name: self._kept_space(item, spaces) for name, item in spaces.items()}
-                made.ColorSpace = Dictionary({k: v for k, v in kept.items() if v is not None})
+                converted.ColorSpace = Dictionary({k: v for k, v in kept.items() if v is not None})
 
-        return ResourceScope(found, self._once("resources", found, fill))
+        return ResourceScope(original, self._once("resources", original, fill))
 
     def _xobject(self, item: Any, scope: ResourceScope) -> Any:
         kind = str(item.get("/Subtype"))
@@ -304,8 +304,8 @@ class BlackRemover:
                 return item  # a stencil, in the colour given with its name
             return self._try("patterns", item, lambda: self.form(item, scope, starts=True))
 
-        def fill(made: pikepdf.Object) -> None:
-            made.Shading = self._shading(item.Shading, scope)
+        def fill(converted: pikepdf.Object) -> None:
+            converted.Shading = self._shading(item.Shading, scope)
 
         return self._once("pattern", item, fill) if "/Shading" in item else item
 
@@ -313,10 +313,10 @@ class BlackRemover:
         if str(item.get("/Subtype")) != "/Type3":
             return item
 
-        def fill(made: pikepdf.Object) -> None:
+        def fill(converted: pikepdf.Object) -> None:
             own = self._scope(item.Resources) if "/Resources" in item else scope
-            made.Resources = own.converted
-            made.CharProcs = Dictionary(
+            converted.Resources = own.converted
+            converted.CharProcs = Dictionary(
                 {name: self._glyph(glyph, own) for name, glyph in item.CharProcs.items()}
             )
 
@@ -326,7 +326,7 @@ class BlackRemover:
         if b"d1" in glyph.read_bytes()[:200]:
             return glyph  # a stencil: its own colours are ignored
         return self._once(
-            "glyph", glyph, lambda made: made.write(self._content(glyph, scope, False))
+            "glyph", glyph, lambda converted: converted.write(self._content(glyph, scope, False))
         )
 
     def _content(self, stream: Stream, scope: ResourceScope, starts: bool) -> bytes:
@@ -334,17 +334,17 @@ class BlackRemover:
 
         def look_up(name: pikepdf.Object) -> ColourSpace | pikepdf.Object | None:
             """Return a space, the array of a pattern space, or None if it cannot be converted."""
-            found = None if spaces is None else spaces.get(str(name))
+            original = None if spaces is None else spaces.get(str(name))
             if str(name) == "/Pattern":
                 return Array([name])
-            if isinstance(found, Array) and len(found) and str(found[0]) == "/Pattern":
-                return found
+            if isinstance(original, Array) and len(original) and str(original[0]) == "/Pattern":
+                return original
             return self._space(name, spaces)
 
         return rewrite_colours(
             stream,
             look_up,
-            lambda found: self._space(found, spaces),
+            lambda original: self._space(original, spaces),
             lambda image: self._name_inline(image, scope),
             self.left,
             starts=starts,
@@ -368,16 +368,16 @@ class BlackRemover:
         resources[name] = self._xobject(stream, scope)
         return Name(name)
 
-    def _space(self, found: pikepdf.Object, spaces: pikepdf.Object | None) -> ColourSpace | None:
+    def _space(self, original: pikepdf.Object, spaces: pikepdf.Object | None) -> ColourSpace | None:
         try:
-            return colours.read_colour_space(found, spaces)
+            return colours.read_colour_space(original, spaces)
         except DAMAGE_ERRORS:
             return None
 
-    def _kept_space(self, found: pikepdf.Object, spaces: pikepdf.Object) -> Any:
+    def _kept_space(self, original: pikepdf.Object, spaces: pikepdf.Object) -> Any:
         """Return the converted colour space of a name, or None if no content uses it any more."""
-        if isinstance(found, Array) and len(found) > 1 and str(found[0]) == "/Pattern":
-            if self._space(found[1], spaces) is not None:
+        if isinstance(original, Array) and len(original) > 1 and str(original[0]) == "/Pattern":
+            if self._space(original[1], spaces) is not None:
                 return Array([Name.Pattern, Name.DeviceCMYK])
-            return found
-        return found if self._space(found, spaces) is None else None
+            return original
+        return original if self._space(original, spaces) is None else None
