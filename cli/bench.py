@@ -1,41 +1,49 @@
-"""``locatk bench``: what the project promises, measured."""
+"""``locatk bench``: accuracy and speed beside targets and peers."""
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command
 
 BENCHES = {
     "lighthouse": "locatk.formats.benchmarks.lighthouse:figures",
     "dots": "locatk.formats.benchmarks.dots.suite:figures",
     "polaris": "locatk.formats.benchmarks.polaris.suite:figures",
     "landmarks": "locatk.formats.benchmarks.landmarks.suite:figures",
-    "capture": "locatk.formats.benchmarks.capture.suite:figures",
-    "look": "locatk.formats.benchmarks.look.suite:figures",
-    "infrared": "locatk.formats.benchmarks.infrared.suite:figures",
+    "capture": "locatk.formats.benchmarks.capture:figures",
+    "look": "locatk.formats.benchmarks.look:figures",
+    "infrared": "locatk.formats.benchmarks.infrared:figures",
 }
 """Name of a system, or of a part, to the function that measures its figures."""
 
-ELSEWHERE = Path("../shared/data")
+DEFAULT_DATA_FOLDER = Path("../shared/data")
+
+TABLE_WIDTH = 80
 
 
-@click.command(short_help="Measure what the project promises, on published data.")
+@click.command(cls=Command, short_help="Measure accuracy and speed against targets.")
 @click.argument("system", metavar="SYSTEM", type=click.Choice(list(BENCHES)))
 @options.input_option(
     "--data",
     metavar="FOLDER",
-    help=f"Folder with the published recordings.  [default: $LOCATK_DATA, else {ELSEWHERE}]",
+    help="Folder with the published recordings.  "
+    f"[default: $LOCATK_DATA, else {DEFAULT_DATA_FOLDER}]",
 )
+@click.option("--full", is_flag=True, help="Also print peers, machine factors and methods.")
 @options.as_json
 @options.verbosity
-def command(system: str, data: Path | None, as_json: bool) -> None:
-    """Measure the figures of SYSTEM and print them beside targets and peers.
+def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
+    """Measure the figures of SYSTEM and print them beside their targets.
 
-    A figure whose data is not there is listed without a value, and with the reason.
+    Targets of durations are scaled by the machine factor: the duration of a fixed workload on this
+    machine, measured with each figure, over that on the reference machine. A figure whose data
+    are missing is listed without a value; --full gives the reason.
 
     \b
     Examples:
@@ -46,40 +54,79 @@ def command(system: str, data: Path | None, as_json: bool) -> None:
       locatk bench capture
       locatk bench look
       locatk bench infrared
+      locatk bench lighthouse --full
       locatk bench lighthouse --data ~/data --json
     """
+    from locatk.formats.benchmarks.timing import machine_figures
     from locatk.formats.published_data import data_folder
 
     with console.working("Measuring"):
-        figures = options.load(BENCHES[system])(data_folder(data) or ELSEWHERE)
+        figures = options.load(BENCHES[system])(data_folder(data) or DEFAULT_DATA_FOLDER)
+        figures = [*figures, *machine_figures()]
     if as_json:
-        rows = [{name: getattr(figure, name) for name in FIELDS} for figure in figures]
-        console.emit_json({"system": system, "commit": _commit(), "figures": rows})
-        return
-    console.result(
-        console.table(
-            ("figure", "value", "target", "unit", "met", "peer", "peer's", "how"),
-            [_row(figure) for figure in figures],
+        console.emit_json(
+            {"system": system, "commit": _commit(), "figures": [_entry(f) for f in figures]}
         )
-    )
+    elif full:
+        header = ("figure", "value", "target", "unit", "met", "machine", "peer", "peer's", "how")
+        console.result(console.table(header, [_full_row(figure) for figure in figures]))
+    else:
+        console.result(_narrow_table([_row(figure) for figure in figures]))
 
 
-FIELDS = ("name", "value", "unit", "target", "better", "met", "peer", "peer_value", "how")
-"""Of one figure, in the order of ``--json``."""
+def _entry(figure: Any) -> dict[str, Any]:
+    """Return a figure as in ``--json``; ``target`` is the one scaled to this machine."""
+    return {
+        "name": figure.name,
+        "value": figure.value,
+        "unit": figure.unit,
+        "target": figure.scaled_target,
+        "better": figure.better,
+        "met": figure.met,
+        "peer": figure.peer,
+        "peer_value": figure.peer_value,
+        "how": figure.how,
+        "workload": figure.workload,
+        "machine_factor": figure.machine_factor,
+        "reference_target": figure.target,
+    }
 
 
 def _row(figure: Any) -> tuple[str, ...]:
     sign = "<=" if figure.better == "lower" else ">="
+    target = figure.scaled_target
     return (
         figure.name,
         _number(figure.value),
-        "-" if figure.target is None else f"{sign} {_number(figure.target)}",
+        "-" if target is None else f"{sign} {_number(target)}",
         figure.unit,
         {True: "yes", False: "no", None: "-"}[figure.met],
+    )
+
+
+def _full_row(figure: Any) -> tuple[str, ...]:
+    factor = figure.machine_factor
+    return (
+        *_row(figure),
+        "-" if factor is None else f"{figure.workload} {factor:.2f}",
         figure.peer or "-",
         _number(figure.peer_value),
         figure.how,
     )
+
+
+def _narrow_table(rows: list[tuple[str, ...]]) -> str:
+    """Format rows in :data:`TABLE_WIDTH` columns; long names continue on the next line."""
+    header = ("figure", "value", "target", "unit", "met")
+    columns = zip(*(row[1:] for row in (header, *rows)), strict=True)
+    widths = [max(map(len, column)) for column in columns]
+    name_width = TABLE_WIDTH - sum(widths) - 2 * len(widths)
+    lines: list[tuple[str, ...]] = []
+    for name, *cells in rows:
+        first, *others = textwrap.wrap(name, name_width, subsequent_indent="  ")
+        lines.append((first, *cells))
+        lines += [(other, *("" for _ in cells)) for other in others]
+    return console.table(header, lines)
 
 
 def _number(value: float | None) -> str:
@@ -87,17 +134,17 @@ def _number(value: float | None) -> str:
 
 
 def _commit() -> str | None:
-    """Commit of the checkout that this module lies in, None in an installed copy."""
+    """Return the commit of the checkout that contains this module; None if installed."""
     import subprocess
 
-    here = Path(__file__).resolve().parent
+    folder = Path(__file__).resolve().parent
     try:
-        answer = subprocess.run(
-            ["git", "-C", str(here), "rev-parse", "--short=12", "HEAD"],
+        process = subprocess.run(
+            ["git", "-C", str(folder), "rev-parse", "--short=12", "HEAD"],
             capture_output=True,
             text=True,
             timeout=10,
         )
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return answer.stdout.strip() or None if answer.returncode == 0 else None
+    return process.stdout.strip() or None if process.returncode == 0 else None

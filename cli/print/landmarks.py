@@ -1,21 +1,15 @@
-"""``locatk print landmarks``: what a person needs who lays a floor of magnets."""
+"""``locatk print landmarks``: drawings for the installation of a landmark floor."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from locatk.cli import console, options
-from locatk.core.errors import OutputExistsError, error_context
 
-if TYPE_CHECKING:
-    from locatk.core.landmarks.drawing.pack import InstallationPack
-    from locatk.core.landmarks.drawing.true_size import FloorPage
-    from locatk.core.landmarks.map.floor import FloorMap
-    from locatk.core.materials import BillItem
-    from locatk.core.paper_sizes import Paper
+DEFAULT_OVERLAP_MM = 10.0
 
 
 @click.command(short_help="Installation pack of a landmark floor.")
@@ -28,7 +22,8 @@ if TYPE_CHECKING:
     "--floor",
     "whole_floor",
     is_flag=True,
-    help="Instead, the whole floor at true size, cut over papers or strips that share --overlap.",
+    help="The whole floor at true size instead, divided into papers or strips that share "
+    "--overlap.",
 )
 @click.option(
     "--paper",
@@ -47,16 +42,16 @@ if TYPE_CHECKING:
     default=10.0,
     show_default=True,
     metavar="MM",
-    help="Left empty, for printers that cannot print to the edge; with --floor it holds rulers "
-    "and joining marks.",
+    help="Empty margin, for printers that cannot print to the edge; with --floor it contains "
+    "rulers and joining marks.",
 )
 @click.option(
     "--overlap",
     "overlap_mm",
     type=click.FloatRange(0),
     metavar="MM",
-    help="What neighbouring papers of --floor both hold; joining marks show where to cut.  "
-    "[default: 10]",
+    help="Overlap of neighbouring papers of --floor; joining marks show where to cut.  "
+    f"[default: {DEFAULT_OVERLAP_MM:g}]",
 )
 @click.option(
     "--spares",
@@ -65,13 +60,13 @@ if TYPE_CHECKING:
     default=5.0,
     show_default=True,
     metavar="PERCENT",
-    help="Bars to buy beyond four a landmark.",
+    help="Spare bars, in addition to four for each landmark.",
 )
 @click.option(
     "--bom",
     type=options.PATH,
     metavar="FILE.csv",
-    help="Write the bill of materials for a spreadsheet, too.",
+    help="Also write the bill of materials for a spreadsheet.",
 )
 @options.overwrite
 @options.as_json
@@ -89,22 +84,22 @@ def landmarks(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Draw what it takes to lay the magnets of the map MAP_FILE.
+    """Draw an installation pack for the magnets of the map MAP_FILE.
 
-    The pack holds the floor's plan, a placement template at true size for each way in which
-    a landmark is laid (outlines, an arrow to each bar's north pole, the map's +y), the bill
-    of materials, a checklist, and a marking list of all landmarks. Print at 100 % and
-    measure the rulers. Landmarks are drawn as designed, also where the file knows how they
-    were built.
+    The pack contains the plan of the floor, a placement template at true size for each kind of
+    landmark (outlines, an arrow to the north pole of each bar, +y of the map), the bill of
+    materials, a checklist, and a marking list of all landmarks. Print at 100 % and measure the
+    rulers. Landmarks are drawn as designed, even if the file contains calibrated ones.
 
     \b
     Examples:
       locatk print landmarks map.toml -o pack.pdf
       locatk print landmarks map.toml -o templates.pdf --templates --paper A3
       locatk print landmarks map.toml -o floor.pdf --floor --paper A0
-      locatk print landmarks map.toml -o floor.pdf --floor --paper roll:914mm --overlap 20
+      locatk print landmarks map.toml -o floor.pdf --floor --paper roll:914mm
       locatk print landmarks map.toml -o pack.pdf --spares 10 --bom parts.csv
     """
+    from locatk.core.errors import OutputExistsError, error_context
     from locatk.core.landmarks.design.materials import bill_of_materials
     from locatk.core.paper_sizes import parse_paper
     from locatk.formats.artifacts.maps import read_map
@@ -114,10 +109,10 @@ def landmarks(
     if templates_only and whole_floor:
         raise click.UsageError("--templates and --floor are different drawings; leave one out.")
     if overlap_mm is not None and not whole_floor:
-        raise click.UsageError("--overlap is that of --floor.")
-    on = parse_paper(paper_name)
-    if on.is_roll and not whole_floor:
-        raise click.UsageError("A roll is for --floor; the pack needs sheets, as --paper A4.")
+        raise click.UsageError("--overlap needs --floor.")
+    paper = parse_paper(paper_name)
+    if paper.is_roll and not whole_floor:
+        raise click.UsageError("A roll needs --floor; the pack needs sheets, as in --paper A4.")
     options.guard_output(output, overwrite=overwrite, inputs=[map_file])
     if bom is not None:
         options.guard_output(bom, overwrite=overwrite, inputs=[map_file])
@@ -127,14 +122,15 @@ def landmarks(
     items = bill_of_materials(floor, spares_percent)
     with error_context(map_file):
         if whole_floor:
-            data, answer = _floor(floor, on, margin_mm, 10.0 if overlap_mm is None else overlap_mm)
+            overlap_mm = DEFAULT_OVERLAP_MM if overlap_mm is None else overlap_mm
+            data, entry = _draw_floor(floor, paper, margin_mm, overlap_mm)
         else:
-            data, answer = _pack(floor, on, margin_mm, spares_percent, templates_only)
+            data, entry = _draw_pack(floor, paper, margin_mm, spares_percent, templates_only)
     with atomic_write(output, overwrite=overwrite) as stream:
         stream.write(data)
     if bom is not None:
         write_bill(bom, items, overwrite=overwrite)
-    console.result(_text(output, bom, floor, items, answer))
+    console.result(_text(output, bom, floor, items, entry))
     console.say("Print at 100 %, without scaling to fit, and measure the rulers.")
     if as_json:
         console.emit_json(
@@ -147,56 +143,34 @@ def landmarks(
                     {"part": item.part, "count": item.count, "detail": item.detail}
                     for item in items
                 ],
-                **answer,
+                **entry,
             }
         )
 
 
-def _pack(
-    floor: FloorMap, on: Paper, margin_mm: float, spares_percent: float, templates_only: bool
+def _draw_pack(
+    floor: Any, paper: Any, margin_mm: float, spares_percent: float, templates_only: bool
 ) -> tuple[bytes, dict[str, Any]]:
-    """The PDF, and what is in it."""
+    """Return the PDF of the pack, and its entries for ``--json`` (docs/formats.md)."""
+    from locatk.core.landmarks.drawing.landmark import code_digit
     from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pack
+    from locatk.core.landmarks.landmark import name
     from locatk.formats.printing.drawings import render_pages
 
-    made = draw_installation_pack(
+    pack = draw_installation_pack(
         floor,
-        on.size_mm,
+        paper.size_mm,
         parts=("templates",) if templates_only else PACK_PARTS,
-        paper_name=on.name,
+        paper_name=paper.name,
         margin_mm=margin_mm,
         spares_percent=spares_percent,
     )
-    with console.steps(len(made.pages), "Drawing") as done:
-        data = render_pages(made.pages, _title(floor), done=done)
-    return data, _pack_entry(made)
-
-
-def _floor(
-    floor: FloorMap, on: Paper, margin_mm: float, overlap_mm: float
-) -> tuple[bytes, dict[str, Any]]:
-    from locatk.core.landmarks.drawing.true_size import draw_floor
-    from locatk.formats.printing.drawings import render_floor
-
-    pages = draw_floor(floor, on, margin_mm=margin_mm, overlap_mm=overlap_mm)
-    with console.steps(len(pages), "Drawing") as done:
-        data = render_floor(pages, _title(floor), done=done)
-    return data, _floor_entry(pages)
-
-
-def _title(floor: FloorMap) -> str:
-    return f"locatk landmarks {floor.name}".strip()
-
-
-def _pack_entry(made: InstallationPack) -> dict[str, Any]:
-    """What ``--json`` says of a pack (docs/formats.md)."""
-    from locatk.core.landmarks.drawing.landmark import code_digit
-    from locatk.core.landmarks.landmark import name
-
-    return {
-        "pages": len(made.pages),
-        "page_mm": made.pages[0].size_mm,
-        "parts": {part: [first + 1, end] for part, (first, end) in made.parts.items()},
+    with console.steps(len(pack.pages), "Drawing") as done:
+        data = render_pages(pack.pages, _title(floor), done=done)
+    return data, {
+        "pages": len(pack.pages),
+        "page_mm": pack.pages[0].size_mm,
+        "parts": {part: [first + 1, end] for part, (first, end) in pack.parts.items()},
         "templates": [
             {
                 "code": code_digit(item.code),
@@ -206,14 +180,22 @@ def _pack_entry(made: InstallationPack) -> dict[str, Any]:
                 "centre_mm": item.centre_mm,
                 "side_mm": item.side_mm,
             }
-            for item in made.templates
+            for item in pack.templates
         ],
     }
 
 
-def _floor_entry(pages: list[FloorPage]) -> dict[str, Any]:
-    """What ``--json`` says of a floor at true size (docs/formats.md)."""
-    return {
+def _draw_floor(
+    floor: Any, paper: Any, margin_mm: float, overlap_mm: float
+) -> tuple[bytes, dict[str, Any]]:
+    """Return the PDF of the floor, and its entries for ``--json`` (docs/formats.md)."""
+    from locatk.core.landmarks.drawing.true_size import draw_floor
+    from locatk.formats.printing.drawings import render_floor
+
+    pages = draw_floor(floor, paper, margin_mm=margin_mm, overlap_mm=overlap_mm)
+    with console.steps(len(pages), "Drawing") as done:
+        data = render_floor(pages, _title(floor), done=done)
+    return data, {
         "pages": len(pages),
         "page_mm": pages[0].size_mm,
         "tiles": [
@@ -229,23 +211,27 @@ def _floor_entry(pages: list[FloorPage]) -> dict[str, Any]:
     }
 
 
+def _title(floor: Any) -> str:
+    return f"locatk landmarks {floor.name}".strip()
+
+
 def _text(
     output: Path,
     bom: Path | None,
-    floor: FloorMap,
-    items: tuple[BillItem, ...],
-    answer: dict[str, Any],
+    floor: Any,
+    items: tuple[Any, ...],
+    entry: dict[str, Any],
 ) -> str:
-    """What was drawn, for people."""
-    width, height = answer["page_mm"]
-    pages = answer["pages"]
+    """Format the summary of the drawing."""
+    width, height = entry["page_mm"]
+    pages = entry["pages"]
     files = f"{output} and {bom}" if bom is not None else str(output)
     bars = sum(item.count for item in items if item.part.startswith("bar magnet"))
     lines = [
         f"Wrote {files}: {pages} page{'s' * (pages != 1)} of {width:g} x {height:g} mm",
         f"{len(floor.cells())} landmarks, {bars} bars with spares",
     ]
-    for part, (first, last) in answer.get("parts", {}).items():
+    for part, (first, last) in entry.get("parts", {}).items():
         where = f"page {first}" if first == last else f"pages {first} to {last}"
         lines.append(f"  {part}: {where}")
     return "\n".join(lines)

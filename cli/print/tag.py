@@ -1,21 +1,15 @@
-"""``locatk print tag``: templates on which magnets are laid by hand."""
+"""``locatk print tag``: templates for placing magnets by hand."""
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from locatk.cli import console, options
-from locatk.core.errors import InputError, error_context
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from locatk.core.polaris.drawing.cards import TagPages
-    from locatk.core.polaris.tag import TagLayout, Tags
 
 FORMATS = ("pdf", "svg")
 
@@ -27,8 +21,7 @@ FORMATS = ("pdf", "svg")
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="`svg`: with several pages a file each, named by its number.  [default: by the "
-    "output's ending, else pdf]",
+    help="`svg` writes one numbered file a page.  [default: by the ending of the output, else pdf]",
 )
 @click.option(
     "--id",
@@ -47,7 +40,7 @@ FORMATS = ("pdf", "svg")
 @click.option(
     "--landscape/--portrait",
     default=None,
-    help="Turn the paper.  [default: whichever takes fewer pages]",
+    help="Orientation of the paper.  [default: that with fewer pages]",
 )
 @click.option(
     "--margin",
@@ -56,12 +49,12 @@ FORMATS = ("pdf", "svg")
     default=10.0,
     show_default=True,
     metavar="MM",
-    help="Left empty, for printers that cannot print to the edge.",
+    help="Empty margin, for printers that cannot print to the edge.",
 )
 @click.option(
     "--mirror",
     is_flag=True,
-    help="As seen from below, for magnets that are put in from the underside.",
+    help="Mirror the tag, for magnets that are inserted from below.",
 )
 @options.overwrite
 @options.as_json
@@ -80,10 +73,10 @@ def tag(
 ) -> None:
     """Draw the tags of TAG_FILE at true size, as templates for placing their magnets.
 
-    Each magnet has an outline and an arrow to its north, which tells the angle clockwise
-    from forward: mark north on the rim of the disc, and turn the mark to the arrow. As many
-    tags as fit share a page, each with cut marks. Print at 100 % and measure the rulers.
-    Tags are drawn as designed, also where the file knows how they were built.
+    Each magnet has an outline and an arrow to its north pole, with the angle clockwise from
+    forward: mark north on the rim of the disc, and rotate the mark to the arrow. A page contains
+    as many tags as fit, each with cut marks. Print at 100 % and measure the rulers. Tags are drawn
+    as designed, even if the file contains calibrated magnets.
 
     \b
     Examples:
@@ -122,19 +115,20 @@ def _ending(output: Path) -> str:
     return ending if ending in FORMATS else "pdf"
 
 
-def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int, TagLayout]]:
-    """The tags to draw; an id that the solver would not read is refused."""
+def _layouts(tag_file: Path, tags: Any, ids: tuple[int, ...]) -> list[tuple[int, Any]]:
+    """Return the tags to draw; refuse ids that the solver would not read."""
+    from locatk.core.errors import InputError, error_context
     from locatk.core.polaris.codec import layout_of
 
     if not ids and tags.ids is None and not tags.site:
-        raise click.UsageError(f"{tag_file} names no family, so any id may be meant; give --id.")
+        raise click.UsageError(f"{tag_file} contains no family of ids; select tags by --id.")
     for number in ids:
         if tags.ids is not None and number not in tags.ids:
             raise InputError(
-                f"id {number} is no member of the family",
+                f"id {number} is not in the family",
                 file=tag_file,
-                hint=f"It has {len(tags.ids)}, from {min(tags.ids)} to {max(tags.ids)}; without "
-                "--id all are drawn",
+                hint=f"The family has {len(tags.ids)} ids from {min(tags.ids)} to {max(tags.ids)}; "
+                "without --id all are drawn",
             )
     wanted = ids or tags.ids or tuple(sorted(tags.site))
     with error_context(tag_file):
@@ -142,37 +136,32 @@ def _layouts(tag_file: Path, tags: Tags, ids: tuple[int, ...]) -> list[tuple[int
 
 
 def _files(output: Path, format_name: str, pages: int) -> list[Path]:
-    """One file for a PDF and for a single page, else one a page."""
+    """Return one file for a PDF and for a single page, else one for each page."""
     if format_name == "pdf" or pages == 1:
         return [output]
     digits = len(str(pages))
     return [output.with_stem(f"{output.stem}-{n:0{digits}}") for n in range(1, pages + 1)]
 
 
-def _write(files: Sequence[Path], format_name: str, drawn: TagPages, *, overwrite: bool) -> None:
-    """All is written whole before anything appears."""
+def _write(files: Sequence[Path], format_name: str, drawn: Any, *, overwrite: bool) -> None:
+    """Write all files completely before the first one appears."""
     from locatk.formats.output import atomic_write
+    from locatk.formats.printing.drawings import render_pages, render_svg
 
     ids = {item.tag_id for item in drawn.tags}
     title = f"locatk tag {min(ids)}" if len(ids) == 1 else f"locatk, {len(ids)} tags"
     if format_name == "pdf":
-        from locatk.formats.printing.drawings import (
-            render_pages,  # reportlab: not for the other format
-        )
-
         hint = "Use a smaller paper, or --format svg"
         contents = [render_pages(drawn.pages, title, hint=hint)]
     else:
-        from locatk.formats.printing import tag_svg
-
-        contents = [tag_svg.render(page, title) for page in drawn.pages]
+        contents = [render_svg(page, title) for page in drawn.pages]
     with contextlib.ExitStack() as stack:
         for path, data in zip(files, contents, strict=True):
             stack.enter_context(atomic_write(path, overwrite=overwrite)).write(data)
 
 
-def _text(files: Sequence[Path], drawn: TagPages) -> str:
-    """What was drawn, for people."""
+def _text(files: Sequence[Path], drawn: Any) -> str:
+    """Format the summary of the drawn tags."""
     count, pages = len(drawn.tags), len(drawn.pages)
     names = str(files[0]) if len(files) == 1 else f"{files[0]} to {files[-1].name}"
     width, height = drawn.pages[0].size_mm
@@ -182,8 +171,8 @@ def _text(files: Sequence[Path], drawn: TagPages) -> str:
     )
 
 
-def _entry(files: Sequence[Path], drawn: TagPages) -> dict[str, Any]:
-    """The same as ``--json`` (docs/commands.md)."""
+def _entry(files: Sequence[Path], drawn: Any) -> dict[str, Any]:
+    """Return the summary for ``--json`` (docs/commands.md)."""
     return {
         "version": 1,
         "outputs": list(files),

@@ -1,4 +1,4 @@
-"""``locatk print testsheet``: what can this printer print?"""
+"""``locatk print testsheet``: test sheet of a printer."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ import click
 from locatk.cli import console, options
 
 
-@click.command(short_help="The sheet that shows what a printer can print.")
+@click.command(short_help="Test sheet for the choice of dots.")
 @options.output("PDF to write.")
 @click.option(
     "--size", type=click.Choice(("A4", "Letter"), case_sensitive=False), default="A4",
-    show_default=True,
+    show_default=True, help="Paper.",
 )  # fmt: skip
 @click.option(
     "--dpi",
     type=click.Choice(("300", "600", "1200")),
     default="600",
     show_default=True,
-    help="Of the printer; dots are whole pixels of it.",
+    help="Resolution of the printer; dots are whole pixels.",
 )
 @click.option(
     "--codec",
     type=click.Choice(("anoto", "libdots", "microdots")),
     default="anoto",
     show_default=True,
+    help="Code of the pattern.",
 )
 @options.overwrite
 @options.as_json
@@ -36,8 +37,8 @@ def testsheet(
 ) -> None:
     """Draw a sheet with a field of dots of each size at each pitch.
 
-    Print it, scan it, and let `locatk calibrate printer` say which dots come out best and
-    how long 100 mm are. It needs no manifest: its markers say which sheet it is.
+    Print it and scan it; `locatk calibrate printer` then determines which dots are printed best,
+    and the scale of the printer. The markers identify the sheet, so that it needs no manifest.
 
     \b
     Examples:
@@ -46,19 +47,21 @@ def testsheet(
     """
     from locatk.core.dots.drawing.test_sheet import printer_sheet
     from locatk.formats.output import atomic_write
-    from locatk.formats.printing.test_sheet import render
+    from locatk.formats.printing.pattern import render_test_sheet
 
     options.guard_output(output, overwrite=overwrite)
     sheet = printer_sheet(size, int(dpi), codec)
     with atomic_write(output, overwrite=overwrite) as stream:
-        stream.write(render(sheet))
+        stream.write(render_test_sheet(sheet))
     pitches = sorted({field.pitch_mm for field in sheet.fields})
     dots = sorted({field.dot_mm for field in sheet.fields})
     console.result(
         f"Wrote {output}: {len(sheet.fields)} fields, dots {1000 * dots[0]:.0f} to "
         f"{1000 * dots[-1]:.0f} um, pitches {pitches[0]:.3f} to {pitches[-1]:.3f} mm"
     )
-    console.say("Print it at 100 %, black only. Scan it with 1200 dpi, and `calibrate printer`.")
+    console.say(
+        "Print at 100 %, black only, scan with 1200 dpi, and run `locatk calibrate printer`."
+    )
     if as_json:
         console.emit_json(
             {

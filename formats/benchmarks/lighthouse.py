@@ -1,21 +1,22 @@
-"""The Lighthouse figures, on the recordings that the paper's authors published.
+"""Figures of Lighthouse, on the recordings that the authors of the paper published.
 
-What is fitted on truth is named in each row: an alignment, where the published scripts fit
-one as well. A time offset between camera and receiver is estimated for each experiment
-from the other experiments, so that no scored pose took part in its own offset.
+Each row states which quantity is fitted to the truth: an alignment, as in the published scripts.
+The time offset between camera and receiver is estimated for each experiment from the other
+experiments, so that no pose is scored with an offset that was fitted to it.
 """
 
 from __future__ import annotations
 
-import time
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import DegenerateError, LocatkError
+from locatk.core.errors import DegenerateError
 from locatk.core.evaluation import (
     Evaluation,
     EvaluationOptions,
@@ -24,52 +25,66 @@ from locatk.core.evaluation import (
 )
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse import SolveOptions, solve
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, predict_angles
+from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene
+from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.benchmarks import Figure
+from locatk.formats.benchmarks.figures import Duration, Figure, measure_or_explain
+from locatk.formats.benchmarks.timing import measure_single_threaded, time_call
 from locatk.formats.importers.dotbot.recording import read_dotbot
 from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.sessions import observations
+from locatk.formats.sessions.reader import Session
 
 Array = NDArray[np.float64]
 Pair = tuple[Trajectory, Trajectory]
 
 SCRIPTS = "authors' scripts"
-TRIALS = 60
-"""Random choices of places behind each point of the paper's Fig. 12."""
+PLANAR_EXPERIMENTS = range(1, 6)
 
-PAPER_FIG_12 = {8: 25.2, 10: 23.1, 15: 18.7, 20: 11.2, 30: 8.2, 50: 7.2, 100: 6.7}
-"""Places used for the scene, and the mean error in mm (figure_13_dataset.csv)."""
+SCENE_DRAWS = 60
+"""Random choices of positions for each point of the paper's Fig. 12."""
 
-GRID_TARGETS = {
-    "3D grid, paper's scale: MAE": 2.3,
-    "3D grid, similarity: MAE": 0.95,
-    "3D grid, static scatter x": 0.087,
-    "3D grid, static scatter y": 0.262,
-    "3D grid, static scatter z": 0.135,
-}
+FIG_12_MM = {8: 25.2, 10: 23.1, 15: 18.7, 20: 11.2, 30: 8.2, 50: 7.2, 100: 6.7}
+"""Number of positions used for the scene, and mean error (figure_13_dataset.csv of the authors'
+repository DotBots/alvarado23lighthouse)."""
 
-MILLION = 1_000_000
+TWO_STATIONS_OFFSET_S = -0.265
+"""Time offset of the authors' evaluation of two stations."""
+
+GRID_EDGE_MM = 40.0
+SWEEPS_PER_EPOCH = 4
+
+SIMULATED_SWEEPS = 1_000_000
 
 
 def figures(data: Path) -> list[Figure]:
-    """All Lighthouse figures; ``data`` is the folder of published recordings."""
-    found: list[Figure] = []
-    for measure, promised in (
+    """Return all figures of Lighthouse; ``data`` is the folder of published recordings."""
+    rows: list[Figure] = []
+    for measure, targets_mm in (
         (_one_station, {"one station, planar: MAE": 3.4}),
         (_two_stations, {"two stations, planar: MAE": 2.9}),
-        (_grid, GRID_TARGETS),
-        (_few_places, {f"3D grid from {n} places: MAE": mm for n, mm in PAPER_FIG_12.items()}),
-        (_speed_on_grid, {"3D grid, 4,759 points: scene and poses": 0.15}),
+        (
+            _grid,
+            {
+                "3D grid, paper's scale: MAE": 2.3,
+                "3D grid, similarity: MAE": 0.95,
+                "3D grid, static scatter x": 0.087,
+                "3D grid, static scatter y": 0.262,
+                "3D grid, static scatter z": 0.135,
+            },
+        ),
+        (
+            _scenes_from_few_positions,
+            {f"3D grid from {n} places: MAE": mm for n, mm in FIG_12_MM.items()},
+        ),
     ):
-        try:
-            rows = measure(data / "lighthouse")
-        except (LocatkError, OSError) as error:
-            unit = "s" if measure is _speed_on_grid else "mm"
-            rows = [Figure(name, None, unit, f"not measured: {error}") for name in promised]
-        found += [replace(row, target=promised.get(row.name)) for row in rows]
-    return found + _speed_on_a_million()
+        declared = [Figure(name, None, "mm", "", mm) for name, mm in targets_mm.items()]
+        measured = measure_or_explain(partial(measure, data / "lighthouse"), *declared)
+        rows += [replace(row, target=targets_mm.get(row.name)) for row in measured]
+    return [*rows, _speed_on_grid(data / "lighthouse"), *_speed_on_simulation()]
 
 
 # ---- accuracy
@@ -78,30 +93,30 @@ def figures(data: Path) -> list[Figure]:
 def _one_station(data: Path) -> list[Figure]:
     folder = data / "oneLH-2D_scene" / "dataset"
 
-    def pairs(method: str) -> list[list[Pair]]:
-        runs = []
-        for k in range(1, 6):
+    def solve_experiments(method: str) -> list[list[Pair]]:
+        experiments = []
+        for k in PLANAR_EXPERIMENTS:
             session = read_dotbot(
                 [folder / "lighthouse" / f"{k}_lh2.csv"],
                 [folder / "ground_truth" / f"{k}_blender.csv"],
             )
-            runs.append(list(_with_truth(_solved(session, method), session.truth)))
-        return runs
+            experiments.append(list(_with_truth(_solve_session(session, method), session.truth)))
+        return experiments
 
     how = (
         "experiments 1-5, frame from the four markers, no alignment; time offset of each "
         "experiment from the other four"
     )
-    return _scored("one station, planar", pairs, "none", how, (7.01, 7.86, 3.56))
+    return _score("one station, planar", solve_experiments, "none", how, (7.01, 7.86, 3.56))
 
 
 def _two_stations(data: Path) -> list[Figure]:
     folder = data / "twoLH-2D_scene" / "dataset"
     recording = folder / "lighthouse" / "data.csv"
 
-    def pairs(method: str) -> list[list[Pair]]:
-        # Markers are left out: the scene is solved from the robots alone, as the paper does.
-        solution = _solved(replace(read_dotbot([recording], []), scene=None), method)
+    def solve_experiments(method: str) -> list[list[Pair]]:
+        # The scene is solved from the robots alone, without markers, as in the paper.
+        solution = _solve_session(replace(read_dotbot([recording], []), scene=None), method)
         return [
             list(
                 _with_truth(
@@ -109,67 +124,62 @@ def _two_stations(data: Path) -> list[Figure]:
                     read_dotbot([recording], [folder / "ground_truth" / f"{k}_blender.csv"]).truth,
                 )
             )
-            for k in range(1, 6)
+            for k in PLANAR_EXPERIMENTS
         ]
 
     how = (
         "experiments 1-5, one scene without markers, one similarity for all poses; the "
         "authors' time offset of 0.265 s"
     )
-    return _scored("two stations, planar", pairs, "sim3", how, (4.35, 5.15, 2.75), offset_s=-0.265)
+    return _score(
+        "two stations, planar", solve_experiments, "sim3", how, (4.35, 5.15, 2.75),
+        offset_s=TWO_STATIONS_OFFSET_S,
+    )  # fmt: skip
 
 
-def _scored(
+def _score(
     name: str,
-    pairs: Callable[[str], list[list[Pair]]],
+    solve_experiments: Callable[[str], list[list[Pair]]],
     align: str,
     how: str,
-    peers: tuple[float, float, float],
+    peer_values: tuple[float, float, float],
     offset_s: float | None = None,
 ) -> list[Figure]:
-    """MAE, RMSE and SD of the default method, and the MAE of the paper's.
+    """Return MAE, RMSE and SD of the default method, and the MAE of the published method.
 
-    Where the published protocol gives an offset, the MAE with our own is a row as well.
+    If the published protocol has a time offset, it is used for the first three, and the MAE with
+    the estimated offset is a row of its own.
     """
-    bundle = pairs("bundle")
-    own = _leave_one_out(bundle, align)
-    ours = own
-    paper = _leave_one_out(pairs("paper"), align)
-    extra = []
+    bundle = solve_experiments("bundle")
+    estimated = _leave_one_out(bundle, align)
+    paper = _leave_one_out(solve_experiments("paper"), align)
+    scored, rows = estimated, []
+    by_others = "time offset of each experiment from the other four"
     if offset_s is not None:
-        every = [pair for experiment in bundle for pair in experiment]
-        ours = evaluate(every, EvaluationOptions(align=align, offset_s=offset_s))
-        extra = [
-            Figure(f"{name}: MAE, own time offset", 1e3 * own.mae, "mm",
-                   "time offset of each experiment from the other four", peer=SCRIPTS,
-                   peer_value=peers[0]),
-        ]  # fmt: skip
+        pairs = [pair for experiment in bundle for pair in experiment]
+        scored = evaluate(pairs, EvaluationOptions(align=align, offset_s=offset_s))
+        rows = [Figure(f"{name}: MAE, own time offset", 1e3 * estimated.mae, "mm", by_others)]
+    mae_peer, rmse_peer, sd_peer = peer_values
+    rows.append(Figure(f"{name}: MAE of --method paper", 1e3 * paper.mae, "mm", by_others))
     return [
-        Figure(f"{name}: MAE", 1e3 * ours.mae, "mm", f"{how}; {ours.n} poses",
-               peer=SCRIPTS, peer_value=peers[0]),
-        Figure(f"{name}: RMSE", 1e3 * ours.rmse, "mm", "the same", peer=SCRIPTS,
-               peer_value=peers[1]),
-        Figure(f"{name}: SD", 1e3 * ours.sd, "mm", "the same", peer=SCRIPTS,
-               peer_value=peers[2]),
-        *extra,
-        Figure(f"{name}: MAE of --method paper", 1e3 * paper.mae, "mm",
-               "time offset of each experiment from the other four", peer=SCRIPTS,
-               peer_value=peers[0]),
+        Figure(f"{name}: MAE", 1e3 * scored.mae, "mm", f"{how}; {scored.n} poses",
+               peer=SCRIPTS, peer_value=mae_peer),
+        Figure(f"{name}: RMSE", 1e3 * scored.rmse, "mm", "of the same poses", peer=SCRIPTS,
+               peer_value=rmse_peer),
+        Figure(f"{name}: SD", 1e3 * scored.sd, "mm", "of the same poses", peer=SCRIPTS,
+               peer_value=sd_peer),
+        *(replace(row, peer=SCRIPTS, peer_value=mae_peer) for row in rows),
     ]  # fmt: skip
 
 
 def _leave_one_out(experiments: list[list[Pair]], align: str) -> Evaluation:
-    """Score all experiments, each with the time offset that the others need."""
+    """Evaluate all experiments, each with the time offset estimated from the others."""
     shifted: list[Pair] = []
     for k, pairs in enumerate(experiments):
-        others = [pair for j, e in enumerate(experiments) if j != k for pair in e]
-        offset = estimate_offset(others, align=align)
-        shifted += [(_later(estimate, offset), truth) for estimate, truth in pairs]
+        others = [pair for j, other in enumerate(experiments) if j != k for pair in other]
+        offset_ns = round(estimate_offset(others, align=align) * 1e9)
+        shifted += [(estimate.shifted(offset_ns), truth) for estimate, truth in pairs]
     return evaluate(shifted, EvaluationOptions(align=align))
-
-
-def _later(trajectory: Trajectory, seconds: float) -> Trajectory:
-    return replace(trajectory, time_ns=trajectory.time_ns + round(seconds * 1e9))
 
 
 def _grid(data: Path) -> list[Figure]:
@@ -183,9 +193,10 @@ def _grid(data: Path) -> list[Figure]:
             Figure(f"{label}, paper's scale: MAE", edge.mean(), "mm",
                    "scale from one 40 mm edge of the grid, rigid alignment",
                    peer=SCRIPTS, peer_value=5.20),
-            Figure(f"{label}, paper's scale: RMSE", np.sqrt(np.mean(edge**2)), "mm", "the same",
+            Figure(f"{label}, paper's scale: RMSE", np.sqrt(np.mean(edge**2)), "mm",
+                   "of the same poses",
                    peer=SCRIPTS, peer_value=5.72),
-            Figure(f"{label}, paper's scale: SD", edge.std(), "mm", "the same",
+            Figure(f"{label}, paper's scale: SD", edge.std(), "mm", "of the same poses",
                    peer=SCRIPTS, peer_value=2.40),
             Figure(f"{label}, similarity: MAE", similarity.mean(), "mm",
                    "similarity alignment to the grid",
@@ -195,84 +206,73 @@ def _grid(data: Path) -> list[Figure]:
     return rows
 
 
-_SQUEEZED = (
-    "; 0.135 is measured in heights that the paper's 30 degree planes shorten by 8 %, which is "
-    "0.146 on the true grid"
-)
-
-
 def _scatter(position: Array, truth: Array) -> list[Figure]:
-    """Mean standard deviation of the poses at each place, along the grid's axes."""
+    """Return the mean standard deviation of the poses at a position, along the grid's axes."""
     aligned = umeyama(position, truth).apply(position)
-    _, place = np.unique(truth, axis=0, return_inverse=True)
-    scatter = np.mean(
-        [aligned[place == k].std(axis=0) for k in range(int(place.max()) + 1)], axis=0
+    sites, site = np.unique(truth, axis=0, return_inverse=True)
+    scatter = np.mean([aligned[site == k].std(axis=0) for k in range(len(sites))], axis=0)
+    height = (
+        "; 0.135 was measured in heights that the paper's planes of 30 degrees shorten by 8 %, "
+        "which is 0.146 on the true grid"
     )
     rows = zip("xyz", scatter, (0.125, 0.2435, 0.137), strict=True)
     return [
         Figure(f"3D grid, static scatter {axis}", value, "mm",
-               "mean over 140 places of the standard deviation of single poses, similarity"
-               + (_SQUEEZED if axis == "z" else ""),
+               "mean over 140 positions of the standard deviation of single poses, similarity"
+               + (height if axis == "z" else ""),
                peer="paper, Table II", peer_value=peer)
         for axis, value, peer in rows
     ]  # fmt: skip
 
 
-def _few_places(data: Path) -> list[Figure]:
-    """The paper's Fig. 12: a scene from n places, then all poses located in it."""
+def _scenes_from_few_positions(data: Path) -> list[Figure]:
+    """Solve the scene from n positions and all poses in that scene (Fig. 12 of the paper)."""
     session, truth = _grid_session(data)
-    _, place = np.unique(truth, axis=0, return_inverse=True)
-    places = int(place.max()) + 1
+    sites, site = np.unique(truth, axis=0, return_inverse=True)
     rng = np.random.default_rng(2024)
     rows = []
-    for n, peer in PAPER_FIG_12.items():
+    for n, peer_value in FIG_12_MM.items():
         errors, refused = [], 0
-        for _ in range(TRIALS):
-            chosen = rng.choice(places, n, replace=False)
-            moments = np.array([rng.choice(np.flatnonzero(place == k)) for k in chosen])
+        for _ in range(SCENE_DRAWS):
+            chosen = rng.choice(len(sites), n, replace=False)
+            epochs = np.array([rng.choice(np.flatnonzero(site == k)) for k in chosen])
             try:
                 scene = solve(
-                    _moments(session.sweeps, moments), Scene(), SolveOptions(scene="two-3d")
+                    _take_epochs(session.sweeps, epochs), Scene(), SolveOptions(scene="two-3d")
                 ).artifact
             except DegenerateError:
                 refused += 1
                 continue
-            solution = solve(session.sweeps, scene)
-            position, known = _rows(solution, truth, session.sweeps)
-            errors.append(np.mean(_grid_errors(position, known)[0]))
-        how = (
-            f"mean over {len(errors)} random choices of single moments, paper's scale protocol"
-            + (f"; {refused} refused as degenerate" if refused else "")
+            trajectory = solve(session.sweeps, scene).trajectories[0]
+            epoch = np.searchsorted(session.sweeps.time_ns[::SWEEPS_PER_EPOCH], trajectory.time_ns)
+            errors.append(np.mean(_grid_errors(trajectory.position * 1e3, truth[epoch])[0]))
+        how = f"mean over {len(errors)} random choices of single epochs, paper's scale protocol" + (
+            f"; {refused} refused as degenerate" if refused else ""
         )
+        mean_mm = float(np.mean(errors)) if errors else None
         rows.append(
-            Figure(
-                f"3D grid from {n} places: MAE",
-                float(np.mean(errors)) if errors else None,
-                "mm",
-                how,
-                peer="paper, Fig. 12",
-                peer_value=peer,
-            )
-        )
+            Figure(f"3D grid from {n} places: MAE", mean_mm, "mm", how, peer="paper, Fig. 12",
+                   peer_value=peer_value)
+        )  # fmt: skip
     return rows
 
 
 def _grid_session(data: Path) -> tuple[ImportedSession, Array]:
-    """The grid recording and the true place of each of its moments in mm."""
+    """Return the recording of the grid, and the true position of each epoch [mm]."""
     path = data / "twoLH-3D_scene" / "dataset" / "data_all.csv"
     session = read_dotbot([path], [])
     return session, np.concatenate([t.position for t in session.truth]) * 1e3
 
 
 def _grid_positions(session: ImportedSession, truth: Array, method: str) -> Array:
-    """Positions in mm in the unit that one edge of the grid gives."""
-    device, when = session.sweeps.devices[0], session.truth[0].time_ns
+    """Return the estimated positions [mm], with the scale of one edge of the grid."""
+    device, truth_ns = session.sweeps.devices[0], session.truth[0].time_ns
 
-    def standing(at: tuple[int, int, int]) -> MarkerVisit:
-        there = when[np.all(truth == at, axis=1)]
-        return MarkerVisit(device, int(there.min()), int(there.max()))
+    def visit(site_mm: tuple[float, float, float]) -> MarkerVisit:
+        visit_ns = truth_ns[np.all(truth == site_mm, axis=1)]
+        return MarkerVisit(device, int(visit_ns.min()), int(visit_ns.max()))
 
-    edge = Distance(standing((0, 0, 0)), standing((40, 0, 0)), 0.040)
+    edge = Distance(visit((0, 0, 0)), visit((GRID_EDGE_MM, 0, 0)), 1e-3 * GRID_EDGE_MM)
     solution = solve(
         session.sweeps, Scene(distances=(edge,)), SolveOptions(method=method, scene="two-3d")
     )
@@ -280,115 +280,124 @@ def _grid_positions(session: ImportedSession, truth: Array, method: str) -> Arra
 
 
 def _grid_errors(position: Array, truth: Array) -> tuple[Array, Array]:
-    """Distances from the grid in mm: with the scale of one edge, and with the best scale."""
-    at_origin = position[np.all(truth == (0, 0, 0), axis=1)].mean(axis=0)
-    at_next = position[np.all(truth == (40, 0, 0), axis=1)].mean(axis=0)
-    scaled = position * (40.0 / np.linalg.norm(at_next - at_origin))
+    """Return the distances from the grid [mm]: with the scale of one edge, and of the best fit."""
+    origin = position[np.all(truth == (0, 0, 0), axis=1)].mean(axis=0)
+    neighbour = position[np.all(truth == (GRID_EDGE_MM, 0, 0), axis=1)].mean(axis=0)
+    scaled = position * (GRID_EDGE_MM / np.linalg.norm(neighbour - origin))
     rigid = umeyama(scaled, truth, with_scale=False)
-    similar = umeyama(position, truth)
+    similarity = umeyama(position, truth)
     return (
         np.linalg.norm(rigid.apply(scaled) - truth, axis=1),
-        np.linalg.norm(similar.apply(position) - truth, axis=1),
+        np.linalg.norm(similarity.apply(position) - truth, axis=1),
     )
 
 
-def _moments(sweeps: Sweeps, rows: NDArray[np.int64]) -> Sweeps:
-    """The sweeps of the given rows of a recording with four sweeps a row."""
-    index = (rows[:, None] * 4 + np.arange(4)).ravel()
-    return sweeps.take(index)
+def _take_epochs(sweeps: Sweeps, epochs: NDArray[np.int64]) -> Sweeps:
+    """Return the sweeps of the given epochs of a recording with four sweeps each."""
+    return sweeps.take((epochs[:, None] * SWEEPS_PER_EPOCH + np.arange(SWEEPS_PER_EPOCH)).ravel())
 
 
-def _rows(solution: Solution, truth: Array, sweeps: Sweeps) -> tuple[Array, Array]:
-    """Poses in mm and the true places that belong to them by time."""
-    trajectory = solution.trajectories[0]
-    row = np.searchsorted(sweeps.time_ns[::4], trajectory.time_ns)
-    return trajectory.position * 1e3, truth[row]
-
-
-def _solved(session: ImportedSession, method: str) -> Solution:
+def _solve_session(session: ImportedSession, method: str) -> Solution:
     return solve(session.sweeps, session.scene, SolveOptions(method=method))
 
 
 def _with_truth(solution: Solution, truth: Sequence[Trajectory]) -> Iterator[Pair]:
-    for true in truth:
+    """Yield the pairs of estimate and truth of each device."""
+    for reference in truth:
         for estimate in solution.trajectories:
-            if estimate.device == true.device:
-                yield estimate, true
+            if estimate.device == reference.device:
+                yield estimate, reference
 
 
 # ---- speed
 
 
-def _seconds(call: Callable[[], object], repeats: int = 5) -> float:
-    """Shortest of several runs: what the machine can do, free of what else it did."""
-    best = np.inf
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        best = min(best, time.perf_counter() - start)
-    return float(best)
+def _speed_on_grid(data: Path) -> Figure:
+    declared = Figure(
+        "3D grid, 4,759 points: scene and poses", None, "s",
+        "solve() from sweeps in memory, processor time of one thread, best of 5", 0.15,
+        peer="authors' solve_3d_scene, scene only", peer_value=0.10, workload="numpy",
+    )  # fmt: skip
+
+    def measure() -> list[Figure]:
+        _grid_session(data)  # reports missing data with its path
+        return [measure_single_threaded(declared, f"lighthouse.time_grid({str(data)!r})")]
+
+    return measure_or_explain(measure, declared)[0]
 
 
-def _speed_on_grid(data: Path) -> list[Figure]:
-    session, _ = _grid_session(data)
-    seconds = _seconds(lambda: solve(session.sweeps, Scene()))
+def time_grid(data: str) -> Duration:
+    """Time the solution of the grid."""
+    session, _ = _grid_session(Path(data))
+    return time_call(lambda: solve(session.sweeps, Scene()))
+
+
+def _speed_on_simulation() -> list[Figure]:
+    """Time the solution of a million simulated sweeps, and reading them from a session."""
+    clock = "processor time of one thread, best of 3"
     return [
-        Figure("3D grid, 4,759 points: scene and poses", seconds, "s",
-               "solve() from sweeps in memory, best of 5",
-               peer="authors' solve_3d_scene, scene only", peer_value=0.10)
+        measure_single_threaded(
+            Figure("1,000,000 sweeps in a known scene", None, "s",
+                   f"solve(): grouping, angles, positions and covariances, {clock}", 1.0,
+                   workload="numpy"),
+            f"lighthouse.time_known_scene({SIMULATED_SWEEPS})",
+        ),
+        measure_single_threaded(
+            Figure("session of 1,000,000 sweeps read", None, "s",
+                   f"{{0:.0f}} MB of MCAP to arrays, {clock}", 2.0, workload="numpy"),
+            f"lighthouse.time_reading({SIMULATED_SWEEPS})",
+        ),
     ]  # fmt: skip
 
 
-def _speed_on_a_million() -> list[Figure]:
-    """A million simulated sweeps: located in a known scene, and read from a session."""
-    import tempfile
+def time_known_scene(count: int) -> Duration:
+    """Time the solution of simulated sweeps in a known scene."""
+    sweeps, scene = simulate_sweeps(count)
+    return time_call(lambda: solve(sweeps, scene), 3)
 
-    from locatk.formats.sessions import observations
-    from locatk.formats.sessions.reader import Session
 
-    sweeps, scene = _a_million()
-    located = _seconds(lambda: solve(sweeps, scene), repeats=3)
+def time_reading(count: int) -> tuple[float, float, float]:
+    """Return the size [MB] of a session of simulated sweeps, and the duration of reading it."""
+    sweeps, _ = simulate_sweeps(count)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "million.mcap"
+        path = Path(folder) / "sweeps.mcap"
         observations.write_session(path, system="lighthouse", sweeps=sweeps)
-        read = _seconds(lambda: observations.read_sweeps(Session.open(path)), repeats=3)
-        size = path.stat().st_size / 1e6
-    return [
-        Figure("1,000,000 sweeps in a known scene", located, "s",
-               "solve(): grouping, angles, positions and covariances, best of 3", 1.0),
-        Figure("session of 1,000,000 sweeps read", read, "s",
-               f"{size:.0f} MB of MCAP to arrays, best of 3", 2.0),
-    ]  # fmt: skip
+        duration = time_call(lambda: observations.read_sweeps(Session.open(path)), 3)
+        return path.stat().st_size / 1e6, *duration
 
 
-def _a_million() -> tuple[Sweeps, Scene]:
-    """A robot under two stations that reports each rotation, made by the forward model."""
-    from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, predict_angles
-    from locatk.core.lighthouse.light_planes import angles_to_counts
-    from locatk.core.lighthouse.scene import Station
+def simulate_sweeps(count: int) -> tuple[Sweeps, Scene]:
+    """Simulate a robot under two stations that reports each sweep, with one count of noise.
 
-    moments = MILLION // 4
+    Returns
+    -------
+    sweeps : Sweeps
+        ``count`` sweeps, four an epoch.
+    scene : Scene
+        The stations.
+    """
+    epochs = count // SWEEPS_PER_EPOCH
     rng = np.random.default_rng(0)
-    phase = np.arange(moments) * 1e-3
+    phase = np.arange(epochs) * 1e-3
     points = np.stack([np.cos(phase), np.sin(1.3 * phase), 0.2 + 0.1 * np.sin(phase)], axis=1)
     stations, counts = [], []
-    for channel, place in ((1, np.array([2.5, 1.0, 2.0])), (2, np.array([-2.5, 0.5, 2.2]))):
-        forward = -place / np.linalg.norm(place)
+    for channel, position in ((1, np.array([2.5, 1.0, 2.0])), (2, np.array([-2.5, 0.5, 2.2]))):
+        forward = -position / np.linalg.norm(position)
         left = np.cross([0.0, 0.0, 1.0], forward)
         left /= np.linalg.norm(left)
         rotation = np.stack([forward, left, np.cross(forward, left)], axis=1)
-        angles = predict_angles((points - place) @ rotation, GENERIC_CALIBRATION)
+        angles = predict_angles((points - position) @ rotation, GENERIC_CALIBRATION)
         noise = rng.normal(0, 1.0, angles.shape)
         counts.append(np.rint(angles_to_counts(angles, channel) + noise))
-        stations.append(Station(channel, place, rotation, GENERIC_CALIBRATION))
+        stations.append(Station(channel, position, rotation, GENERIC_CALIBRATION))
     sweeps = Sweeps(
         devices=("robot",),
-        time_ns=np.repeat(np.arange(moments, dtype=np.int64) * 20_000_000 + 10**18, 4),
-        device=np.zeros(MILLION, np.int32),
-        sensor=np.zeros(MILLION, np.int32),
-        channel=np.tile(np.array([1, 1, 2, 2], np.int32), moments),
-        polynomial=np.tile(np.array([0, 0, 2, 2], np.int32), moments),
-        sweep=np.tile(np.array([0, 1, 0, 1], np.int32), moments),
+        time_ns=np.repeat(np.arange(epochs, dtype=np.int64) * 20_000_000 + 10**18, 4),
+        device=np.zeros(count, np.int32),
+        sensor=np.zeros(count, np.int32),
+        channel=np.tile(np.array([1, 1, 2, 2], np.int32), epochs),
+        polynomial=np.tile(np.array([0, 0, 2, 2], np.int32), epochs),
+        sweep=np.tile(np.array([0, 1, 0, 1], np.int32), epochs),
         count=np.stack(counts, axis=1).ravel(),
     )
     return sweeps, Scene(tuple(stations), planar=False, scale="markers")

@@ -1,4 +1,4 @@
-"""A print job: sheets drawn in a format, and put on the disk with manifest and ledger."""
+"""Print job of dot sheets: draw them in a format, and write them with manifest and ledger."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from typing import IO
 
 from locatk.core.dots.design.ledger import Area
 from locatk.core.dots.drawing.layout import Raster, SheetLayout, lay_out
+from locatk.core.dots.drawing.tiles import SheetTiling, tiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import InputError
+from locatk.core.paper_sizes import paper_size
 from locatk.formats.artifacts.ledger import Ledger
 from locatk.formats.artifacts.sheets import dumps_manifest
 from locatk.formats.output import atomic_write
@@ -22,45 +24,70 @@ Writer = Callable[[IO[bytes]], object]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnSheets:
     """Sheets that can be written.
 
     Attributes
     ----------
     writers : sequence of callable
-        One a file; each writes its content to the stream that it is given.
+        One for each file; it writes the content to a stream.
     losses : tuple of str
-        What of a document under the dots could not be kept or recoloured.
+        Parts of a document below the dots that could not be kept or recoloured.
     """
 
     writers: Sequence[Writer]
     losses: tuple[str, ...] = ()
 
 
-def page_layouts(document: Path, margin_mm: float, raster: Raster) -> list[SheetLayout]:
-    """Layouts of sheets that go over the pages of a PDF.
+def paper_layouts(
+    paper: str,
+    margin_mm: float,
+    raster: Raster,
+    *,
+    landscape: bool | None,
+    count: int,
+    tiles: tuple[int, int] | None,
+    overlap_mm: float,
+) -> Sequence[SheetLayout | SheetTiling]:
+    """Return the layouts of ``count`` equal sheets, or of one floor of (columns, rows) tiles.
+
+    Raises
+    ------
+    InputError
+        The paper is unknown or too small for dots.
+    """
+    _, size_mm = paper_size(paper, landscape=landscape)
+    layout = lay_out(size_mm, margin_mm, raster)
+    return [layout] * count if tiles is None else [tiling(layout, tiles, overlap_mm)]
+
+
+def page_layouts(
+    document: Path, margin_mm: float, raster: Raster
+) -> Sequence[SheetLayout | SheetTiling]:
+    """Return the layouts of sheets that are printed over the pages of a PDF.
 
     Raises
     ------
     FormatError, MissingDataError
         See :func:`locatk.formats.printing.overlay.page_sizes`.
     InputError
-        A page has no room for dots.
+        A page is too small for dots.
     """
-    from locatk.formats.printing.overlay import page_sizes
+    from locatk.formats.printing.overlay import page_sizes  # imports pikepdf
 
     layouts = []
     for number, size in enumerate(page_sizes(document), 1):
         try:
             layouts.append(lay_out(size, margin_mm, raster))
         except InputError as error:
-            where = f"page {number}"
-            raise InputError(error.message, file=document, where=where, hint=error.hint) from None
+            raise InputError(
+                error.message, file=document, where=f"page {number}", hint=error.hint
+            ) from None
     return layouts
 
 
 def steps(manifest: Manifest, document: Path | None = None) -> int:
-    """How often :func:`draw` and its writers call ``done``."""
+    """Return how often :func:`draw` and its writers call ``done``."""
     return rasters.bands(manifest) + (len(manifest.sheets) if document else 0)
 
 
@@ -73,7 +100,7 @@ def draw(
     document: Path | None = None,
     strip_black: bool = False,
     done: Callable[[], object] = lambda: None,
-) -> Drawn:
+) -> DrawnSheets:
     """Draw sheets as ``"pdf"``, one file with a page a sheet, or ``"png"`` or ``"txt"``.
 
     Parameters
@@ -85,39 +112,41 @@ def draw(
     document : path, optional
         PDF below the dots, a page a sheet.
     strip_black : bool
-        Make its black of the other three inks.
+        Replace its black ink by the other three inks.
     done : callable
         Called :func:`steps` times in all.
 
     Raises
     ------
     InputError
-        The sheets cannot be drawn so.
+        The sheets cannot be drawn in this format.
     FormatError, MissingDataError
         The document cannot be read.
     """
     if format_name != "pdf":
         write = rasters.write_png if format_name == "png" else rasters.write_text
         numbers = range(len(manifest.sheets))
-        return Drawn([partial(write, manifest=manifest, number=n, done=done) for n in numbers])
-    from locatk.formats.printing.pattern import render  # reportlab: not for the other formats
+        return DrawnSheets(
+            [partial(write, manifest=manifest, number=n, done=done) for n in numbers]
+        )
+    from locatk.formats.printing.pattern import render  # imports reportlab, only for PDF
 
     data = render(manifest, marks=marks, crop=crop, done=done)
     if document is None:
-        return Drawn([lambda stream: stream.write(data)])
-    from locatk.formats.printing.overlay import overlay
+        return DrawnSheets([lambda stream: stream.write(data)])
+    from locatk.formats.printing.overlay import overlay  # imports pikepdf
 
     def page_done(number: int, count: int) -> None:
         done()
 
-    made = overlay(document, data, strip_black=strip_black, progress=page_done)
+    merged = overlay(document, data, strip_black=strip_black, progress=page_done)
     losses = []
-    if made.left_black:
-        kept = ", ".join(f"{count} {what}" for what, count in made.left_black.items())
+    if merged.left_black:
+        kept = ", ".join(f"{count} {kind}" for kind, count in merged.left_black.items())
         losses.append(f"{document} keeps black in {kept}")
-    if made.dropped:
-        losses.append(f"{document} has comments that cannot be drawn: {made.dropped} left out")
-    return Drawn([lambda stream: stream.write(made.data)], tuple(losses))
+    if merged.dropped:
+        losses.append(f"{document} has comments that cannot be drawn: {merged.dropped} left out")
+    return DrawnSheets([lambda stream: stream.write(merged.data)], tuple(losses))
 
 
 def publish(
@@ -131,30 +160,29 @@ def publish(
 ) -> None:
     """Write sheets, their manifest and their areas.
 
-    All is written whole before anything appears, and then appears in the order ledger,
-    manifest, sheets. So a sheet that is on the disk has its area in the ledger and its
-    manifest beside it; what an interrupt can leave behind is an area that no sheet uses.
+    All files are written completely before the first one appears, in the order ledger, manifest,
+    sheets. Each sheet on disk therefore has its area in the ledger and its manifest; after an
+    interruption the ledger may contain an area that no sheet uses.
 
     Parameters
     ----------
     outputs : sequence of (path, callable)
-        Files of sheets; the callable writes the content to the stream it is given.
+        Files of sheets; the callable writes the content to a stream.
     manifest_path : path
     manifest : Manifest
     ledger : Ledger
     areas : sequence of Area
-        To add to the ledger.
+        Areas to add to the ledger.
     overwrite : bool
 
     Raises
     ------
     OutputExistsError, MissingDataError, LocatkError
-        See :func:`locatk.formats.output.atomic_write`; then nothing is written but the
-        ledger, at most.
+        See :func:`locatk.formats.output.atomic_write`; at most the ledger is then written.
     """
     text = dumps_manifest(manifest).encode()
     with contextlib.ExitStack() as stack:
-        # A stack unwinds from its end: what is opened last appears first.
+        # The stack closes files in reverse order: the one opened last appears first.
         for path, write in reversed(outputs):
             stream = stack.enter_context(atomic_write(path, overwrite=overwrite))
             write(stream)

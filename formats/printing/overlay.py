@@ -1,7 +1,7 @@
-"""Dots over the pages of a document.
+"""Dots printed over the pages of a PDF document.
 
-:func:`overlay` lays page after page of one PDF over another at true size and place, and
-returns an :class:`Overlaid`: the bytes, and what could not be freed of black.
+:func:`overlay` draws each page of one PDF over the same page of another at true size, and
+optionally removes the black ink of the lower one.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from pikepdf import Array, Dictionary, Name, Pdf, Stream
 from locatk.core.dots.sheet import MM_PER_INCH
 from locatk.core.errors import FormatError, InputError
 from locatk.formats.files import read_bytes
-from locatk.formats.printing.separation.document import BROKEN, Stripper
+from locatk.formats.printing.separation.content import DAMAGE_ERRORS, BlackRemover
 
 MM_PER_POINT = MM_PER_INCH / 72
 
-TOLERANCE_MM = 0.1
-"""By how much a stamp may differ in size from the page that it goes on."""
+SIZE_TOLERANCE_MM = 0.1
+"""Largest difference in size between a stamp and its page."""
 
-PRINTS, HIDDEN = 4, 2
+PRINT_FLAG, HIDDEN_FLAG = 4, 2
 """Flags of annotations (ISO 32000-1 table 165)."""
 
 
 @dataclass(frozen=True)
-class Overlaid:
-    """What :func:`overlay` made.
+class OverlaidDocument:
+    """Result of :func:`overlay`.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class Overlaid:
         The PDF.
     pages : int
     left_black : dict of str to int
-        Where the document keeps black although it was to go: what it is, in the plural
-        ("shadings of a mesh in CMYK"), and how many. Empty: only the stamp is black.
+        Kinds of objects that remain black although black was to be removed, in the plural
+        ("shadings of a mesh in CMYK"), and their numbers. If empty, only the stamp is black.
     dropped : int
-        Comments that would print but that say not how they look; each viewer draws them
-        in its own way, and they are gone.
+        Printable comments without an appearance, which each viewer draws in its own way; they are
+        left out.
     """
 
     data: bytes
@@ -55,8 +55,8 @@ class Overlaid:
 
 
 @dataclass(frozen=True)
-class _Frame:
-    """What is seen of a page: its crop box in the page's units, from the lower left."""
+class _PageFrame:
+    """Visible part of a page: its crop box in the page's units, from the lower left."""
 
     left: float
     bottom: float
@@ -66,7 +66,7 @@ class _Frame:
     unit: float
 
     @classmethod
-    def of(cls, page: pikepdf.Object) -> _Frame:
+    def of(cls, page: pikepdf.Object) -> _PageFrame:
         media = _box(page.MediaBox)
         crop = _box(page.get("/CropBox", page.MediaBox))
         left, bottom = max(media[0], crop[0]), max(media[1], crop[1])
@@ -85,8 +85,8 @@ class _Frame:
             width, height = height, width
         return width * self.unit * MM_PER_POINT, height * self.unit * MM_PER_POINT
 
-    def onto(self, stamp: _Frame) -> str:
-        """Matrix (for ``cm``) that lays what is seen upright over ``stamp``."""
+    def onto(self, stamp: _PageFrame) -> str:
+        """Return the matrix (for ``cm``) that moves the upright visible part over ``stamp``."""
         x, y = {
             0: (self.left, self.bottom),
             90: (self.right, self.bottom),
@@ -102,19 +102,19 @@ class _Frame:
 
 
 def page_sizes(path: str | os.PathLike[str]) -> list[tuple[float, float]]:
-    """Width and height of each page in mm, as a viewer shows it and a printer prints it.
+    """Return width and height of each page in mm, as it is displayed and printed.
 
-    That is its crop box, in its unit, turned by its rotation.
+    This is the rotated crop box in the unit of the page.
 
     Raises
     ------
     MissingDataError
-        There is no such file.
+        The file does not exist.
     FormatError
-        It is no PDF, is damaged, is encrypted or has no page.
+        The file is not a PDF, is damaged or encrypted, or has no page.
     """
     with _opened(path) as pdf:
-        return [_Frame.of(page.obj).size_mm for page in pdf.pages]
+        return [_PageFrame.of(page.obj).size_mm for page in pdf.pages]
 
 
 def overlay(
@@ -123,48 +123,47 @@ def overlay(
     *,
     strip_black: bool,
     progress: Callable[[int, int], None] | None = None,
-) -> Overlaid:
-    """Lay page i of ``stamp`` over page i of a document.
+) -> OverlaidDocument:
+    """Draw page i of ``stamp`` over page i of a document.
 
-    Nothing is scaled; the lower left corner of the stamp lies on that of the page as it is
-    shown. The stamp's fonts are stored once, its inks and its overprint are kept, and
-    nothing of the document covers it: comments and filled-in forms become part of the page
-    below, as they would print.
+    Pages are not scaled; the lower left corners of the stamp and of the displayed page coincide.
+    The fonts of the stamp are stored once, its inks and its overprint are kept, and no part of the
+    document covers it: comments and filled-in forms become part of the page below, as they would
+    print.
 
     Parameters
     ----------
     document : path
-        The PDF below.
+        The lower PDF.
     stamp : bytes
-        A PDF of as many pages, each of the size that :func:`page_sizes` tells, not
-        rotated.
+        PDF with as many pages, of the sizes of :func:`page_sizes`, without rotation.
     strip_black : bool
-        Make all that is black or grey in the document of cyan, magenta and yellow.
+        Replace black and grey of the document by cyan, magenta and yellow.
     progress : callable, optional
-        Called with the number of pages that are done and the number of all.
+        Called with the number of finished pages and the number of all.
 
     Returns
     -------
-    Overlaid
+    OverlaidDocument
         The same input gives the same bytes.
 
     Raises
     ------
     MissingDataError, FormatError
-        As :func:`page_sizes`.
+        See :func:`page_sizes`.
     InputError
-        The stamp has another number of pages, or one of another size.
+        The stamp has another number of pages, or a page of another size.
     """
     with _opened(document) as pdf, Pdf.open(io.BytesIO(stamp)) as stamps:
         if len(stamps.pages) != len(pdf.pages):
             raise InputError(
-                f"{len(stamps.pages)} pages to lay over {len(pdf.pages)}", file=document
+                f"{len(stamps.pages)} pages cannot be drawn over {len(pdf.pages)}", file=document
             )
         dropped = _flatten(pdf)
-        stripper = Stripper(pdf) if strip_black else None
+        remover = BlackRemover(pdf) if strip_black else None
         for number, page in enumerate(pdf.pages, 1):
             try:
-                _lay(pdf, page, stamps, stamps.pages[number - 1], stripper)
+                _draw_over(pdf, page, stamps, stamps.pages[number - 1], remover)
             except InputError as error:
                 raise InputError(error.message, file=document, where=f"page {number}") from None
             if progress is not None:
@@ -179,65 +178,76 @@ def overlay(
             object_stream_mode=pikepdf.ObjectStreamMode.generate,
             deterministic_id=True,
         )
-        left = {} if stripper is None else dict(sorted(stripper.left.items()))
-        return Overlaid(target.getvalue(), len(pdf.pages), left, dropped)
+        left_black = {} if remover is None else dict(sorted(remover.left.items()))
+        return OverlaidDocument(target.getvalue(), len(pdf.pages), left_black, dropped)
 
 
-def _lay(
-    pdf: Pdf, page: pikepdf.Page, stamps: Pdf, stamp: pikepdf.Page, stripper: Stripper | None
+def _draw_over(
+    pdf: Pdf, page: pikepdf.Page, stamps: Pdf, stamp: pikepdf.Page, remover: BlackRemover | None
 ) -> None:
-    frame, its = _Frame.of(page.obj), _Frame.of(stamp.obj)
-    if its.rotation:
-        raise InputError("a stamp that is rotated")
-    if any(abs(a - b) > TOLERANCE_MM for a, b in zip(frame.size_mm, its.size_mm, strict=True)):
-        sizes = (*its.size_mm, *frame.size_mm)
-        raise InputError("a stamp of {:.2f} x {:.2f} mm on {:.2f} x {:.2f} mm".format(*sizes))
+    frame, stamp_frame = _PageFrame.of(page.obj), _PageFrame.of(stamp.obj)
+    if stamp_frame.rotation:
+        raise InputError("the stamp is rotated")
+    if any(
+        abs(a - b) > SIZE_TOLERANCE_MM
+        for a, b in zip(frame.size_mm, stamp_frame.size_mm, strict=True)
+    ):
+        sizes = (*stamp_frame.size_mm, *frame.size_mm)
+        raise InputError(
+            "the stamp has {:.2f} x {:.2f} mm, the page {:.2f} x {:.2f} mm".format(*sizes)
+        )
     below = _as_form(pdf, page.obj)
-    if stripper is not None:
-        below = stripper.form(below, starts=True)
+    if remover is not None:
+        below = remover.form(below, starts=True)
     above = pdf.copy_foreign(_as_form(stamps, stamp.obj))
-    # The page becomes the stamp's, whose size is a whole number of the printer's pixels, and
-    # the document a form below: neither's state, blending or profiles reach the other.
+    # The page gets the size of the stamp, which is an integer number of the printer's pixels. The
+    # document becomes a form, so that neither affects the state, blending or profiles of the other.
     for key in list(page.obj.keys()):
         if key not in ("/Type", "/Parent"):
             del page.obj[key]
     page.obj.MediaBox = Array([_plain(value) for value in _box(stamp.obj.MediaBox)])
     if "/TrimBox" in stamp.obj:
         page.obj.TrimBox = Array([_plain(value) for value in _box(stamp.obj.TrimBox)])
-    if its.unit != 1:
-        page.obj.UserUnit = _plain(its.unit)
+    if stamp_frame.unit != 1:
+        page.obj.UserUnit = _plain(stamp_frame.unit)
     page.obj.Resources = Dictionary(XObject=Dictionary(Below=below, Dots=above))
-    page.obj.Contents = pdf.make_stream(f"q {frame.onto(its)} cm /Below Do Q /Dots Do".encode())
+    page.obj.Contents = pdf.make_stream(
+        f"q {frame.onto(stamp_frame)} cm /Below Do Q /Dots Do".encode()
+    )
 
 
 def _as_form(pdf: Pdf, page: pikepdf.Object) -> Stream:
-    """What a page draws, as a form in the page's own coordinates."""
+    """Convert the content of a page to a form in the page's coordinates."""
     contents = page.get("/Contents")
     if isinstance(contents, Stream):
-        made = copy.copy(contents)  # its bytes stay packed as they are
+        form = copy.copy(contents)  # its bytes remain compressed
     else:
         parts = [] if contents is None else [item.read_bytes() for item in contents]
-        made = pdf.make_stream(b"\n".join(parts))
-    made.Type, made.Subtype = Name.XObject, Name.Form
-    made.BBox = Array([_plain(value) for value in _box(page.MediaBox)])
-    made.Resources = page.get("/Resources", Dictionary())
+        form = pdf.make_stream(b"\n".join(parts))
+    form.Type, form.Subtype = Name.XObject, Name.Form
+    form.BBox = Array([_plain(value) for value in _box(page.MediaBox)])
+    form.Resources = page.get("/Resources", Dictionary())
     if "/Group" in page:
-        made.Group = page.Group
-    return pdf.make_indirect(made)
+        form.Group = page.Group
+    return pdf.make_indirect(form)
 
 
 def _flatten(pdf: Pdf) -> int:
-    """Draw what is annotated into the pages; the number of what cannot be drawn."""
+    """Draw annotations into the pages; return the number of those that cannot be drawn."""
     if "/AcroForm" in pdf.Root and pdf.Root.AcroForm.get("/NeedAppearances", False):
         pdf.generate_appearance_streams()
     dropped = 0
     for page in pdf.pages:
-        for note in page.obj.get("/Annots", ()):
-            flags = int(note.get("/F", 0))
-            drawn = "/AP" in note or str(note.get("/Subtype")) in ("/Link", "/Popup", "/Widget")
-            dropped += bool(flags & PRINTS) and not flags & HIDDEN and not drawn
+        for annotation in page.obj.get("/Annots", ()):
+            flags = int(annotation.get("/F", 0))
+            is_drawn = "/AP" in annotation or str(annotation.get("/Subtype")) in (
+                "/Link",
+                "/Popup",
+                "/Widget",
+            )
+            dropped += bool(flags & PRINT_FLAG) and not flags & HIDDEN_FLAG and not is_drawn
         if "/Annots" in page.obj:
-            # As a form, the page cannot leave a state behind that displaces the notes.
+            # The page becomes a form, so that its graphics state does not displace annotations.
             below = _as_form(pdf, page.obj)
             if "/Group" in below:
                 del below.Group
@@ -249,9 +259,9 @@ def _flatten(pdf: Pdf) -> int:
     return dropped
 
 
-def _box(found: Any) -> tuple[float, float, float, float]:
-    """Left, bottom, right, top of a rectangle, which any two corners may give."""
-    a, b, c, d = (float(value) for value in found)
+def _box(rectangle: Any) -> tuple[float, float, float, float]:
+    """Return left, bottom, right, top of a rectangle that is given by any two corners."""
+    a, b, c, d = (float(value) for value in rectangle)
     return min(a, c), min(b, d), max(a, c), max(b, d)
 
 
@@ -261,11 +271,11 @@ def _plain(value: float) -> float | int:
 
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
-    """A document that can be read whole; what goes wrong with it later is damage, too."""
+    """Open a document; errors while it is processed are reported as damage, too."""
     if b"%PDF-" not in read_bytes(path, 1024):
         raise FormatError("not a PDF", file=path)
     try:
-        # Without repairing, which may lose pages and not say so.
+        # A repair may lose pages without a message.
         with Pdf.open(os.fspath(path), attempt_recovery=False) as pdf:
             if pdf.is_encrypted:
                 raise _encrypted(path)
@@ -276,11 +286,11 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
         raise _encrypted(path) from None
     except InputError:
         raise
-    except BROKEN as error:
+    except DAMAGE_ERRORS as error:
         raise FormatError(
             f"a damaged PDF ({_first_line(error)})",
             file=path,
-            hint="print it into a new PDF from a viewer, look whether all is there, and use that",
+            hint="Print it into a new PDF from a viewer, check that it is complete, and use that",
         ) from error
 
 
@@ -288,7 +298,7 @@ def _encrypted(path: str | os.PathLike[str]) -> FormatError:
     return FormatError(
         "an encrypted PDF",
         file=path,
-        hint="save it without password and restrictions, as with `qpdf --decrypt IN.pdf OUT.pdf`",
+        hint="Save it without password and restrictions, as with `qpdf --decrypt IN.pdf OUT.pdf`",
     )
 
 

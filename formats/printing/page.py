@@ -1,8 +1,7 @@
-"""A page at true size, and what stands in its margin: rulers, marks, words.
+"""PDF pages at true size, and the rulers, marks and captions in their margin.
 
-Nothing in the margin comes nearer to the pattern than :data:`CLEARANCE_MM`. Lengths are in
-mm from the page's lower left corner, as on the sheet itself; reportlab's points stay in
-here.
+The margin keeps a distance of :data:`CLEARANCE_MM` from the pattern. Lengths are in mm from the
+page's lower left corner; only this module converts them to reportlab's points.
 """
 
 from __future__ import annotations
@@ -23,30 +22,33 @@ from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
 
 BLACK = CMYKColor(0, 0, 0, 1)
-"""The one ink of all that is drawn: K alone, never grey, which printers
-halftone."""
+"""Ink of all drawings: K alone, since printers halftone grey."""
 
-LARGEST_MM = 5080.0
-"""200 inches; no PDF viewer need show a longer page (ISO 32000-1 annex C)."""
+MAX_PAGE_MM = 5080.0
+"""Longest side that PDF viewers must support: 200 inches (ISO 32000-1 annex C)."""
 
 CLEARANCE_MM = 1.0
 STRIP_MM = 5.0
-"""The margin's furniture lies within a strip of this depth around the pattern."""
+"""Depth of the strip around the pattern that contains rulers, marks and captions."""
 
-NEEDED_MM = CLEARANCE_MM + STRIP_MM + 1.0
-"""Margin below which there is no room for it."""
+MIN_MARGIN_MM = CLEARANCE_MM + STRIP_MM + 1.0
+"""Smallest margin for this strip."""
 
 RULER_MM = 100
 
-_CORNER_MM = 6.0
-_MARK_MM = 4.0
-_FONT, _BOLD = "Helvetica", "Helvetica-Bold"
-_SMALL, _LARGE = 5.0, 7.0
+CORNER_MM = 6.0
+"""Length of an edge, from each corner, without rulers and captions."""
+
+MARK_MM = 4.0
+"""Size of a registration mark."""
+
+FONT, BOLD_FONT = "Helvetica", "Helvetica-Bold"
+AXIS_LABEL_POINTS, CAPTION_POINTS = 5.0, 7.0
 
 
 @dataclass(frozen=True)
 class Box:
-    """A rectangle on the page, in mm."""
+    """Rectangle on the page, in mm."""
 
     left: float
     bottom: float
@@ -55,16 +57,16 @@ class Box:
 
     @classmethod
     def of(cls, layout: SheetLayout) -> Box:
-        """All that the dots of a layout can cover."""
+        """Return the area that the dots of a layout can cover."""
         left, top, right, bottom = (layout.raster.mm(edge) for edge in layout.box)
         height = layout.raster.mm(layout.page[1])
         return cls(left, height - bottom, right, height - top)
 
 
 def open_document(stream: IO[bytes], title: str) -> Canvas:
-    """A document that viewers print at 100 %.
+    """Open a document that viewers print at 100 %.
 
-    It holds no time and no random number: the same drawing gives the same bytes.
+    It contains neither a time nor random numbers: the same drawing gives the same bytes.
     """
     canvas = Canvas(stream, pageCompression=1, invariant=1, pdfVersion=(1, 6))
     canvas.setTitle(title)
@@ -86,12 +88,12 @@ def start_page(
     Raises
     ------
     InputError
-        No viewer need show a page as long as that; ``hint`` says what to do.
+        The page is longer than a PDF may be; ``hint`` is the remedy.
     """
-    if max(size_mm) > LARGEST_MM:
+    if max(size_mm) > MAX_PAGE_MM:
         raise InputError(
-            f"a PDF page of {size_mm[0]:g} x {size_mm[1]:g} mm is longer than "
-            f"{LARGEST_MM:g} mm, which is the most",
+            f"a PDF page of {size_mm[0]:g} x {size_mm[1]:g} mm is longer than the limit of "
+            f"{MAX_PAGE_MM:g} mm",
             hint=hint,
         )
     canvas.setPageSize(tuple(_points(side) for side in size_mm))
@@ -101,11 +103,11 @@ def start_page(
 
 
 def _points(side_mm: float) -> float:
-    """Points of a side in the seven digits that reportlab writes, a trifle too small.
+    """Return the points of a side in the seven digits that reportlab writes, rounded down.
 
-    Some rasterisers round the pixels of a page up: 595.2 points, or even 792, are then a
-    pixel more than 2480 or 3300 of 1/300 in, over which the page is stretched, because
-    32 bits, or 300/72, hold a little too much.
+    Some rasterizers round the number of pixels of a page up. With single precision, or a scale of
+    300/72, 595.2 points (or even 792) become one pixel more than 2480 (3300) of 1/300 in, and the
+    page is stretched over them.
     """
     side = round(side_mm * mm, 6)
     unit = 10.0 ** (math.floor(math.log10(side)) - 6)
@@ -123,7 +125,7 @@ def ruler(
 
 
 def draw(canvas: Canvas, marks: Iterable[drawing.Mark]) -> None:
-    """Draw marks on the page that was begun."""
+    """Draw marks on the current page."""
     for mark in marks:
         canvas.saveState()
         if isinstance(mark, drawing.Text):
@@ -134,14 +136,14 @@ def draw(canvas: Canvas, marks: Iterable[drawing.Mark]) -> None:
         canvas.restoreState()
 
 
-def _write(canvas: Canvas, words: drawing.Text) -> None:
-    canvas.translate(words.position[0] * mm, words.position[1] * mm)
-    canvas.rotate(words.angle_deg)
-    font = _BOLD if words.bold else _FONT
-    canvas.setFont(font, words.points)
-    share = {"start": 0.0, "middle": 0.5, "end": 1.0}[words.anchor]
-    width = canvas.stringWidth(words.text, font, words.points)
-    canvas.drawString(-share * width, 0, words.text)
+def _write(canvas: Canvas, label: drawing.Text) -> None:
+    canvas.translate(label.position[0] * mm, label.position[1] * mm)
+    canvas.rotate(label.angle_deg)
+    font = BOLD_FONT if label.bold else FONT
+    canvas.setFont(font, label.points)
+    anchor = {"start": 0.0, "middle": 0.5, "end": 1.0}[label.anchor]
+    width = canvas.stringWidth(label.text, font, label.points)
+    canvas.drawString(-anchor * width, 0, label.text)
 
 
 def _stroke(canvas: Canvas, mark: drawing.Line | drawing.Circle | drawing.Polygon) -> None:
@@ -165,37 +167,37 @@ def _lines(canvas: Canvas, lines: Sequence[tuple[float, float, float, float]]) -
 
 
 def text(
-    canvas: Canvas, at: tuple[float, float], words: str, size: float, *, bold: bool = False
+    canvas: Canvas, start: tuple[float, float], words: str, points: float, *, bold: bool = False
 ) -> float:
-    """Write from ``at`` to the right, in points; returns the width in mm."""
-    font = _BOLD if bold else _FONT
-    canvas.setFont(font, size)
-    canvas.drawString(at[0] * mm, at[1] * mm, words)
-    width: float = canvas.stringWidth(words, font, size) / mm
+    """Write a line of text from ``start`` to the right; return its width in mm."""
+    font = BOLD_FONT if bold else FONT
+    canvas.setFont(font, points)
+    canvas.drawString(start[0] * mm, start[1] * mm, words)
+    width: float = canvas.stringWidth(words, font, points) / mm
     return width
 
 
 def registration_mark(canvas: Canvas, x: float, y: float) -> None:
-    """A cross in a circle around a point at which two tiles meet."""
-    arm = _MARK_MM / 2
+    """Draw a cross in a circle around a point at which two tiles meet."""
+    arm = MARK_MM / 2
     _lines(canvas, [(x - arm, y, x + arm, y), (x, y - arm, x, y + arm)])
     canvas.circle(x * mm, y * mm, 0.6 * arm * mm)
 
 
 def crop_marks(canvas: Canvas, box: Box) -> None:
-    """Where to cut for a sheet without margin; the page's TrimBox says the same."""
-    near, far = CLEARANCE_MM + 0.5, CLEARANCE_MM + STRIP_MM
+    """Draw marks for cutting the margin off, and set the page's TrimBox to the same box."""
+    inner, outer = CLEARANCE_MM + 0.5, CLEARANCE_MM + STRIP_MM
     lines = []
-    for x, out in ((box.left, -1), (box.right, 1)):
-        lines += [(x + out * near, y, x + out * far, y) for y in (box.bottom, box.top)]
-    for y, out in ((box.bottom, -1), (box.top, 1)):
-        lines += [(x, y + out * near, x, y + out * far) for x in (box.left, box.right)]
+    for x, side in ((box.left, -1), (box.right, 1)):
+        lines += [(x + side * inner, y, x + side * outer, y) for y in (box.bottom, box.top)]
+    for y, side in ((box.bottom, -1), (box.top, 1)):
+        lines += [(x, y + side * inner, x, y + side * outer) for x in (box.left, box.right)]
     _lines(canvas, lines)
     canvas.setTrimBox([edge * mm for edge in (box.left, box.bottom, box.right, box.top)])
 
 
 def axes(canvas: Canvas, x: float, y: float, length: float = 3.5) -> None:
-    """Arrows along the sheet's x and y, with their letters, from a corner."""
+    """Draw labelled arrows along the sheet's x and y from a corner."""
     head = 0.8
     _lines(
         canvas,
@@ -208,21 +210,21 @@ def axes(canvas: Canvas, x: float, y: float, length: float = 3.5) -> None:
             (x + head / 2, y + length - head, x, y + length),
         ],
     )
-    text(canvas, (x + length - 0.6, y - 1.9), "x", _SMALL)
-    text(canvas, (x - 1.6, y + length - 0.9), "y", _SMALL)
+    text(canvas, (x + length - 0.6, y - 1.9), "x", AXIS_LABEL_POINTS)
+    text(canvas, (x - 1.6, y + length - 0.9), "y", AXIS_LABEL_POINTS)
 
 
-def has_room(box: Box, size_mm: tuple[float, float]) -> bool:
-    """Whether the margin around ``box`` holds rulers, marks and words."""
+def fits_margin(box: Box, size_mm: tuple[float, float]) -> bool:
+    """Return True if the margin around ``box`` is wide enough for rulers, marks and captions."""
     sides = (box.left, box.bottom, size_mm[0] - box.right, size_mm[1] - box.top)
-    # The box is in the middle of what the margin leaves, to a pixel.
-    return min(sides) > NEEDED_MM - 0.1
+    # The box is in the middle of the page without its margin, except for one pixel.
+    return min(sides) > MIN_MARGIN_MM - 0.1
 
 
-def furnish(
+def draw_margin(
     canvas: Canvas,
     box: Box,
-    words: Sequence[str],
+    captions: Sequence[str],
     seams: tuple[Sequence[float], Sequence[float]] = ((), ()),
     *,
     marks: bool = True,
@@ -232,17 +234,17 @@ def furnish(
 
     Parameters
     ----------
-    words : sequence of str
-        What is written above the pattern, the most important first: the first in bold,
-        and from the last on those left out that do not fit.
+    captions : sequence of str
+        Texts above the pattern in the order of importance. The first one is bold; the last ones
+        are omitted if they do not fit.
     seams : (x, y)
-        Tiles: where they are cut for their neighbours, in mm from the left and from the
-        bottom edge; registration marks stand at both ends of each.
+        Lines along which tiles are cut, in mm from the left and from the bottom edge, with
+        registration marks at both ends.
     marks : bool
-        Rulers of 100 mm below and at the left (shorter where the page is), the axes, and
-        the words.
+        Draw rulers of 100 mm below and at the left (shorter on small pages), the axes, and the
+        captions.
     crop : bool
-        Marks for cutting the margin off.
+        Draw marks for cutting the margin off.
     """
     middle = CLEARANCE_MM + STRIP_MM / 2
     for x in seams[0]:
@@ -257,26 +259,26 @@ def furnish(
         return
     left, right = _between(box.left, box.right, seams[0])
     bottom, top = _between(box.bottom, box.top, seams[1])
-    for room, start, upright in (
+    for length_mm, start, upright in (
         (right - left, (left, box.bottom - CLEARANCE_MM), False),
         (top - bottom, (box.left - CLEARANCE_MM, bottom), True),
     ):
-        length = min(RULER_MM, int(room - 5) // 10 * 10)
+        length = min(RULER_MM, int(length_mm - 5) // 10 * 10)
         if length > 0:
             ruler(canvas, start, length, upright=upright)
     axes(canvas, box.left - CLEARANCE_MM - 4, box.bottom - CLEARANCE_MM - 4)
-    at, bold = left, True
-    for item in words:
-        width = canvas.stringWidth(item, _BOLD if bold else _FONT, _LARGE) / mm
-        if at + width > right:
+    x, bold = left, True
+    for caption in captions:
+        width = canvas.stringWidth(caption, BOLD_FONT if bold else FONT, CAPTION_POINTS) / mm
+        if x + width > right:
             break
-        text(canvas, (at, box.top + CLEARANCE_MM + 1), item, _LARGE, bold=bold)
-        at, bold = at + width + 4, False
+        text(canvas, (x, box.top + CLEARANCE_MM + 1), caption, CAPTION_POINTS, bold=bold)
+        x, bold = x + width + 4, False
 
 
 def _between(low: float, high: float, seams: Sequence[float]) -> tuple[float, float]:
-    """What of an edge is free between the marks at its ends."""
+    """Return the part of an edge between the marks at its ends."""
     middle = (low + high) / 2
-    below = [at + _MARK_MM for at in seams if at < middle]
-    above = [at - _MARK_MM for at in seams if at >= middle]
-    return max([low + _CORNER_MM, *below]), min([high - _CORNER_MM, *above])
+    below = [seam + MARK_MM for seam in seams if seam < middle]
+    above = [seam - MARK_MM for seam in seams if seam >= middle]
+    return max([low + CORNER_MM, *below]), min([high - CORNER_MM, *above])

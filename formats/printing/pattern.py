@@ -1,8 +1,9 @@
-"""The dots as PDF: one Type 3 font of four glyphs, one string a row.
+"""Sheets of dots, and the printer's test sheet, as PDF.
 
-Of the methods compared this gives the smallest files, 2.2 bits a dot, and every dot exactly on
-the printer's pixels, whereas renderers resample images. A page is an XObject in pixels of the
-printer, so that all its numbers are whole.
+The dots are a Type 3 font of four glyphs, and each row is a string. Of the methods compared this
+gives the smallest files (2.2 bits a dot), and each dot is exactly on the printer's pixels, whereas
+renderers resample images. A pattern is an XObject in pixels of the printer, so that all its numbers
+are integers.
 """
 
 from __future__ import annotations
@@ -18,13 +19,23 @@ from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core.dots.codec import DOT_DIRECTIONS, SYMBOL_LETTERS
 from locatk.core.dots.drawing.layout import Raster, SheetLayout, pixels
+from locatk.core.dots.drawing.test_sheet import (
+    MARKER_SIDE_MODULES,
+    CornerMarker,
+    PrinterField,
+    PrinterSheet,
+)
 from locatk.core.dots.drawing.tiles import seams
 from locatk.core.dots.sheet import Manifest
 from locatk.formats.printing import page
 from locatk.formats.printing.rasters import symbols
 
-LONGEST = 32_000
-"""Letters in one string; a PDF reader need take no more than 32767 (ISO 32000-1 annex C)."""
+MAX_STRING_BYTES = 32_000
+"""Letters in one string; PDF readers must support 32767 (ISO 32000-1 annex C)."""
+
+CAPTION_POINTS = 6.0
+LINE_SPACING_MM = 3.4
+"""Captions of the test sheet."""
 
 _CODES = np.frombuffer(SYMBOL_LETTERS.encode(), np.uint8)
 
@@ -36,20 +47,20 @@ def render(
     crop: bool = False,
     done: Callable[[], object] = lambda: None,
 ) -> bytes:
-    """A PDF with a page for each sheet of a manifest, in its order.
+    """Render a PDF with one page a sheet of a manifest, in its order.
 
     Parameters
     ----------
     manifest : Manifest
     marks, crop : bool
-        See :func:`locatk.formats.printing.page.furnish`. Margins that are too narrow stay empty.
+        See :func:`locatk.formats.printing.page.draw_margin`. Too narrow margins remain empty.
     done : callable
         Called after each of :func:`locatk.formats.printing.rasters.bands`.
 
     Raises
     ------
     InputError
-        A page is longer than a PDF may be, or the manifest's dots do not lie on pixels.
+        A page is longer than a PDF may be, or the manifest's dots are not on pixels.
     """
     stream = io.BytesIO()
     canvas = page.open_document(stream, f"locatk {manifest.sheets[0].id}")
@@ -58,45 +69,45 @@ def render(
         page.start_page(canvas, sheet.page_mm)
         draw_dots(canvas, f"pattern{number}", layout, symbols(manifest, number, done))
         box = page.Box.of(layout)
-        if page.has_room(box, sheet.page_mm):
+        if page.fits_margin(box, sheet.page_mm):
             x, y = seams(manifest, number)
-            upwards = [sheet.page_mm[1] - at for at in y]
-            page.furnish(
-                canvas, box, _words(manifest, number), (x, upwards), marks=marks, crop=crop
+            upwards = [sheet.page_mm[1] - seam for seam in y]
+            page.draw_margin(
+                canvas, box, _captions(manifest, number), (x, upwards), marks=marks, crop=crop
             )
         canvas.showPage()
     canvas.save()
     return stream.getvalue()
 
 
-def cramped(manifest: Manifest) -> list[str]:
-    """Ids of the sheets whose margin is too narrow for rulers, marks and words."""
+def sheets_without_margin(manifest: Manifest) -> list[str]:
+    """Return the ids of the sheets with too narrow margins for rulers, marks and captions."""
     return [
         sheet.id
         for number, sheet in enumerate(manifest.sheets)
-        if not page.has_room(page.Box.of(pixels(manifest, number)), sheet.page_mm)
+        if not page.fits_margin(page.Box.of(pixels(manifest, number)), sheet.page_mm)
     ]
 
 
 def draw_dots(
     canvas: Canvas, name: str, layout: SheetLayout, rows: Iterable[NDArray[np.uint8]]
 ) -> None:
-    """Draw a pattern on the page that was begun.
+    """Draw a pattern on the current page.
 
     Parameters
     ----------
     canvas : reportlab Canvas
     name : str
-        Of the drawing, not used for another one in this document.
+        Unique name of the drawing in this document.
     layout : SheetLayout
-        Where; its page must be the canvas'.
+        Layout of a page of the canvas' size.
     rows : iterable of (rows, columns) uint8 ndarray
         Bands of rows from the top down, together of the layout's size.
     """
     raster, height = layout.raster, layout.page[1]
     x, y = layout.first[0], height - layout.first[1] - raster.dot
     packer = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_FILTERED)
-    # `'` goes to the next line first, so begin one above.
+    # The operator `'` moves to the next line first, so the text starts one line above.
     head = f"/O gs 0 0 0 1 k BT /D 1 Tf {raster.pitch} TL 1 0 0 1 {x} {y + raster.pitch} Tm\n"
     parts = [packer.compress(head.encode())]
     parts += [packer.compress(_strings(band)) for band in rows]
@@ -122,11 +133,11 @@ def draw_dots(
 
 
 def _strings(symbols: NDArray[np.uint8]) -> bytes:
-    """Text operators that show these rows, each on a line of its own."""
+    """Return text operators that show these rows, each on a line of its own."""
     rows, columns = symbols.shape
     blocks = []
-    for start in range(0, columns, LONGEST):
-        letters = _CODES[symbols[:, start : start + LONGEST]]
+    for start in range(0, columns, MAX_STRING_BYTES):
+        letters = _CODES[symbols[:, start : start + MAX_STRING_BYTES]]
         for text in (b"(", b")'\n" if start == 0 else b")Tj\n"):
             blocks.append(np.tile(np.frombuffer(text, np.uint8), (rows, 1)))
         blocks.insert(-1, letters)
@@ -134,9 +145,9 @@ def _strings(symbols: NDArray[np.uint8]) -> bytes:
 
 
 def _font(canvas: Canvas, raster: Raster) -> pdfdoc.PDFObjectReference:
-    """The font of a raster in this document; it is made when first asked for.
+    """Return the font of a raster in this document, which is added at the first call.
 
-    A glyph's origin is the lower left pixel of a dot at the place itself.
+    The origin of a glyph is the lower left pixel of a dot exactly on the grid point.
     """
     document = canvas._doc
     name = f"dots-{raster.pitch}-{raster.offset}-{raster.dot}"
@@ -171,8 +182,8 @@ def _dictionary(**entries: object) -> pdfdoc.PDFDictionary:
     return pdfdoc.PDFDictionary(entries)
 
 
-def _words(manifest: Manifest, number: int) -> list[str]:
-    """What the margin says of a sheet, the most important first."""
+def _captions(manifest: Manifest, number: int) -> list[str]:
+    """Return the captions of a sheet in the order of importance."""
     sheet = manifest.sheets[number]
     (x, y), (u, v), (columns, rows) = sheet.origin, sheet.section, sheet.size
     return [
@@ -185,3 +196,77 @@ def _words(manifest: Manifest, number: int) -> list[str]:
         f"{manifest.codec} {x},{y} section {u},{v}",
         f"{columns} x {rows} dots",
     ]
+
+
+# ---- test sheet
+
+
+def render_test_sheet(sheet: PrinterSheet) -> bytes:
+    """Render a page with the fields, their captions, the markers and rulers of 100 mm.
+
+    The same sheet gives the same bytes.
+    """
+    stream = io.BytesIO()
+    canvas = page.open_document(stream, f"locatk test sheet {sheet.paper} {sheet.dpi} dpi")
+    width, height = (sheet.mm(side) for side in sheet.page)
+    page.start_page(canvas, (width, height))
+    for corner in sheet.corners:
+        _draw_marker(canvas, sheet, corner)
+    for field in sheet.fields:
+        draw_dots(canvas, f"field-{field.name}", field.layout, [sheet.symbols(field)])
+        _caption(canvas, sheet, field)
+    _instructions(canvas, sheet)
+    inner_mm = sheet.mm(sheet.corners[0].points[2, 0]) + 4
+    middle = (height - page.RULER_MM) / 2
+    page.ruler(canvas, (inner_mm - 6, middle), upright=True)
+    page.ruler(canvas, ((width - page.RULER_MM) / 2, inner_mm - 6))
+    canvas.showPage()
+    canvas.save()
+    return stream.getvalue()
+
+
+def _draw_marker(canvas: Canvas, sheet: PrinterSheet, corner: CornerMarker) -> None:
+    """Draw the black modules on the printer's pixels, adjacent ones of a row as one rectangle."""
+    canvas.saveState()
+    point = 72 / sheet.dpi
+    canvas.scale(point, point)
+    left, top = corner.at
+    side, bottom = corner.module, sheet.page[1]
+    path = canvas.beginPath()
+    for row, black in enumerate(corner.modules()):
+        starts = [k for k in range(MARKER_SIDE_MODULES) if black[k] and not (k and black[k - 1])]
+        for start in starts:
+            end = start
+            while end < MARKER_SIDE_MODULES and black[end]:
+                end += 1
+            y = bottom - top - (row + 1) * side
+            path.rect(left + start * side, y, (end - start) * side, side)
+    canvas.drawPath(path, stroke=0, fill=1)
+    canvas.restoreState()
+
+
+def _caption(canvas: Canvas, sheet: PrinterSheet, field: PrinterField) -> None:
+    """Write name, dot and pitch below a field."""
+    left, _, _, bottom = field.layout.box
+    x, y = sheet.mm(left), sheet.mm(sheet.page[1] - bottom) - LINE_SPACING_MM
+    raster = field.layout.raster
+    width = page.text(canvas, (x, y), field.name, CAPTION_POINTS, bold=True)
+    dot = f"dot {1000 * field.dot_mm:.0f} \u00b5m = {raster.dot} px"
+    page.text(canvas, (x + width + 1, y), dot, CAPTION_POINTS)
+    pitch = f"pitch {field.pitch_mm:.3f} mm = {raster.pitch} px"
+    page.text(canvas, (x, y - 0.75 * LINE_SPACING_MM), pitch, CAPTION_POINTS)
+
+
+def _instructions(canvas: Canvas, sheet: PrinterSheet) -> None:
+    """Write the instructions between the upper markers."""
+    x = sheet.mm(sheet.corners[0].points[1, 0]) + 6
+    y = sheet.mm(sheet.page[1] - sheet.corners[0].at[1]) - LINE_SPACING_MM
+    title = f"locatk test sheet, {sheet.paper}, {sheet.dpi} dpi, {sheet.codec}"
+    page.text(canvas, (x, y), title, 10.0, bold=True)
+    for line in (
+        "Print at 100 %, no scaling, best quality, black only; no toner or ink saving.",
+        "Scan the whole sheet in grey with 1200 dpi (600 at least), not sharpened, as PNG; then",
+        "locatk calibrate printer SCAN.png -o printer.toml",
+    ):
+        y -= LINE_SPACING_MM
+        page.text(canvas, (x, y), line, 8.0)

@@ -1,4 +1,4 @@
-"""The dots as pixels (PNG) and as letters (text), for printers and programs of one's own."""
+"""Dots as pixels (PNG) and as letters (text), for other printers and programs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from locatk.core.dots.codec import DOT_DIRECTIONS, SYMBOL_LETTERS, codec
 from locatk.core.dots.drawing.layout import Raster, SheetLayout, pixels
 from locatk.core.dots.sheet import MM_PER_INCH, Manifest
 
-BAND = 256
-"""Rows of dots that are made at once."""
+BAND_ROWS = 256
+"""Rows of dots that are computed at once."""
 
-MOST_PIXELS = 16_000_000
-"""Pixels that are made at once, a byte each."""
+MAX_BAND_PIXELS = 16_000_000
+"""Pixels that are computed at once, one byte each."""
 
 
 def _nothing() -> None:
@@ -26,21 +26,21 @@ def _nothing() -> None:
 
 
 def bands(manifest: Manifest) -> int:
-    """How many steps drawing all sheets of a manifest takes."""
-    return sum(-(-sheet.size[1] // BAND) for sheet in manifest.sheets)
+    """Return the number of bands of all sheets of a manifest."""
+    return sum(-(-sheet.size[1] // BAND_ROWS) for sheet in manifest.sheets)
 
 
 def symbols(
     manifest: Manifest, number: int, done: Callable[[], object] = _nothing
 ) -> Iterator[NDArray[np.uint8]]:
-    """The symbols of sheet ``number``, at most :data:`BAND` rows at a time.
+    """Yield the symbols of sheet ``number``, at most :data:`BAND_ROWS` rows at a time.
 
-    ``done`` is called when the caller is through with each.
+    ``done`` is called when the caller has processed a band.
     """
     sheet, table = manifest.sheets[number], codec(manifest.codec)
     (x, y), (columns, rows) = sheet.origin, sheet.size
-    for row in range(0, rows, BAND):
-        count = min(BAND, rows - row)
+    for row in range(0, rows, BAND_ROWS):
+        count = min(BAND_ROWS, rows - row)
         yield table.symbols((x, y + row), (columns, count), sheet.section)
         done()
 
@@ -61,13 +61,12 @@ def write_png(
 ) -> None:
     """Write the page of sheet ``number`` as a PNG of 1 bit a pixel, at the sheet's dpi.
 
-    Only dots are on it. Its size in metres is in it, so that programs which look place
-    it at true size.
+    It contains only dots, and its resolution, so that programs can import it at true size.
 
     Raises
     ------
     InputError
-        The manifest's dots do not lie on pixels.
+        The manifest's dots are not on pixels.
     """
     layout = pixels(manifest, number)
     width, height = layout.page
@@ -90,24 +89,24 @@ def _chunk(stream: IO[bytes], kind: bytes, data: bytes) -> None:
 
 
 def _rows(layout: SheetLayout, rows: Iterator[NDArray[np.uint8]]) -> Iterator[bytes]:
-    """The lines of a page from the top down, packed, each after its filter byte of 0."""
+    """Yield the lines of a page from the top down, packed, each after its filter byte of 0."""
     raster, (width, height) = layout.raster, layout.page
     left, top = (start - raster.offset for start in layout.first)
     cells = _cells(raster)
-    at = 0
-    step = max(1, MOST_PIXELS // (width * raster.pitch))
+    line = 0
+    step = max(1, MAX_BAND_PIXELS // (width * raster.pitch))
     yield from _packed(np.ones((top, width), np.uint8), step * raster.pitch)
-    at = top
+    line = top
     for band in rows:
         for start in range(0, len(band), step):
             part = band[start : start + step]
             ink = cells[part].transpose(0, 2, 1, 3).reshape(len(part) * raster.pitch, -1)
             lines = np.ones((len(ink), width), np.uint8)
             lines[:, left : left + ink.shape[1]] -= ink[:, : width - left]
-            # The last cell may be higher than what is left of the page.
-            yield from _packed(lines[: height - at], len(lines))
-            at = min(height, at + len(lines))
-    yield from _packed(np.ones((height - at, width), np.uint8), step * raster.pitch)
+            # The last cell may be higher than the rest of the page.
+            yield from _packed(lines[: height - line], len(lines))
+            line = min(height, line + len(lines))
+    yield from _packed(np.ones((height - line, width), np.uint8), step * raster.pitch)
 
 
 def _packed(lines: NDArray[np.uint8], step: int) -> Iterator[bytes]:
@@ -117,7 +116,7 @@ def _packed(lines: NDArray[np.uint8], step: int) -> Iterator[bytes]:
 
 
 def _cells(raster: Raster) -> NDArray[np.uint8]:
-    """(4, pitch, pitch) ink of each symbol, its place ``offset`` from the upper left."""
+    """Return the ink (4, pitch, pitch) of each symbol; its grid point is at ``offset``."""
     cells = np.zeros((4, raster.pitch, raster.pitch), np.uint8)
     for cell, (x, y) in zip(cells, DOT_DIRECTIONS.tolist(), strict=True):
         column, row = raster.offset * (1 + x), raster.offset * (1 + y)

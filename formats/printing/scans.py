@@ -1,4 +1,4 @@
-"""Scans and photos of printed sheets: grey values, and how many pixels an inch."""
+"""Scans and photos of printed sheets: grey values and resolution."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from locatk.formats.files import read_bytes
 
 @dataclass(frozen=True)
 class Scan:
-    """A picture of a sheet.
+    """Picture of a sheet.
 
     Attributes
     ----------
     image : (height, width) uint8 ndarray
         Grey values.
     dpi : (x, y) or None
-        What the file says; scanners write it, cameras write anything.
+        Resolution in the file; that of a camera is meaningless.
     """
 
     image: NDArray[np.uint8]
@@ -37,9 +37,9 @@ def read_scan(path: str | os.PathLike[str]) -> Scan:
     Raises
     ------
     MissingDataError
-        There is no such file.
+        The file does not exist.
     InputError
-        It is no picture, or a damaged one; see :func:`locatk.formats.images.decode`.
+        The file is not a picture, or is damaged; see :func:`locatk.formats.images.decode`.
     """
     data = read_bytes(path)
     try:
@@ -51,13 +51,13 @@ def read_scan(path: str | os.PathLike[str]) -> Scan:
 
 
 def _dpi(data: bytes) -> tuple[float, float] | None:
-    from PIL import Image
+    from PIL import Image  # slow to import
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = Image.open(io.BytesIO(data)).info.get("dpi", ())
+        resolution = Image.open(io.BytesIO(data)).info.get("dpi", ())
     try:
-        x, y = (float(value) for value in found)
+        x, y = (float(value) for value in resolution)
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return (x, y) if min(x, y) > 1 and max(x, y) < 1e5 else None

@@ -1,12 +1,16 @@
-"""The figures of the dots' codec and of printing: no camera takes part in them."""
+"""Figures of the dots without a camera: the codec, and printed sheets."""
 
 from __future__ import annotations
 
+import io
 import math
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core.dots.codec import (
     DOT_DIRECTIONS,
@@ -16,7 +20,7 @@ from locatk.core.dots.codec import (
     Codec,
     codec,
 )
-from locatk.core.dots.codec import lookup as exact
+from locatk.core.dots.codec.lookup import rotate_symbols
 from locatk.core.dots.drawing import layout
 from locatk.core.dots.identification.decoding import (
     MIN_CONFIDENCE,
@@ -25,236 +29,265 @@ from locatk.core.dots.identification.decoding import (
 )
 from locatk.core.dots.sheet import Manifest
 from locatk.core.paper_sizes import paper_size
-from locatk.formats.benchmarks import Figure
-from locatk.formats.benchmarks.timing import SEED, cpu_seconds, measured
+from locatk.formats.benchmarks.figures import Duration, Figure
+from locatk.formats.benchmarks.timing import FIRST_SEED, measure_single_threaded, time_call
+from locatk.formats.printing import pattern
 
-ORIGIN = (SECTION_LENGTH // 2, SECTION_LENGTH // 4)
-WINDOW = 8
-WINDOWS = 20_000
-SPOILT = 2000
-"""Windows with wrong bits, or of nothing but wrong bits, behind each rate."""
+SHEET_ORIGIN = (SECTION_LENGTH // 2, SECTION_LENGTH // 4)
+WINDOW_DOTS = 8
+DECODED_WINDOWS = 20_000
+FLIPPED_WINDOWS = 2000
+"""Windows with wrong bits, or of random bits, for each rate."""
 
 RASTER_WINDOWS = 1000
-"""Windows that are read from each paper's raster."""
+"""Windows decoded from the raster of each paper."""
 
-FIRMNESS = 4.0
-"""Log-likelihood ratio of a bit that was read off a symbol: 1.8 % of such bits are wrong."""
+SOFT_BIT_NATS = 4.0
+"""Log-likelihood ratio of each bit of a symbol; 1.8 % of bits with this ratio are wrong."""
 
 MICRODOTS = "py-microdots"
-FLIPS = {1: (0.44, 0.43), 2: (0.19, 0.55), 4: (0.027, 0.56)}
-"""Wrong bits of 128, and the peer's shares of right and of silently wrong answers."""
+MICRODOTS_PERCENT = {1: (44.0, 43.0), 2: (19.0, 55.0), 4: (2.7, 56.0)}
+"""Wrong bits of 128, and the correct and the silently wrong results of py-microdots in percent."""
 
-FAINT = 5
-"""Grey values by which pdfium rounds: white is 254 here and there."""
+GREY_ROUNDING = 5
+"""Grey values by which pdfium rounds: some white pixels have 254."""
 
-PRINTS = {"A4": (0.15, 70.0, 45.6, 12_500.0), "A0": (2.0, 1100.0, None, None)}
-"""Paper to seconds and kB that were promised, and those of reportlab with circles."""
+PRINT_TARGETS = {"A4": (0.15, 70.0), "A0": (2.0, 1100.0)}
+"""Paper to targets of seconds and kB."""
+
+REPORTLAB = "reportlab, a circle a dot"
+REPORTLAB_DOTS = 5000
+"""Circles that are timed; their duration and size are proportional to the number."""
 
 
-def page(paper: str) -> Manifest:
-    """A sheet as ``locatk print pattern`` makes it by default."""
+def default_sheet(paper: str) -> Manifest:
+    """Return a sheet with the defaults of ``locatk print pattern``."""
     raster = layout.snap(0.508, None, 300)
     _, size_mm = paper_size(paper)
-    placed = layout.lay_out(size_mm, 5.0, raster)
-    return layout.manifest(raster, placed.sheets(paper, ORIGIN), "anoto")
+    page = layout.lay_out(size_mm, 5.0, raster)
+    return layout.manifest(raster, page.sheets(paper, SHEET_ORIGIN), "anoto")
 
 
 # ---- codec
 
 
 def codec_figures() -> list[Figure]:
-    """Encoding, decoding, and what wrong bits do."""
-    table, size = codec("anoto"), page("A0").sheets[0].size
-    seconds = cpu_seconds(lambda: table.symbols(ORIGIN, size))
-    rng = np.random.default_rng(SEED)
-    truth, symbols = random_windows(table, WINDOWS, rng)
-    right = is_right(identify_windows(*soft(symbols), table), truth)
+    """Encode a sheet, and decode windows with and without wrong bits."""
+    table, size = codec("anoto"), default_sheet("A0").sheets[0].size
+    rng = np.random.default_rng(FIRST_SEED)
+    truth, symbols = random_windows(table, DECODED_WINDOWS, rng)
+    correct = is_correct(identify_windows(*soft_bits(symbols), table), truth)
     rows = [
-        Figure("A0 encoded", seconds, "s",
-               f"{size[0]} x {size[1]} dots in the middle of the plane, best of 5", 0.2,
-               peer=f"{MICRODOTS}, at its origin 0", peer_value=0.306),
-        _decoding(),
-        Figure("8x8 windows: right", 100 * float(right.mean()), "%",
-               f"{WINDOWS} windows without a wrong bit; any place, section and turn",
+        Figure("A0 encoded", None, "s",
+               f"{size[0]} x {size[1]} dots in the middle of the plane, processor time, best of 5",
+               0.2, peer=f"{MICRODOTS}, at its origin 0", peer_value=0.306, workload="numpy"
+               ).timed(time_call(lambda: table.symbols(SHEET_ORIGIN, size))),
+        measure_single_threaded(
+            Figure("8x8 window decoded", None, "us",
+                   f"identify_windows() of {DECODED_WINDOWS} windows, any position, section and "
+                   "rotation, processor time of one thread", 5.0,
+                   peer=f"{MICRODOTS}, 6x6 of it, no turn", peer_value=150.0, workload="numpy"),
+            f"dots.printing.time_decoding({DECODED_WINDOWS})", 1e6 / DECODED_WINDOWS),
+        Figure("8x8 windows: right", 100 * float(correct.mean()), "%",
+               f"{DECODED_WINDOWS} windows without a wrong bit; any position, section and rotation",
                100.0, "higher", f"{MICRODOTS}, libdots' digits", 96.1),
     ]  # fmt: skip
-    truth, symbols = truth[:SPOILT], symbols[:SPOILT]
-    for count, (peer_right, peer_wrong) in FLIPS.items():
-        order = rng.random((SPOILT, 2 * WINDOW * WINDOW)).argsort(axis=1)
-        rows += _spoilt(
-            f"8x8 windows, {count} wrong bit{'s' * (count > 1)}", truth, symbols, order < count,
-            (100 * peer_right, 100 * peer_wrong),
-        )  # fmt: skip
-    lot = rng.random((SPOILT, 2 * WINDOW * WINDOW)) < 1 / (1 + math.exp(FIRMNESS))
-    rows += _spoilt("8x8 windows, 1.8 % of bits wrong", truth, symbols, lot)
-    for side in (WINDOW, 16):
-        lots = rng.integers(0, 4, (SPOILT, side, side)).astype(np.uint8)
-        accepted = identify_windows(*soft(lots), table).confidence >= MIN_CONFIDENCE
+    truth, symbols = truth[:FLIPPED_WINDOWS], symbols[:FLIPPED_WINDOWS]
+    bits = 2 * WINDOW_DOTS * WINDOW_DOTS
+    for count, peer_percent in MICRODOTS_PERCENT.items():
+        order = rng.random((FLIPPED_WINDOWS, bits)).argsort(axis=1)
+        name = f"8x8 windows, {count} wrong bit{'s' * (count > 1)}"
+        rows += _flipped_rows(name, truth, symbols, order < count, peer_percent)
+    flips = rng.random((FLIPPED_WINDOWS, bits)) < 1 / (1 + math.exp(SOFT_BIT_NATS))
+    rows += _flipped_rows("8x8 windows, 1.8 % of bits wrong", truth, symbols, flips)
+    for side in (WINDOW_DOTS, 16):
+        random = rng.integers(0, 4, (FLIPPED_WINDOWS, side, side)).astype(np.uint8)
+        accepted = identify_windows(*soft_bits(random), table).confidence >= MIN_CONFIDENCE
         rows.append(
             Figure(f"random bits, {side}x{side}: accepted", 100 * float(accepted.mean()), "%",
-                   f"{SPOILT} windows of symbols drawn by lot", 0.1,
+                   f"{FLIPPED_WINDOWS} windows of random symbols", 0.1,
                    peer=f"{MICRODOTS}, 6x6", peer_value=18.0)
         )  # fmt: skip
     return rows
 
 
-def decoding(windows: int) -> tuple[float]:
-    """Seconds for a window."""
+def time_decoding(windows: int) -> Duration:
+    """Time the identification of windows in one call."""
     table = codec("anoto")
-    _, symbols = random_windows(table, windows, np.random.default_rng(SEED))
-    bits = soft(symbols)
-    return (cpu_seconds(lambda: identify_windows(*bits, table)) / windows,)
+    _, symbols = random_windows(table, windows, np.random.default_rng(FIRST_SEED))
+    bits = soft_bits(symbols)
+    return time_call(lambda: identify_windows(*bits, table))
 
 
-def _decoding() -> Figure:
-    return measured(
-        "8x8 window decoded", "us", f"dots.printing.decoding({WINDOWS})", 1e6,
-        f"identify_windows() of {WINDOWS} windows, any place, section and turn, one thread",
-        5.0, "lower", f"{MICRODOTS}, 6x6 of it, no turn", 150.0,
-    )  # fmt: skip
-
-
-def _spoilt(
+def _flipped_rows(
     name: str,
     truth: NDArray[np.int64],
     symbols: NDArray[np.uint8],
-    wrong: NDArray[np.bool_],
-    peers: tuple[float | None, float | None] = (None, None),
+    flipped: NDArray[np.bool_],
+    peer_percent: tuple[float | None, float | None] = (None, None),
 ) -> list[Figure]:
-    """Windows of which the bits in ``wrong`` (n, 128) are turned over, all equally sure."""
-    signs = np.where(wrong, -1, 1).astype(np.float32).reshape(-1, 2, WINDOW, WINDOW)
-    column, row = soft(symbols)
-    answer = identify_windows(column * signs[:, 0], row * signs[:, 1], codec("anoto"))
-    right, accepted = is_right(answer, truth), answer.confidence >= MIN_CONFIDENCE
-    good, bad = int((right & accepted).sum()), int((~right & accepted).sum())
-    peer = None if peers[0] is None else MICRODOTS
+    """Decode windows with inverted bits (mask (n, 128)), all of equal likelihood ratio."""
+    signs = np.where(flipped, -1, 1).astype(np.float32).reshape(-1, 2, WINDOW_DOTS, WINDOW_DOTS)
+    column, row = soft_bits(symbols)
+    decoded = identify_windows(column * signs[:, 0], row * signs[:, 1], codec("anoto"))
+    accepted = decoded.confidence >= MIN_CONFIDENCE
+    correct = is_correct(decoded, truth)
+    n_correct, n_wrong = int((correct & accepted).sum()), int((~correct & accepted).sum())
+    n_accepted = n_correct + n_wrong
+    peer = None if peer_percent[0] is None else MICRODOTS
     return [
-        Figure(f"{name}: right", 100 * good / len(truth), "%",
-               f"and accepted, of {len(truth)}; no bit looks worse than the others",
-               None, "higher", peer, peers[0]),
-        Figure(f"{name}: wrong among accepted", 100 * bad / max(good + bad, 1), "%",
-               f"{bad} of {good + bad}", 0.1, "lower",
-               peer and f"{peer}, of all", peers[1]),
+        Figure(f"{name}: right", 100 * n_correct / len(truth), "%",
+               f"and accepted, of {len(truth)}; all bits have the same likelihood ratio",
+               None, "higher", peer, peer_percent[0]),
+        Figure(f"{name}: wrong among accepted", 100 * n_wrong / max(n_accepted, 1), "%",
+               f"{n_wrong} of {n_accepted}", 0.1, "lower",
+               peer and f"{peer}, of all", peer_percent[1]),
     ]  # fmt: skip
 
 
 def random_windows(
     table: Codec, n: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Truth (n, 3): x, y and quarter turns; and symbols (n, 8, 8) as they are seen."""
-    along = np.arange(WINDOW)
-    x, y = rng.integers(0, SECTION_LENGTH - WINDOW, (2, n))
+    """Return random windows of the pattern.
+
+    Returns
+    -------
+    truth : (n, 3) ndarray
+        x, y and quarter turns.
+    symbols : (n, 8, 8) ndarray
+        Symbols in the frame of the camera.
+    """
+    offset = np.arange(WINDOW_DOTS)
+    x, y = rng.integers(0, SECTION_LENGTH - WINDOW_DOTS, (2, n))
     u, v = rng.integers(0, MAIN_SEQUENCE_LENGTH, (2, n))
-    turns = rng.integers(0, 4, n)
-    columns = table.phases(x[:, None] + along) + u[:, None]
-    rows = table.phases(y[:, None] + along) + v[:, None]
-    down, right = (y[:, None] + along)[:, :, None], (x[:, None] + along)[:, None, :]
+    rotation = rng.integers(0, 4, n)
+    columns = table.phases(x[:, None] + offset) + u[:, None]
+    rows = table.phases(y[:, None] + offset) + v[:, None]
+    down, right = (y[:, None] + offset)[:, :, None], (x[:, None] + offset)[:, None, :]
     printed = MAIN_SEQUENCE[(columns[:, None, :] + down) % MAIN_SEQUENCE_LENGTH]
     printed = printed + 2 * MAIN_SEQUENCE[(rows[:, :, None] + right) % MAIN_SEQUENCE_LENGTH]
-    seen = np.empty_like(printed)
+    symbols = np.empty_like(printed)
     for quarter in range(4):
-        seen[turns == quarter] = exact.rotate_symbols(printed[turns == quarter], quarter)
-    return np.stack([x, y, turns], axis=1), seen
+        symbols[rotation == quarter] = rotate_symbols(printed[rotation == quarter], quarter)
+    return np.stack([x, y, rotation], axis=1), symbols
 
 
-def soft(symbols: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Column and row bits of symbols, all equally sure."""
+def soft_bits(symbols: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the column and row bits of symbols as log-likelihood ratios of equal magnitude."""
     column, row = (
-        np.where(bits > 0, FIRMNESS, -FIRMNESS).astype(np.float32)
+        np.where(bits > 0, SOFT_BIT_NATS, -SOFT_BIT_NATS).astype(np.float32)
         for bits in (symbols & 1, symbols >> 1)
     )
     return column, row
 
 
-def is_right(answer: DecodedWindows, truth: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which answers have the place and the turn of ``truth`` (n, 3)."""
-    found = np.stack([answer.x, answer.y, answer.rotation], axis=1)
-    return (found == truth).all(axis=1)
+def is_correct(decoded: DecodedWindows, truth: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return a mask of the windows with the position and rotation of ``truth`` (n, 3)."""
+    estimate = np.stack([decoded.x, decoded.y, decoded.rotation], axis=1)
+    return (estimate == truth).all(axis=1)
 
 
 # ---- print
 
 
 def print_figures() -> list[Figure]:
-    """Time, size and memory of PDFs, and whether their raster can be read."""
-    from locatk.formats.printing import pattern
-
+    """Measure duration, size and memory of PDFs, and decode their raster."""
     rows: list[Figure] = []
-    for paper, (seconds_target, size_target, peer_s, peer_kb) in PRINTS.items():
-        sheet = page(paper)
-        pdf = pattern.render(sheet)
-        seconds = cpu_seconds(lambda sheet=sheet: pattern.render(sheet), 3)  # type: ignore[misc]
-        columns, count = sheet.sheets[0].size
-        peer = "reportlab, a circle a dot" if peer_s else None
+    circle_s, circle_kb = measure_reportlab(REPORTLAB_DOTS)
+    for paper, (target_s, target_kb) in PRINT_TARGETS.items():
+        manifest = default_sheet(paper)
+        pdf = pattern.render(manifest)
+        dots = math.prod(manifest.sheets[0].size)
+        peer_how = f"; the peer in the same run, from {REPORTLAB_DOTS:,} dots"
         rows += [
-            Figure(f"{paper} printed", seconds, "s", f"PDF of {columns * count:,} dots, best of 3",
-                   seconds_target, peer=peer, peer_value=peer_s),
-            Figure(f"{paper} printed: size", len(pdf) / 1e3, "kB", "the same PDF", size_target,
-                   peer=peer, peer_value=peer_kb),
-            *_raster(paper, sheet, pdf),
+            Figure(f"{paper} printed", None, "s",
+                   f"PDF of {dots:,} dots, processor time, best of 3{peer_how}", target_s,
+                   peer=REPORTLAB, peer_value=circle_s * dots, workload="numpy"
+                   ).timed(time_call(partial(pattern.render, manifest), 3)),
+            Figure(f"{paper} printed: size", len(pdf) / 1e3, "kB", f"the same PDF{peer_how}",
+                   target_kb, peer=REPORTLAB, peer_value=circle_kb * dots),
+            *raster_figures(paper, manifest, pdf),
         ]  # fmt: skip
-    how = "most of a process of its own; {0:.0f} MB of it before it prints"
-    rows.append(measured("A0 printed: memory", "MB", "dots.printing.memory()", 1.0, how, 300.0))
-    return rows
+    how = "largest of a process of its own; {0:.0f} MB of it before printing"
+    memory = Figure("A0 printed: memory", None, "MB", how, 300.0)
+    return [*rows, measure_single_threaded(memory, "dots.printing.measure_memory()")]
 
 
-def memory() -> tuple[float, float]:
-    """Most memory in MB that this process had before and after it printed A0."""
-    from locatk.formats.printing import pattern
+def measure_reportlab(dots: int) -> tuple[float, float]:
+    """Return the duration [s] and the size [kB] of a dot that reportlab draws as a circle."""
 
-    manifest = page("A0")
-    before = _most_memory_mb()
+    def render() -> bytes:
+        stream = io.BytesIO()
+        canvas = Canvas(stream, pageCompression=1)
+        for k in range(dots):
+            canvas.circle(1.44 * (k % 400), 1.44 * (k // 400), 0.12, stroke=0, fill=1)
+        canvas.save()
+        return stream.getvalue()
+
+    return time_call(render, 3).seconds / dots, len(render()) / 1e3 / dots
+
+
+def measure_memory() -> tuple[float, float]:
+    """Return the largest memory [MB] of this process before and after printing A0."""
+    manifest = default_sheet("A0")
+    before_mb = _peak_memory_mb()
     pattern.render(manifest)
-    return before, _most_memory_mb()
+    return before_mb, _peak_memory_mb()
 
 
-def _most_memory_mb() -> float:
-    # Not getrusage: what it tells of a child begins with the memory of its parent.
+def _peak_memory_mb() -> float:
+    # The value of getrusage includes the memory of the parent before the program was started.
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM:"):
             return int(line.split()[1]) * 1024 / 1e6
     raise OSError("no VmHWM in /proc/self/status")
 
 
-def _raster(paper: str, sheet: Manifest, pdf: bytes) -> list[Figure]:
-    """Rasterised at 300 dpi by an independent renderer: its dots, then windows of them."""
-    names = (f"{paper} at 300 dpi: dots of one black pixel", f"{paper} at 300 dpi: windows right")
+def raster_figures(paper: str, manifest: Manifest, pdf: bytes) -> list[Figure]:
+    """Rasterize a PDF at 300 dpi by an independent renderer, check its dots and decode windows."""
+    declared = (
+        Figure(f"{paper} at 300 dpi: dots of one black pixel", None, "%",
+               "pdfium's raster: one black pixel in each square of a pitch, at the position of "
+               "its symbol, and no other ink", 100.0, "higher"),
+        Figure(f"{paper} at 300 dpi: windows right", None, "%",
+               f"{RASTER_WINDOWS} random 8x8 windows of that raster, correct and accepted",
+               100.0, "higher"),
+    )  # fmt: skip
     try:
-        import pypdfium2
+        import pypdfium2  # optional: part of locatk[test]
     except ImportError:
-        how = "not measured: pypdfium2 is not installed (it comes with locatk[test])"
-        return [Figure(name, None, "%", how, 100.0, "higher") for name in names]
+        reason = "pypdfium2 is not installed (it comes with locatk[test])"
+        return [figure.missing(reason) for figure in declared]
     rendered = pypdfium2.PdfDocument(pdf)[0].render(scale=300 / 72, grayscale=True).to_numpy()
     grey = rendered.reshape(rendered.shape[:2])
-    black, touched = grey <= int(grey.min()) + FAINT, grey < 255 - FAINT
-    placed = layout.pixels(sheet, 0)
-    (columns, rows), pitch, (x, y) = placed.size, placed.raster.pitch, placed.first
-    seen = np.stack(
+    is_black, has_ink = grey <= int(grey.min()) + GREY_ROUNDING, grey < 255 - GREY_ROUNDING
+    page = layout.pixels(manifest, 0)
+    (columns, rows), pitch, (x, y) = page.size, page.raster.pitch, page.first
+    candidates = np.stack(
         [
-            black[y + dy :: pitch, x + dx :: pitch][:rows, :columns]
-            for dx, dy in (placed.raster.offset * DOT_DIRECTIONS.astype(int)).tolist()
+            is_black[y + dy :: pitch, x + dx :: pitch][:rows, :columns]
+            for dx, dy in (page.raster.offset * DOT_DIRECTIONS.astype(int)).tolist()
         ]
     )
-    # A dot is alone in the square of one pitch about its place.
+    # Each square of one pitch around a grid point contains no other ink than its dot.
     top, left = y - pitch // 2, x - pitch // 2
-    around = touched[top : top + rows * pitch, left : left + columns * pitch]
-    inked = around.reshape(rows, pitch, columns, pitch).sum(axis=(1, 3))
-    symbols = codec(sheet.codec).symbols(sheet.sheets[0].origin, (columns, rows))
-    where_it_should = np.take_along_axis(seen, symbols[None].astype(np.intp), axis=0)[0]
-    share = float((where_it_should & (inked == 1)).mean())
+    squares = has_ink[top : top + rows * pitch, left : left + columns * pitch]
+    ink_pixels = squares.reshape(rows, pitch, columns, pitch).sum(axis=(1, 3))
+    sheet = manifest.sheets[0]
+    symbols = codec(manifest.codec).symbols(sheet.origin, (columns, rows))
+    has_dot = np.take_along_axis(candidates, symbols[None].astype(np.intp), axis=0)[0]
+    dots_percent = 100 * float((has_dot & (ink_pixels == 1)).mean())
 
-    read = seen.argmax(axis=0).astype(np.uint8)
-    rng = np.random.default_rng(SEED + 1)
-    at = rng.integers(0, (columns - WINDOW + 1, rows - WINDOW + 1), (RASTER_WINDOWS, 2))
-    cut = np.stack([read[down:, right:][:WINDOW, :WINDOW] for right, down in at])
-    answer = identify_windows(*soft(cut), codec(sheet.codec))
-    truth = np.c_[at + sheet.sheets[0].origin, np.zeros(len(at), np.int64)]
-    right = is_right(answer, truth) & (answer.confidence >= MIN_CONFIDENCE)
+    read = candidates.argmax(axis=0).astype(np.uint8)
+    rng = np.random.default_rng(FIRST_SEED + 1)
+    corners = rng.integers(
+        0, (columns - WINDOW_DOTS + 1, rows - WINDOW_DOTS + 1), (RASTER_WINDOWS, 2)
+    )
+    windows = np.stack([read[y:, x:][:WINDOW_DOTS, :WINDOW_DOTS] for x, y in corners])
+    decoded = identify_windows(*soft_bits(windows), codec(manifest.codec))
+    truth = np.c_[corners + sheet.origin, np.zeros(len(corners), np.int64)]
+    correct = is_correct(decoded, truth) & (decoded.confidence >= MIN_CONFIDENCE)
     return [
-        Figure(names[0], 100 * share, "%",
-               "pdfium's raster: one black pixel in each square of a pitch, where its symbol "
-               "puts it, and no other ink", 100.0, "higher"),
-        Figure(names[1], 100 * float(right.mean()), "%",
-               f"{RASTER_WINDOWS} random 8x8 windows of that raster, right and accepted",
-               100.0, "higher"),
-    ]  # fmt: skip
+        replace(declared[0], value=dots_percent),
+        replace(declared[1], value=100 * float(correct.mean())),
+    ]

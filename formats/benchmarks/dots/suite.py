@@ -1,16 +1,17 @@
-"""The figures of the dots: frames that were rendered, read one by one, and the real one.
+"""Figures of the dots: rendered frames, each localized on its own, and the published frame.
 
-Frames are like those on which cellulo-localization was measured: 188 x 120 px of 0.046 mm over a
-grid of 0.508 mm, anywhere on a sheet and at any rotation, blurred by 0.6 px, with noise of 2 grey
-values, dots of 0.30 pitches and an ideal lens where a row does not say otherwise. Each is read
-cold, for itself. A place is right within half a pitch and five degrees.
+Unless a row states otherwise, frames are like those on which cellulo-localization was measured:
+188 x 120 px of 0.046 mm over a grid of 0.508 mm, anywhere on a sheet and at any rotation, with a
+blur of 0.6 px, noise of 2 grey values, dots of 0.30 pitches and an ideal lens. No frame uses the
+result of another ("cold"). A position is correct within half a pitch and five degrees.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
+from locatk.core.dots.drawing import layout
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.localization.frames import (
     LocalizedFrames,
@@ -28,38 +30,82 @@ from locatk.core.dots.localization.frames import (
 from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation import session as simulate
 from locatk.core.dots.simulation.decoys import KINDS, decoys
-from locatk.core.dots.solver import SolveOptions, solve
-from locatk.core.errors import LocatkError
+from locatk.core.dots.simulation.paths import CameraPath
+from locatk.core.dots.solver import METHODS, SolveOptions, solve
 from locatk.core.geometry import heading_from_quaternion
-from locatk.formats.benchmarks import Figure
-from locatk.formats.benchmarks.dots.printing import codec_figures, page, print_figures
-from locatk.formats.benchmarks.dots.published_study import study_figures
-from locatk.formats.benchmarks.timing import SEED, cpu_seconds, measured
+from locatk.core.paper_sizes import paper_size
+from locatk.formats import images as image_files
+from locatk.formats.benchmarks.dots.printing import codec_figures, default_sheet, print_figures
+from locatk.formats.benchmarks.figures import Duration, Figure, measure_or_explain
+from locatk.formats.benchmarks.timing import (
+    FIRST_SEED,
+    measure_single_threaded,
+    time_call,
+    time_each,
+)
 
 Array = NDArray[np.float64]
 
-FRAMES = 1000
-"""Of each condition, and behind each measure of speed."""
+CONDITION_FRAMES = 1000
+"""Frames of each condition, and of each measurement of speed."""
 
-DECOYS = 500
-"""Of each kind of frames without the pattern."""
+DECOY_FRAMES = 500
+"""Frames of each kind without the pattern."""
 
-PAPER_FRAMES = 200
-"""The same for the published method, which reads frame by frame."""
+PAPER_METHOD_FRAMES = 200
+"""Frames of each condition for the published method, which decodes frame by frame."""
 
 CELLULO = "cellulo-localization"
-LENS = simulate.camera()
-FLAT = simulate.camera(0.0)
+PAPER_LENS = simulate.camera()
+IDEAL_LENS = simulate.camera(0.0)
 
-REAL_CENTRE = (129.168, 3224.506)
-REAL_HEADING_DEG = 1.603
+MAX_ERROR_PITCHES, MAX_ERROR_DEG = 0.5, 5.0
+"""Largest errors of a correct position."""
+
+FRAME_BMP_CENTRE = (129.168, 3224.506)
+FRAME_BMP_HEADING_DEG = 1.603
 """Centre [pitches] and heading of frame.bmp, the image a.bmp of cellulo-localization, decoded by a
 prototype and confirmed by the decoder of that repository."""
+
+STUDY_SAMPLES = 20
+"""Frames at each position and angle of the study."""
+
+STUDY_GRID, STUDY_ANGLES = 11, 36
+STUDY_SPAN_M = 0.2
+
+STUDY_JITTER_M = 10e-6
+"""Standard deviation of the position of a simulated printed dot."""
+
+STUDY_MAX_ERROR_MM, STUDY_MAX_ERROR_DEG = 0.254, 5.0
+"""Largest errors that are averaged (half a pitch); frames beyond are counted as wrong, as in the
+paper's Fig. 13."""
+
+PAPER_RIGHT_PERCENT = 99.17
+"""Frames of which the paper decoded x (section IV-A): 120 of 121 positions."""
+
+TABLE_III = {"x": ("mm", 0.155, 0.010), "y": ("mm", 0.273, 0.014), "heading": ("deg", 1.581, 0.407)}
+"""Unit, worst error and precision as published."""
+
+STUDY_PEER = "paper, Table III"
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What frames are rendered with, and what is promised and known of them, in percent."""
+    """Options of rendered frames, with targets and values of a peer.
+
+    Attributes
+    ----------
+    name : str
+    options : dict
+        Options of the simulator.
+    target, peer_value : float or None
+        Correct frames in percent.
+    peer : str
+    rms_target, rms_peer_value : float or None
+        RMS error in pitches.
+    camera : Camera or None
+        Calibration that the solver knows.
+    """
 
     name: str
     options: dict[str, Any] = field(default_factory=dict)
@@ -67,18 +113,17 @@ class Condition:
     peer_value: float | None = None
     peer: str = f"{CELLULO}, warm"
     rms_target: float | None = None
-    rms_peer: float | None = None
+    rms_peer_value: float | None = None
     camera: Camera | None = None
-    """What the reader knows of the camera."""
 
 
-COLD = f"{CELLULO}, cold: 74-78"
-TEN_DEGREES = {"tilt_rad": math.radians(10)}
+CELLULO_COLD = f"{CELLULO}, cold: 74-78"
+TILT_TO_10_DEG = {"tilt_rad": math.radians(10)}
 
 CONDITIONS = (
-    Condition("dots 0.25", {"dot": 0.25}, 100.0, 78.0, COLD, 0.003, 0.050),
-    Condition("dots 0.30", {}, 100.0, 78.0, COLD, 0.003, 0.050),
-    Condition("dots 0.35", {"dot": 0.35}, 100.0, 78.0, COLD, 0.003, 0.050),
+    Condition("dots 0.25", {"dot": 0.25}, 100.0, 78.0, CELLULO_COLD, 0.003, 0.050),
+    Condition("dots 0.30", {}, 100.0, 78.0, CELLULO_COLD, 0.003, 0.050),
+    Condition("dots 0.35", {"dot": 0.35}, 100.0, 78.0, CELLULO_COLD, 0.003, 0.050),
     Condition("dots 1/6", {"dot": 1 / 6}, 99.0, 0.7),
     Condition("2 % missing", {"missing": 0.02}, 99.5, 83.0),
     Condition("5 % missing", {"missing": 0.05}, 99.0, 62.0),
@@ -86,12 +131,19 @@ CONDITIONS = (
     Condition("blur 2.2 px", {"blur_px": 2.2}, 99.0, 92.5),
     Condition("vignette 0.4", {"vignette": 0.4}, 100.0, 100.0),
     Condition("noise 16", {"noise": 16.0}, 100.0, 100.0),
-    Condition("tilt to 10 deg", TEN_DEGREES, 99.0),
-    Condition("paper's lens", {"camera": LENS}, 99.0, camera=LENS),
-    Condition("paper's lens, not calibrated", {"camera": LENS}, 99.0),
-    Condition("paper's lens, tilt to 10 deg", {"camera": LENS, **TEN_DEGREES}, 99.0, camera=LENS),
+    Condition("tilt to 10 deg", TILT_TO_10_DEG, 99.0),
+    Condition("paper's lens", {"camera": PAPER_LENS}, 99.0, camera=PAPER_LENS),
+    Condition("paper's lens, not calibrated", {"camera": PAPER_LENS}, 99.0),
     Condition(
-        "paper's lens, tilt to 10 deg, not calibrated", {"camera": LENS, **TEN_DEGREES}, 99.0
+        "paper's lens, tilt to 10 deg",
+        {"camera": PAPER_LENS, **TILT_TO_10_DEG},
+        99.0,
+        camera=PAPER_LENS,
+    ),
+    Condition(
+        "paper's lens, tilt to 10 deg, not calibrated",
+        {"camera": PAPER_LENS, **TILT_TO_10_DEG},
+        99.0,
     ),
     Condition("motion blur 2 px", {"motion_px": 2.0}),
     Condition("5 % dust", {"dust": 0.05}),
@@ -100,7 +152,7 @@ CONDITIONS = (
 
 
 def figures(data: Path) -> list[Figure]:
-    """All figures of dots; ``data`` is the folder of published recordings."""
+    """Return all figures of dots; ``data`` is the folder of published recordings."""
     return [
         *codec_figures(),
         *print_figures(),
@@ -108,7 +160,7 @@ def figures(data: Path) -> list[Figure]:
         *decoy_figures(),
         *paper_method_figures(),
         *speed_figures(),
-        *real_figures(data / "dots" / "frame.bmp"),
+        *published_frame_figures(data / "dots" / "frame.bmp"),
         *study_figures(),
     ]
 
@@ -117,31 +169,41 @@ def figures(data: Path) -> list[Figure]:
 
 
 @dataclass(frozen=True)
-class Score:
-    """How frames were read: counts, and errors in pitches of those that are right."""
+class FrameScore:
+    """Numbers of frames by result, and the RMS error of the correct ones in pitches."""
 
     frames: int
-    right: int
+    correct: int
     wrong: int
     rms: float
 
     @property
-    def wrong_share(self) -> float:
-        """Percent of the accepted."""
-        return 100 * self.wrong / max(self.right + self.wrong, 1)
+    def accepted(self) -> int:
+        """Frames with a pose."""
+        return self.correct + self.wrong
+
+    @property
+    def correct_percent(self) -> float:
+        """Correct frames in percent of all."""
+        return 100 * self.correct / self.frames
+
+    @property
+    def wrong_percent(self) -> float:
+        """Wrong frames in percent of the accepted ones."""
+        return 100 * self.wrong / max(self.accepted, 1)
 
 
 def render(
     condition: Condition, n: int, seed: int, manifest: Manifest
 ) -> tuple[NDArray[np.uint8], Array, Array]:
-    """Frames (n, h, w), and true grid coordinates (n, 2) and headings (n,)."""
+    """Render frames (n, h, w); return them with true grid coordinates (n, 2) and headings (n,)."""
     options = simulate.SimulationOptions(
-        frames=n, path="random", seed=seed, **{"camera": FLAT, **condition.options}
+        frames=n, path="random", seed=seed, **{"camera": IDEAL_LENS, **condition.options}
     )
     simulated = simulate.simulate(manifest, options)
     start = manifest.to_metres(0, manifest.sheets[0].origin)
-    away = simulated.truth.position[:, :2] - start
-    grid = away @ np.linalg.inv(manifest.jacobian(0)).T + manifest.sheets[0].origin
+    offset = simulated.truth.position[:, :2] - start
+    grid = offset @ np.linalg.inv(manifest.jacobian(0)).T + manifest.sheets[0].origin
     return (
         np.array(list(simulated.frames.images)),
         grid,
@@ -149,72 +211,71 @@ def render(
     )
 
 
-def score(located: LocalizedFrames, grid: Array, heading: Array) -> Score:
-    """Compare with the truth."""
+def score_frames(located: LocalizedFrames, grid: Array, heading: Array) -> FrameScore:
+    """Compare localized frames with true grid coordinates (n, 2) and headings (n,)."""
     accepted = located.accepted
-    away = located.grid - grid
-    turned = np.angle(np.exp(1j * (located.heading - heading)))
-    near = (np.abs(away).max(axis=1) < 0.5) & (np.abs(turned) < math.radians(5))
-    right = accepted & near
-    rms = np.sqrt(np.mean(away[right] ** 2, axis=0)).max() if right.any() else math.nan
-    return Score(len(grid), int(right.sum()), int((accepted & ~near).sum()), float(rms))
+    errors = located.grid - grid
+    heading_errors = np.angle(np.exp(1j * (located.heading - heading)))
+    is_correct = np.abs(errors).max(axis=1) < MAX_ERROR_PITCHES
+    is_correct &= np.abs(heading_errors) < math.radians(MAX_ERROR_DEG)
+    correct = accepted & is_correct
+    rms = np.sqrt(np.mean(errors[correct] ** 2, axis=0)).max() if correct.any() else math.nan
+    return FrameScore(
+        len(grid), int(correct.sum()), int((accepted & ~is_correct).sum()), float(rms)
+    )
 
 
 def condition_figures() -> list[Figure]:
-    """A share that is right, an error and a share that is wrong for each condition."""
-    manifest = page("A0")
+    """Score rendered frames under each condition."""
+    manifest = default_sheet("A0")
     rows: list[Figure] = []
-    right = wrong = 0
+    accepted = wrong = 0
     for number, condition in enumerate(CONDITIONS):
-        images, grid, heading = render(condition, FRAMES, SEED + 100 + number, manifest)
-        found = score(
-            localize_frames(images, codec(manifest.codec), condition.camera), grid, heading
+        images, grid, heading = render(
+            condition, CONDITION_FRAMES, FIRST_SEED + 100 + number, manifest
         )
-        rows += _rows(condition, found)
-        right, wrong = right + found.right, wrong + found.wrong
-    share = 100 * wrong / max(right + wrong, 1)
-    rows.append(
-        Figure(
-            "all conditions: wrong among accepted", share, "%", f"{wrong} of {right + wrong}", 0.1
-        )
-    )
-    return rows
+        located = localize_frames(images, codec(manifest.codec), condition.camera)
+        score = score_frames(located, grid, heading)
+        rows += _condition_rows(condition, score)
+        accepted, wrong = accepted + score.accepted, wrong + score.wrong
+    percent = 100 * wrong / max(accepted, 1)
+    how = f"{wrong} of {accepted}"
+    return [*rows, Figure("all conditions: wrong among accepted", percent, "%", how, 0.1)]
 
 
-def _rows(condition: Condition, found: Score) -> Iterator[Figure]:
-    known = condition.peer_value is not None
-    peer = condition.peer if known else None
+def _condition_rows(condition: Condition, score: FrameScore) -> Iterator[Figure]:
+    has_peer = condition.peer_value is not None
+    peer = condition.peer if has_peer else None
     yield Figure(
-        f"{condition.name}: right", 100 * found.right / found.frames, "%",
-        f"of {found.frames} frames, each cold", condition.target, "higher",
+        f"{condition.name}: right", score.correct_percent, "%",
+        f"of {score.frames} frames, each cold", condition.target, "higher",
         peer, condition.peer_value,
     )  # fmt: skip
     yield Figure(
-        f"{condition.name}: rms", found.rms, "pitch",
-        "the larger of x and y, of the right ones", condition.rms_target, "lower",
-        f"{CELLULO}; 0.008 with its centre corrected" if condition.rms_peer else None,
-        condition.rms_peer,
+        f"{condition.name}: rms", score.rms, "pitch",
+        "the larger of x and y, of the correct ones", condition.rms_target, "lower",
+        f"{CELLULO}; 0.008 with its centre corrected" if condition.rms_peer_value else None,
+        condition.rms_peer_value,
     )  # fmt: skip
     yield Figure(
-        f"{condition.name}: wrong among accepted", found.wrong_share, "%",
-        f"{found.wrong} of {found.right + found.wrong}", 0.1, "lower",
-        peer and "the same, says nothing", 100 - condition.peer_value if known else None,  # type: ignore[operator]
+        f"{condition.name}: wrong among accepted", score.wrong_percent, "%",
+        f"{score.wrong} of {score.accepted}", 0.1, "lower",
+        peer and "the same, says nothing", 100 - condition.peer_value if has_peer else None,  # type: ignore[operator]
     )  # fmt: skip
 
 
 def decoy_figures() -> list[Figure]:
-    """Frames of something else that are taken for the pattern, by kind."""
+    """Count the frames without the pattern that are accepted, by kind."""
     rows, total = [], 0
     for kind in KINDS:
-        accepted = int(
-            localize_frames(decoys(kind, DECOYS, SEED + 200), codec("anoto")).accepted.sum()
-        )
+        images = decoys(kind, DECOY_FRAMES, FIRST_SEED + 200)
+        accepted = int(localize_frames(images, codec("anoto")).accepted.sum())
         total += accepted
         rows.append(
-            Figure(f"{kind}: accepted", 100 * accepted / DECOYS, "%", f"{accepted} of {DECOYS}",
-                   0.1, peer=CELLULO, peer_value=100.0)
+            Figure(f"{kind}: accepted", 100 * accepted / DECOY_FRAMES, "%",
+                   f"{accepted} of {DECOY_FRAMES}", 0.1, peer=CELLULO, peer_value=100.0)
         )  # fmt: skip
-    count = DECOYS * len(KINDS)
+    count = DECOY_FRAMES * len(KINDS)
     return [
         *rows,
         Figure("all without the pattern: accepted", 100 * total / count, "%",
@@ -223,35 +284,39 @@ def decoy_figures() -> list[Figure]:
 
 
 def paper_method_figures() -> list[Figure]:
-    """The published algorithm on the frames that it was made for."""
-    manifest = page("A0")
+    """Score the published algorithm on frames as it was designed for."""
+    manifest = default_sheet("A0")
     rows = []
     for condition in (CONDITIONS[1], CONDITIONS[6]):
-        images, grid, heading = render(condition, PAPER_FRAMES, SEED + 300, manifest)
-        found = score(_by_solve(images, manifest, "paper"), grid, heading)
+        images, grid, heading = render(condition, PAPER_METHOD_FRAMES, FIRST_SEED + 300, manifest)
+        score = score_frames(_solve_as_session(images, manifest, "paper"), grid, heading)
         name = f"--method paper, {condition.name}"
         rows += [
-            Figure(f"{name}: right", 100 * found.right / found.frames, "%",
-                   f"of {found.frames} frames", None, "higher",
+            Figure(f"{name}: right", score.correct_percent, "%",
+                   f"of {score.frames} frames", None, "higher",
                    condition.peer, condition.peer_value),
-            Figure(f"{name}: rms", found.rms, "pitch", "the larger of x and y, of the right ones",
-                   peer=CELLULO if condition.rms_peer else None, peer_value=condition.rms_peer),
-            Figure(f"{name}: wrong among accepted", found.wrong_share, "%",
-                   f"{found.wrong} of {found.right + found.wrong}"),
+            Figure(f"{name}: rms", score.rms, "pitch",
+                   "the larger of x and y, of the correct ones",
+                   peer=CELLULO if condition.rms_peer_value else None,
+                   peer_value=condition.rms_peer_value),
+            Figure(f"{name}: wrong among accepted", score.wrong_percent, "%",
+                   f"{score.wrong} of {score.accepted}"),
         ]  # fmt: skip
     return rows
 
 
-def _by_solve(images: NDArray[np.uint8], manifest: Manifest, method: str) -> LocalizedFrames:
-    """Frames solved as a session of them is; places again in grid coordinates."""
+def _solve_as_session(
+    images: NDArray[np.uint8], manifest: Manifest, method: str
+) -> LocalizedFrames:
+    """Solve frames as those of a session, and return the results in grid coordinates."""
     n = len(images)
     frames = Frames("camera", np.arange(n), tuple(map(str, range(n))), list(images))
     solution = solve([frames], manifest, SolveOptions(method))
     located = unlocalized_frames(n, "rejected")
-    for found in solution.detections:
-        k = int(found.frame)
-        located.grid[k] = found.grid_x, found.grid_y
-        located.heading[k] = found.heading_rad
+    for detection in solution.detections:
+        k = int(detection.frame)
+        located.grid[k] = detection.grid_x, detection.grid_y
+        located.heading[k] = detection.heading_rad
         located.rejected[k] = ""
     return located
 
@@ -260,74 +325,150 @@ def _by_solve(images: NDArray[np.uint8], manifest: Manifest, method: str) -> Loc
 
 
 def speed_figures() -> list[Figure]:
-    """Frames a second in a batch, and time of a single one."""
+    """Time the localization of frames in a batch, and of single ones."""
+    batch = Figure(
+        "frames a second, in a batch", None, "1/s",
+        f"localize_frames() of {CONDITION_FRAMES} frames of 188 x 120 px, processor time of one "
+        "thread, best of 3", 4000.0, "higher", CELLULO, 4000.0, "numpy",
+    )  # fmt: skip
+    single = Figure(
+        "a single frame", None, "ms",
+        "localize_frames() of one frame, median, processor time of one thread", 0.5, "lower",
+        CELLULO, 0.26, "numpy",
+    )  # fmt: skip
+    frames = CONDITION_FRAMES
     return [
-        measured("frames a second, in a batch", "1/s", f"dots.suite.batch_speed({FRAMES})", 1.0,
-                 f"localize_frames() of {FRAMES} frames of 188 x 120 px, one thread, best of 3",
-                 4000.0, "higher", CELLULO, 4000.0),
-        measured("a single frame", "ms", f"dots.suite.single_time({min(FRAMES, 200)})", 1e3,
-                 "localize_frames() of one frame, median, one thread", 0.5, "lower", CELLULO, 0.26),
-    ]  # fmt: skip
-
-
-def batch_speed(frames: int) -> tuple[float]:
-    """Frames a second of processor time."""
-    images, _, _ = render(CONDITIONS[1], frames, SEED + 400, page("A0"))
-    table = codec("anoto")
-    return (frames / cpu_seconds(lambda: localize_frames(images, table), 3),)
-
-
-def single_time(frames: int) -> tuple[float]:
-    """Seconds of processor time for a frame that comes alone, the median of some."""
-    images, _, _ = render(CONDITIONS[1], frames, SEED + 401, page("A0"))
-    table = codec("anoto")
-    times = [
-        cpu_seconds(lambda one=image[None]: localize_frames(one, table), 3)  # type: ignore[misc]
-        for image in images
+        measure_single_threaded(batch, f"dots.suite.time_batch({frames})", frames),
+        measure_single_threaded(single, f"dots.suite.time_single({min(frames, 200)})", 1e3),
     ]
-    return (float(np.median(times)),)
+
+
+def time_batch(frames: int) -> Duration:
+    """Time the localization of a batch of frames."""
+    images, _, _ = render(CONDITIONS[1], frames, FIRST_SEED + 400, default_sheet("A0"))
+    table = codec("anoto")
+    return time_call(lambda: localize_frames(images, table), 3)
+
+
+def time_single(frames: int) -> Duration:
+    """Time the localization of single frames; the median counts."""
+    images, _, _ = render(CONDITIONS[1], frames, FIRST_SEED + 401, default_sheet("A0"))
+    table = codec("anoto")
+    calls = [partial(localize_frames, image[None], table) for image in images]
+    seconds, factor = time_each(calls, 3)
+    return Duration(float(np.median(seconds)), factor)
 
 
 # ---- the published frame
 
 
-def real_figures(path: Path) -> list[Figure]:
-    """frame.bmp as it is and turned by quarters."""
-    names = [f"frame.bmp turned by {90 * k} deg" for k in range(4)]
-    try:
-        frame = _grey(path)
-    except (LocatkError, OSError) as error:
-        how = f"not measured: {error}"
-        return [
-            row
-            for name in names
-            for row in (
-                Figure(f"{name}: centre", None, "pitch", how, 0.05),
-                Figure(f"{name}: heading", None, "deg", how, 0.2),
-            )
-        ]
-    rows = []
-    for quarter, name in enumerate(names):
-        located = localize_frames(
-            np.ascontiguousarray(np.rot90(frame, quarter))[None], codec("libdots")
+def published_frame_figures(path: Path) -> list[Figure]:
+    """Localize frame.bmp at four rotations."""
+    declared = [
+        figure
+        for name in (f"frame.bmp turned by {90 * k} deg" for k in range(4))
+        for figure in (
+            Figure(f"{name}: centre", None, "pitch", "", 0.05),
+            Figure(f"{name}: heading", None, "deg", "", 0.2),
         )
-        how = f"{located.dots[0]} dots, {located.corrected[0]} bits corrected; a libdots sheet"
-        away, turned = math.nan, math.nan
-        if located.accepted[0]:
-            away = float(np.abs(located.grid[0] - REAL_CENTRE).max())
-            # Turned to the left, the frame's right is what was down before.
-            expected = math.radians(REAL_HEADING_DEG - 90 * quarter)
-            turned = abs(math.remainder(located.heading[0] - expected, math.tau))
-        else:
-            how = f"rejected: {located.rejected[0]}"
-        rows += [
-            Figure(f"{name}: centre", away, "pitch", how, 0.05),
-            Figure(f"{name}: heading", math.degrees(turned), "deg", "the same", 0.2),
-        ]
+    ]
+
+    def measure() -> Iterator[Figure]:
+        image = image_files.grey(image_files.decode(path.read_bytes()).pixels)
+        for quarter in range(4):
+            rotated = np.ascontiguousarray(np.rot90(image, quarter))
+            located = localize_frames(rotated[None], codec("libdots"))
+            error, heading_error = math.nan, math.nan
+            if located.accepted[0]:
+                error = float(np.abs(located.grid[0] - FRAME_BMP_CENTRE).max())
+                # A rotation to the left moves the lower edge of the frame to the right.
+                expected = math.radians(FRAME_BMP_HEADING_DEG - 90 * quarter)
+                heading_error = abs(math.remainder(located.heading[0] - expected, math.tau))
+                how = (
+                    f"{located.dots[0]} dots, {located.corrected[0]} bits corrected; a libdots "
+                    "sheet"
+                )
+            else:
+                how = f"rejected: {located.rejected[0]}"
+            centre, heading = declared[2 * quarter : 2 * quarter + 2]
+            yield replace(centre, value=error, how=how)
+            yield replace(heading, value=math.degrees(heading_error), how="of the same frame")
+
+    return measure_or_explain(measure, *declared)
+
+
+# ---- study of the paper's section IV on a simulated sheet: 121 positions and 36 angles
+
+
+def study_figures() -> list[Figure]:
+    """Measure errors and scatter by both methods, with a known lens, as in the paper.
+
+    Errors refer to the truth of the simulation; those of the paper include its printer, its paper
+    and its CNC machine.
+    """
+    raster = layout.snap(0.508, None, 300)
+    page = layout.lay_out(paper_size("A3")[1], 5.0, raster)
+    manifest = layout.manifest(raster, page.sheets("A3", (7_000_000, 9_000_000)), "anoto")
+    middle = np.array(manifest.sheets[0].page_mm) * 0.5e-3
+    offsets = np.linspace(-STUDY_SPAN_M / 2, STUDY_SPAN_M / 2, STUDY_GRID)
+    positions = np.array([[x, y] for y in offsets for x in offsets]) + middle
+    angles = np.radians(np.arange(STUDY_ANGLES) * 360 / STUDY_ANGLES)
+    rows: list[Figure] = []
+    for method in METHODS:
+        over_positions = study_errors(manifest, positions, np.zeros(len(positions)), method)
+        over_angles = study_errors(manifest, np.tile(middle, (STUDY_ANGLES, 1)), angles, method)
+        rows += _study_rows(method, over_positions, over_angles)
     return rows
 
 
-def _grey(path: Path) -> NDArray[np.uint8]:
-    from locatk.formats import images
+def study_errors(manifest: Manifest, positions: Array, headings: Array, method: str) -> Array:
+    """Return errors (positions, samples, 3) of x and y [mm] and heading [deg]; nan if wrong."""
+    position, heading = (np.repeat(part, STUDY_SAMPLES, axis=0) for part in (positions, headings))
+    n = len(position)
+    options = simulate.SimulationOptions(frames=n, jitter_m=STUDY_JITTER_M, seed=FIRST_SEED + 500)
+    path = CameraPath(position, heading, np.zeros((n, 2)), np.zeros(n))
+    simulated = simulate.simulate_path(manifest, options, path)
+    solution = solve([simulated.frames], manifest, SolveOptions(method, simulated.camera))
+    errors = np.full((n, 3), np.nan)
+    for detection in solution.detections:
+        k = int(detection.frame)
+        errors[k, 0] = 1e3 * (detection.x_m - position[k, 0])
+        errors[k, 1] = 1e3 * (detection.y_m - position[k, 1])
+        heading_error = math.remainder(detection.heading_rad - heading[k], math.tau)
+        errors[k, 2] = math.degrees(heading_error)
+    is_wrong = np.abs(errors[:, :2]).max(axis=1) >= STUDY_MAX_ERROR_MM
+    errors[is_wrong | (np.abs(errors[:, 2]) >= STUDY_MAX_ERROR_DEG)] = np.nan
+    return errors.reshape(len(positions), STUDY_SAMPLES, 3)
 
-    return images.grey(images.decode(path.read_bytes()).pixels)
+
+def _study_rows(method: str, over_positions: Array, over_angles: Array) -> Iterator[Figure]:
+    # Both methods have to read as many frames as the paper; the default method also has to be at
+    # least as accurate.
+    is_default = method == METHODS[0]
+    label = "study" if is_default else f"study, --method {method}"
+    is_correct = np.isfinite(over_positions[..., 0])
+    yield Figure(
+        f"{label}: frames right", 100 * float(is_correct.mean()), "%",
+        f"{STUDY_GRID} x {STUDY_GRID} positions over 200 x 200 mm, {STUDY_SAMPLES} samples each: "
+        f"{is_correct.size} frames", PAPER_RIGHT_PERCENT, "higher", "paper, its x",
+        PAPER_RIGHT_PERCENT,
+    )  # fmt: skip
+    for axis, (name, (unit, paper_worst, paper_precision)) in enumerate(TABLE_III.items()):
+        errors = (over_angles if name == "heading" else over_positions)[..., axis]
+        read = np.isfinite(errors).any(axis=1)
+        how = f"{int(read.sum())} of {len(errors)} {'angles' if axis == 2 else 'positions'}"
+        largest = mean = precision = math.nan
+        if read.any():
+            absolute = np.abs(errors[np.isfinite(errors)])
+            largest, mean = float(absolute.max()), float(absolute.mean())
+            precision = float(np.nanstd(errors[read], axis=1).max())
+        yield Figure(
+            f"{label}: worst error {name}", largest, unit, how,
+            paper_worst if is_default else None, "lower", STUDY_PEER, paper_worst,
+        )  # fmt: skip
+        yield Figure(f"{label}: mean error {name}", mean, unit, "of absolute values")
+        yield Figure(
+            f"{label}: precision {name}", precision, unit,
+            "largest standard deviation at one of them",
+            paper_precision if is_default else None, "lower", STUDY_PEER, paper_precision,
+        )  # fmt: skip

@@ -1,9 +1,9 @@
-"""Global localization on the map of 24 x 24 landmarks read with their orientation, by L.
+"""Figures of global localization on the map of 24 x 24 landmarks, with windows of an L.
 
-The filter alone is fed by hand-made sightings: what the map says (or, where a landmark is
-misread, any other code, each time that it is visited) as the only hypothesis, with a
-probability of 1, a pose with the covariance of a plain pass, and odometry of nominal
-errors. Whole sessions are in :mod:`.landmarks_sessions`.
+Only the cell filter is tested. It receives synthetic observations: the code of the map (or, if a
+landmark is misread, another code at each visit) as the only hypothesis with a probability of 1, a
+pose with the covariance of a single pass, and odometry with nominal errors. Whole sessions are in
+:mod:`.sessions`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, code_of, rotated
-from locatk.core.landmarks.localization import cell_filter as globalize
-from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY
+from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY, identify_cells
 from locatk.core.landmarks.localization.consistency import CERTAIN_PROBABILITY
 from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.map.windows import window_path, window_readings
@@ -28,266 +27,276 @@ from locatk.core.landmarks.simulation.options import Errors
 from locatk.core.landmarks.simulation.sensors import odometry
 from locatk.core.landmarks.solver import SolveOptions
 from locatk.formats.artifacts.map_library import entries
-from locatk.formats.benchmarks import Figure
-from locatk.formats.benchmarks.timing import SEED
+from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.timing import FIRST_SEED
 
 Array = NDArray[np.float64]
 
-SIDE = 24
+MAP_SIDE = 24
 
-MISREAD = 0.05
+MISREAD_FRACTION = 0.05
 
-LONGEST = 8
-"""Landmarks of a walk."""
+WALK_LANDMARKS = 8
 
-WALKS = 1
-"""From each start, with misread landmarks."""
+START_STRIDE = 1
+"""Every how many starts one is measured."""
 
-EVERY = 1
-"""One start in so many is measured."""
+MAX_LISTED_WALKS = 10
 
-STOP_M, STOP_RAD = 2.4e-3, math.radians(1.0)
-"""How far off a landmark's centre and its heading the robot stops: 3 mm in the mean."""
+STOP_SIGMA_M, STOP_SIGMA_RAD = 2.4e-3, math.radians(1.0)
+"""Standard deviations of the pose at which the robot stops at a landmark: 3 mm on average."""
 
-SEEN_M, SEEN_RAD = 0.5e-3, math.radians(0.5)
-"""Standard deviations of poses of hand-made sightings along each axis."""
+POSE_SIGMA_M, POSE_SIGMA_RAD = 0.5e-3, math.radians(0.5)
+"""Standard deviations of the poses of synthetic observations along each axis."""
 
-WINDOWS = {"L": "L", "I2": "I2", "I3": "I3", "S": "2x2"}
-"""Letters in the names of published maps."""
+WINDOW_NAMES = {"L": "L", "I2": "I2", "I3": "I3", "S": "2x2"}
+"""Letters of windows in the names of published maps."""
 
-PUBLISHED = {
+PUBLISHED_SIDES = {
     "id6_L_7x7": 7, "id6_S_17x17": 17, "or16_I2_8x8": 8, "or16_I3_28x28": 28,
     "or16_L_24x24": 24, "or16_S_100x100": 100,
 }  # fmt: skip
-"""Maps of the data folder and their sides."""
+"""Maps of the data folder, and their sides."""
 
 
 def read_published(folder: Path, name: str) -> FloorMap:
-    """A published map: a line that says what it is, and a line of letters for each row.
+    """Read a published map: a title, and a line of letters for each row.
 
     Raises
     ------
-    OSError, ValueError
-        It is not there, or no such map.
+    OSError
+        The file cannot be read.
+    ValueError
+        The file is not a map of this size.
     """
     alphabet, window, _ = name.split("_")
     lines = (folder / f"{name}.txt").read_text(encoding="ascii").split("\n")[1:]
     values = np.array([[int(letter, 16) for letter in line] for line in lines if line.strip()])
-    if values.shape != (PUBLISHED[name],) * 2:
+    if values.shape != (PUBLISHED_SIDES[name],) * 2:
         raise ValueError(f"{name}.txt has {values.shape} letters")
     if alphabet == "id6":
         values = np.array([code_of(letters) for letters in PATTERNS])[values]
     return FloorMap(
         values.astype(np.int64),
         alphabet="6" if alphabet == "id6" else "16",
-        window=WINDOWS[window],
+        window=WINDOW_NAMES[window],
     )
 
 
-def the_floor(folder: Path) -> tuple[FloorMap, str]:
-    """The published map of 24 x 24, else one cut of the map that ships; and which it is."""
+def standard_floor(folder: Path) -> tuple[FloorMap, str]:
+    """Return the published map of 24 x 24, or a part of the supplied map; and its source."""
     try:
         return read_published(folder, "or16_L_24x24"), "published map"
     except OSError:
-        entry = next(e for e in entries() if (e.alphabet, e.window, e.detect) == ("16", "L", 0))
-        return FloorMap(entry.codes()[:SIDE, :SIDE]), f"cut of {entry.file}, which ships"
+        return supplied_floor()
+
+
+def supplied_floor() -> tuple[FloorMap, str]:
+    """Return a part of 24 x 24 landmarks of the supplied map, and its source."""
+    entry = next(e for e in entries() if (e.alphabet, e.window, e.detect) == ("16", "L", 0))
+    codes = entry.codes()[:MAP_SIDE, :MAP_SIDE]
+    return FloorMap(codes), f"cut of {entry.file}, which ships"
 
 
 def global_figures(folder: Path) -> list[Figure]:
-    """All figures of the filter; ``folder`` has the published maps."""
-    floor, which = the_floor(folder)
-    return [
-        *perfect_figures(floor, which),
-        *misread_figures(floor, which),
-    ]
+    """Return all figures of the filter; ``folder`` contains the published maps."""
+    floor, source = standard_floor(folder)
+    return [*perfect_figures(floor, source), *misread_figures(floor, source)]
 
 
-# ---- sightings by hand
+# ---- synthetic observations
 
 
 @dataclass(frozen=True)
 class Walk:
-    """Where a robot has stopped, in order.
+    """Stops of a robot, in order.
 
     Attributes
     ----------
     cells : tuple of cell
     quarters : tuple of int
-        Its heading at each, in quarter turns.
+        Heading at each stop, in quarter turns.
     """
 
     cells: tuple[Cell, ...]
     quarters: tuple[int, ...]
 
+    @property
+    def stops(self) -> list[tuple[Cell, int]]:
+        """Cell and heading of each stop."""
+        return list(zip(self.cells, self.quarters, strict=True))
 
-def windows_of(floor: FloorMap) -> list[Walk]:
-    """The window from every start (cell, heading) that has one."""
-    found = window_readings(floor)
-    turns = np.diff(window_path(floor.window, 0), axis=0, prepend=[[0, -1]])
-    turn = [STEPS.index((int(a), int(b))) for a, b in turns]
+
+def window_walks(floor: FloorMap) -> list[Walk]:
+    """Return the walk over the window from each start (cell, heading) that has one."""
+    readings = window_readings(floor)
+    steps = np.diff(window_path(floor.window, 0), axis=0, prepend=[[0, -1]])
+    turns = [STEPS.index((int(rows), int(columns))) for rows, columns in steps]
     return [
         Walk(
-            tuple((int(r), int(c)) for r, c in cells),
-            tuple((int(heading) + t) % 4 for t in turn),
+            tuple((int(row), int(column)) for row, column in cells),
+            tuple((int(heading) + turn) % 4 for turn in turns),
         )
-        for cells, heading in zip(found.cells, found.heading, strict=True)
+        for cells, heading in zip(readings.cells, readings.heading, strict=True)
     ]
 
 
 def random_walk(floor: FloorMap, start: Cell, heading: int, rng: np.random.Generator) -> Walk:
-    """On from a start, straight or after a turn, to cells not visited yet if there are any."""
+    """Walk from a start, straight ahead or to a side, if possible to cells not visited before."""
     cells, quarters = [start], [heading]
-    while len(cells) < LONGEST:
-        open_ = [
-            h for h in ((heading + t) % 4 for t in (0, 1, 3)) if floor.is_passable(cells[-1], h)
-        ] or [(heading + 2) % 4]
-        fresh = [h for h in open_ if neighbour(cells[-1], h) not in cells] or open_
-        heading = int(rng.choice(fresh))
+    while len(cells) < WALK_LANDMARKS:
+        passable = [
+            h for h in ((heading + turn) % 4 for turn in (0, 1, 3))
+            if floor.is_passable(cells[-1], h)
+        ] or [(heading + 2) % 4]  # fmt: skip
+        new = [h for h in passable if neighbour(cells[-1], h) not in cells] or passable
+        heading = int(rng.choice(new))
         cells.append(neighbour(cells[-1], heading))
         quarters.append(heading)
     return Walk(tuple(cells), tuple(quarters))
 
 
-def sightings(
-    floor: FloorMap, walk: Walk, laid: dict[Cell, int], rng: np.random.Generator
+def simulate_observations(
+    floor: FloorMap, walk: Walk, misread: dict[Cell, int], rng: np.random.Generator
 ) -> list[VisitHypotheses]:
-    """What is seen on a walk over landmarks laid as ``laid`` says, else as the map does."""
-    stops = _stops(floor, walk, rng)
-    told = _odometry(stops, rng)
-    sigma = np.array([SEEN_M, SEEN_M, SEEN_RAD])
+    """Simulate the observations of a walk; ``misread`` gives the codes of misread landmarks."""
+    poses = _stop_poses(floor, walk, rng)
+    odometry_poses = _simulate_odometry(poses, rng)
+    sigma = np.array([POSE_SIGMA_M, POSE_SIGMA_M, POSE_SIGMA_RAD])
     unknown = np.full(4, np.nan)
-    seen = []
-    for n, (cell, quarters) in enumerate(zip(walk.cells, walk.quarters, strict=True)):
-        code = laid.get(cell, int(floor.codes[cell]))
-        turn = quarters * math.pi / 2
-        cos, sin = math.cos(turn), math.sin(turn)
-        x, y = stops[n, :2] - floor.position(cell)
-        pose = [cos * x + sin * y, cos * y - sin * x, math.remainder(stops[n, 2] - turn, math.tau)]
+    observations = []
+    for n, (cell, quarters) in enumerate(walk.stops):
+        code = misread.get(cell, int(floor.codes[cell]))
+        angle = quarters * math.pi / 2
+        cos, sin = math.cos(angle), math.sin(angle)
+        x, y = poses[n, :2] - floor.position(cell)
+        heading = math.remainder(poses[n, 2] - angle, math.tau)
+        pose = [cos * x + sin * y, cos * y - sin * x, heading]
         hypothesis = Hypothesis(
             int(rotated(code, -quarters)), 1.0, pose + sigma * rng.standard_normal(3),
             np.diag(sigma**2), unknown, unknown,
         )  # fmt: skip
-        seen.append(VisitHypotheses("robot", n, n, n + 1, told[n], (hypothesis,)))
-    return seen
+        observations.append(VisitHypotheses("robot", n, n, n + 1, odometry_poses[n], (hypothesis,)))
+    return observations
 
 
-def _stops(floor: FloorMap, walk: Walk, rng: np.random.Generator) -> Array:
-    """Poses (n, 3) near the landmarks' centres, the heading without jumps."""
-    turns = np.array([math.remainder(t, 4) for t in np.diff(walk.quarters)])
+def _stop_poses(floor: FloorMap, walk: Walk, rng: np.random.Generator) -> Array:
+    """Return poses (n, 3) close to the landmarks' centres, with unwrapped headings."""
+    turns = np.array([math.remainder(turn, 4) for turn in np.diff(walk.quarters)])
     heading = (walk.quarters[0] + np.concatenate([[0.0], np.cumsum(turns)])) * math.pi / 2
-    place = np.array([floor.position(cell) for cell in walk.cells])
+    position = np.array([floor.position(cell) for cell in walk.cells])
     count = len(walk.cells)
-    place = place + rng.normal(0, STOP_M, (count, 2))
-    return np.column_stack([place, heading + rng.normal(0, STOP_RAD, count)])
+    position = position + rng.normal(0, STOP_SIGMA_M, (count, 2))
+    return np.column_stack([position, heading + rng.normal(0, STOP_SIGMA_RAD, count)])
 
 
-def _odometry(stops: Array, rng: np.random.Generator) -> Array:
-    """Poses (n, 3) at the stops by wheels of nominal errors: turn, go straight, turn."""
-    poses, at = [stops[0]], [0]
+def _simulate_odometry(stops: Array, rng: np.random.Generator) -> Array:
+    """Return the odometry (n, 3) at the stops, with nominal errors: rotate, drive, rotate."""
+    poses, indices = [stops[0]], [0]
     for target in stops[1:]:
-        here = poses[-1]
-        way = target[:2] - here[:2]
-        along = here[2] + math.remainder(math.atan2(way[1], way[0]) - here[2], math.tau)
-        for corner in ([*here[:2], along], [*target[:2], along], target):
-            steps = np.linspace(0, 1, 11)[1:, None]
-            poses += list(poses[-1] + steps * (np.asarray(corner) - poses[-1]))
-        at.append(len(poses) - 1)
-    return odometry(np.array(poses), Errors(), rng)[0][at]
+        start = poses[-1]
+        offset = target[:2] - start[:2]
+        direction = math.atan2(offset[1], offset[0])
+        heading = start[2] + math.remainder(direction - start[2], math.tau)
+        for corner in ([*start[:2], heading], [*target[:2], heading], target):
+            fractions = np.linspace(0, 1, 11)[1:, None]
+            poses += list(poses[-1] + fractions * (np.asarray(corner) - poses[-1]))
+        indices.append(len(poses) - 1)
+    return odometry(np.array(poses), Errors(), rng)[0][indices]
 
 
-def misread(floor: FloorMap, rng: np.random.Generator) -> dict[Cell, int]:
-    """Landmarks that are taken for any other code, one in twenty."""
-    hit = np.argwhere(rng.random(floor.shape) < MISREAD)
+def random_misreadings(floor: FloorMap, rng: np.random.Generator) -> dict[Cell, int]:
+    """Return other codes for a random twentieth of the landmarks."""
+    cells = np.argwhere(rng.random(floor.shape) < MISREAD_FRACTION)
     return {
-        (int(r), int(c)): int((floor.codes[r, c] + rng.integers(1, CODE_COUNT)) % CODE_COUNT)
-        for r, c in hit
+        (int(row), int(column)): int(
+            (floor.codes[row, column] + rng.integers(1, CODE_COUNT)) % CODE_COUNT
+        )
+        for row, column in cells
     }
 
 
-def told_places(
-    floor: FloorMap, seen: Sequence[VisitHypotheses]
+def localize_stops(
+    floor: FloorMap, observations: Sequence[VisitHypotheses]
 ) -> tuple[list[tuple[Cell, int, float]], list[tuple[Cell, int, float]]]:
-    """Cell, heading and probability of the last sighting after each of them, and of all
-    sightings in the end."""
-    drift, rate = OdometryDrift(), SolveOptions().misread
-    so_far, places = [], []
-    for count in range(1, len(seen) + 1):
-        places = globalize.identify_cells(seen[:count], floor, misread=rate, drift=drift)
-        last = places[-1]
-        so_far.append((last.cell, last.quarters, last.probability))
-    return so_far, [(one.cell, one.quarters, one.probability) for one in places]
+    """Return cell, heading and probability of each stop: after this stop, and after all stops."""
+    drift, misread = OdometryDrift(), SolveOptions().misread
+    current, estimates = [], []
+    for count in range(1, len(observations) + 1):
+        estimates = identify_cells(observations[:count], floor, misread=misread, drift=drift)
+        last = estimates[-1]
+        current.append((last.cell, last.quarters, last.probability))
+    return current, [(each.cell, each.quarters, each.probability) for each in estimates]
 
 
-# ---- the filter alone
+# ---- figures
 
 
-def perfect_figures(floor: FloorMap, which: str) -> list[Figure]:
-    """Three landmarks of the L from every start, each read as the map has it."""
-    rng = np.random.default_rng(SEED + 40)
-    walks = windows_of(floor)[::EVERY]
-    right, probability = [], []
+def perfect_figures(floor: FloorMap, source: str) -> list[Figure]:
+    """Localize the three landmarks of the L from each start, all read correctly."""
+    rng = np.random.default_rng(FIRST_SEED + 40)
+    walks = window_walks(floor)[::START_STRIDE]
+    correct, probability = [], []
     for walk in walks:
-        _, places = told_places(floor, sightings(floor, walk, {}, rng))
-        true = list(zip(walk.cells, walk.quarters, strict=True))
-        right.append([(cell, quarters) for cell, quarters, _ in places] == true)
-        probability.append(places[-1][2])
-    least, mean = min(probability), float(np.mean(probability))
-    given = [r and p >= MIN_CELL_PROBABILITY for r, p in zip(right, probability, strict=True)]
+        _, stops = localize_stops(floor, simulate_observations(floor, walk, {}, rng))
+        correct.append([(cell, quarters) for cell, quarters, _ in stops] == walk.stops)
+        probability.append(stops[-1][2])
+    smallest, mean = min(probability), float(np.mean(probability))
+    has_poses = [c and p >= MIN_CELL_PROBABILITY for c, p in zip(correct, probability, strict=True)]
     how = (
-        f"{len(walks)} starts (cell, heading) with an L, {which}; the filter alone, perfect reads, "
-        "nominal odometry"
+        f"{len(walks)} starts (cell, heading) with an L, {source}; the filter alone, all landmarks "
+        "read correctly, nominal odometry"
     )
     return [
-        Figure("24x24, 16/L: right after three landmarks", 100 * float(np.mean(right)), "%",
+        Figure("24x24, 16/L: right after three landmarks", 100 * float(np.mean(correct)), "%",
                f"{how}: cell and heading of all three", 100.0, "higher",
                "paper: three landmarks", 100.0),
         Figure("24x24, 16/L: right and poses given after three",
-               100 * float(np.mean(given)), "%",
-               f"the same, at a probability of {MIN_CELL_PROBABILITY} or more; "
-               f"least {least:.4f}, mean {mean:.4f}",
+               100 * float(np.mean(has_poses)), "%",
+               f"of the same starts, at a probability of {MIN_CELL_PROBABILITY} or more; "
+               f"smallest {smallest:.4f}, mean {mean:.4f}",
                100.0, "higher"),
     ]  # fmt: skip
 
 
-def misread_figures(floor: FloorMap, which: str) -> list[Figure]:
-    """Random walks over a floor of which one landmark in twenty is taken for another."""
+def misread_figures(floor: FloorMap, source: str) -> list[Figure]:
+    """Walk over a floor with a twentieth of the landmarks misread."""
     rows, columns = floor.shape
     starts = [(r, c, h) for r in range(rows) for c in range(columns) for h in range(4)]
-    certain, likely, needed, failed, faults = 0, 0, [], [], 0
-    walks = starts[::EVERY] * WALKS
+    silently_wrong, remarked, landmarks_needed, walks_with_misreadings = [], 0, [], 0
+    walks = starts[::START_STRIDE]
     for number, (row, column, heading) in enumerate(walks):
-        rng = np.random.default_rng([SEED + 41, number])
+        rng = np.random.default_rng([FIRST_SEED + 41, number])
         walk = random_walk(floor, (row, column), heading, rng)
-        laid = misread(floor, rng)
-        faults += any(cell in laid for cell in walk.cells)
-        so_far, places = told_places(floor, sightings(floor, walk, laid, rng))
-        true = list(zip(walk.cells, walk.quarters, strict=True))
-        every = [*zip(so_far, true, strict=True), *zip(places, true, strict=True)]
-        wrong = max((p for (c, q, p), t in every if (c, q) != t), default=0.0)
+        misread = random_misreadings(floor, rng)
+        walks_with_misreadings += any(cell in misread for cell in walk.cells)
+        current, final = localize_stops(floor, simulate_observations(floor, walk, misread, rng))
+        estimates = zip([*current, *final], [*walk.stops, *walk.stops], strict=True)
+        wrong = max((p for (cell, q, p), stop in estimates if (cell, q) != stop), default=0.0)
         if wrong >= CERTAIN_PROBABILITY:
-            certain += 1
-            failed.append(number)
-        likely += MIN_CELL_PROBABILITY <= wrong < CERTAIN_PROBABILITY
-        first = (n for n, (_, _, p) in enumerate(so_far, 1) if p >= CERTAIN_PROBABILITY)
-        needed.append(next(first, math.inf))
-    done = [n for n in needed if math.isfinite(n)]
+            silently_wrong.append(number)
+        remarked += MIN_CELL_PROBABILITY <= wrong < CERTAIN_PROBABILITY
+        certain = (n for n, (_, _, p) in enumerate(current, 1) if p >= CERTAIN_PROBABILITY)
+        landmarks_needed.append(next(certain, math.inf))
+    localized = [n for n in landmarks_needed if math.isfinite(n)] or [math.nan]
     how = (
-        f"{len(walks)} random walks over {LONGEST} landmarks from every start, {which}, "
-        f"{100 * MISREAD:.0f} % of the landmarks taken for any other code whenever they are "
-        f"visited ({faults} walks met one); the filter alone"
+        f"{len(walks)} random walks over {WALK_LANDMARKS} landmarks from every start, {source}, "
+        f"{100 * MISREAD_FRACTION:.0f} % of the landmarks with another code at every visit "
+        f"({walks_with_misreadings} walks met one); the filter alone"
     )
-    seeds = f"; walks {', '.join(map(str, failed[:10]))}" if failed else ""
+    listed = ", ".join(map(str, silently_wrong[:MAX_LISTED_WALKS]))
     return [
-        Figure("5 % misread: wrong silently", float(certain), "walks",
+        Figure("5 % misread: wrong silently", float(len(silently_wrong)), "walks",
                f"{how}: a wrong cell or heading at a probability of {CERTAIN_PROBABILITY} or "
-               f"more, after any of the landmarks or in the end{seeds}", 0.0),
-        Figure("5 % misread: wrong with a remark", 100 * likely / len(walks), "%",
-               f"the same, at {MIN_CELL_PROBABILITY} to {CERTAIN_PROBABILITY}: poses are given, "
-               "with the probability said"),
-        Figure("5 % misread: landmarks needed", float(np.mean(done)) if done else math.nan,
-               "landmarks", f"mean until {CERTAIN_PROBABILITY} is reached; 99 % within "
-               f"{np.quantile(done, 0.99) if done else math.nan:.0f}", peer="paper, no fault",
-               peer_value=3.0),
-        Figure(f"5 % misread: certain within {LONGEST} landmarks",
-               100 * len(done) / len(walks), "%", "the same walks", better="higher"),
+               f"more, after any of the landmarks or at the end{listed and f'; walks {listed}'}",
+               0.0),
+        Figure("5 % misread: wrong with a remark", 100 * remarked / len(walks), "%",
+               f"of the same walks, at {MIN_CELL_PROBABILITY} to {CERTAIN_PROBABILITY}: poses are "
+               "reported with their probability"),
+        Figure("5 % misread: landmarks needed", float(np.mean(localized)), "landmarks",
+               f"mean until {CERTAIN_PROBABILITY} is reached; 99 % within "
+               f"{np.quantile(localized, 0.99):.0f}", peer="paper, no fault", peer_value=3.0),
+        Figure(f"5 % misread: certain within {WALK_LANDMARKS} landmarks",
+               100 * float(np.mean(np.isfinite(landmarks_needed))), "%", "of the same walks",
+               better="higher"),
     ]  # fmt: skip

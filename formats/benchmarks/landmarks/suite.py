@@ -1,8 +1,8 @@
-"""The figures of the landmarks: the paper's study, simulated visits, floors, maps and speed.
+"""Figures of the landmarks: the paper's study, simulated visits, sessions, maps and speed.
 
-There is no published recording: what is simulated, and with which errors, is told in
-:mod:`.landmarks_study`, :mod:`.landmarks_global`, :mod:`.landmarks_sessions` and
-:mod:`.landmarks_closed_loop`. Of the data folder only the verified maps are used.
+No recording of a landmark floor is published. The simulations and their errors are described in
+:mod:`.visits`, :mod:`.global_localization` and :mod:`.sessions`. Only the verified maps are read
+from the data folder.
 """
 
 from __future__ import annotations
@@ -15,57 +15,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.published.study import study
-from locatk.formats.benchmarks import Figure
-from locatk.formats.benchmarks.landmarks.closed_loop import closed_loop_figures
+from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.landmarks.global_localization import global_figures
-from locatk.formats.benchmarks.landmarks.sessions import session_figures
+from locatk.formats.benchmarks.landmarks.sessions import closed_loop_figures, session_figures
 from locatk.formats.benchmarks.landmarks.speed import map_figures, speed_figures
-from locatk.formats.benchmarks.landmarks.study import (
-    SURE,
-    Found,
-    by_field,
-    by_valleys,
-    by_voting,
-    calibration,
+from locatk.formats.benchmarks.landmarks.visits import (
+    CONFIDENT_PROBABILITY,
+    VisitResult,
+    calibration_error,
     errors_mm,
     log_loss,
     rms_deg,
-    stands,
-    visited,
+    simulate_visits,
+    solve_by_field,
+    solve_by_valleys,
+    solve_first_steps,
+    solve_stops,
 )
-from locatk.formats.benchmarks.timing import SEED
+from locatk.formats.benchmarks.timing import FIRST_SEED
 
 Array = NDArray[np.float64]
 
-PASSES = 600
+SINGLE_PASSES = 600
 """Single straight passes."""
 
-VISITS = 1000
-"""Passes with a spin after them, and as many with a second pass."""
+LONG_VISITS = 1000
+"""Passes followed by a spin, and as many followed by a second pass."""
 
-STANDS = 400
+STOPPED_ROBOTS = 400
 
-START_STEP = 1
-"""Degrees between the starts of the paper's study; those in the real field are six times
-as far apart, as in the prototype's study."""
+STUDY_STEP_DEG = 1
+"""Angle between the starts of the paper's study; six times as large in the real field, as in the
+prototype's study."""
 
-PAPER = {"mean": 7.28, "SD": 3.53, "largest": 17.9}
-"""Errors of the paper's first step in mm (section 3.5.2)."""
+REAL_FIELD_STEPS = 6
 
-FAR_MM = 15.0
+PAPER_MM = {"mean": 7.28, "SD": 3.53, "largest": 17.9}
+"""Errors of the paper's first step (section 3.5.2)."""
+
+MAX_FIRST_ERROR_MM = 15.0
+
+MAX_LISTED_NUMBERS = 12
 
 NOMINAL = "nominal errors, any of the 16 codes, at the end of the visit"
 
 
 def figures(data: Path) -> list[Figure]:
-    """All figures of landmarks; ``data`` is the folder of published data."""
+    """Return all figures of landmarks; ``data`` is the folder of published data."""
     folder = data / "landmarks"
     return [
         *paper_figures(),
         *pass_figures(),
         *spin_figures(),
         *second_pass_figures(),
-        *stand_figures(),
+        *stop_figures(),
         *global_figures(folder),
         *session_figures(folder),
         *closed_loop_figures(folder),
@@ -78,26 +81,26 @@ def figures(data: Path) -> list[Figure]:
 
 
 def paper_figures() -> Iterator[Figure]:
-    """The first step of the published algorithm, on ideal half-discs and in the real field."""
+    """Run the first step of the published algorithm on ideal half-discs and in the real field."""
     name = "paper's first step, half-discs"
-    found = study(START_STEP)
-    all_, ungrazed = found.figures(), found.figures(grazed=False)
-    runs = f"{all_['runs']:.0f} runs, {all_['missed']:.0f} miss the landmark"
-    yield Figure(f"{name}: mean, off the paper's", abs(all_["mean_mm"] - PAPER["mean"]), "mm",
-                 f"landmark 3 (NNNS), corrected rule for two lines; {runs}", 0.5)  # fmt: skip
+    results = study(STUDY_STEP_DEG)
+    all_runs, ungrazed = results.figures(), results.figures(grazed=False)
+    runs = f"{all_runs['runs']:.0f} runs, {all_runs['missed']:.0f} miss the landmark"
+    yield Figure(f"{name}: mean, off the paper's", abs(all_runs["mean_mm"] - PAPER_MM["mean"]),
+                 "mm", f"landmark 3 (NNNS), corrected rule for two lines; {runs}", 0.5)  # fmt: skip
     for label, key in (("mean", "mean_mm"), ("SD", "sd_mm"), ("largest", "max_mm")):
-        yield Figure(f"{name}: {label}", all_[key], "mm",
-                     f"the same; {ungrazed[key]:.2f} without passes that graze a corner",
-                     peer="paper", peer_value=PAPER[label])  # fmt: skip
-    yield Figure(f"{name}: over 20 mm", 100 * all_["over_20_share"], "%",
-                 f"the same; {100 * ungrazed['over_20_share']:.2g} without passes that graze",
-                 0.5, peer="paper", peer_value=0.0)  # fmt: skip
-    literal = study(START_STEP, method="literal").figures()
+        yield Figure(f"{name}: {label}", all_runs[key], "mm",
+                     f"of the same runs; {ungrazed[key]:.2f} without passes that graze a corner",
+                     peer="paper", peer_value=PAPER_MM[label])  # fmt: skip
+    yield Figure(f"{name}: over 20 mm", 100 * all_runs["over_20_share"], "%",
+                 f"of the same runs; {100 * ungrazed['over_20_share']:.2g} without passes that "
+                 "graze a corner", 0.5, peer="paper", peer_value=0.0)  # fmt: skip
+    literal = study(STUDY_STEP_DEG, method="literal").figures()
     yield Figure(f"{name}, literal rules: mean", literal["mean_mm"], "mm",
                  f"the text's convex hull: {100 * literal['over_20_share']:.0f} % over 20 mm",
-                 peer="paper", peer_value=PAPER["mean"])  # fmt: skip
+                 peer="paper", peer_value=PAPER_MM["mean"])  # fmt: skip
     for label, method, prototype in (("", "corrected", 10.0), (", voting", "voting", 9.4)):
-        real = study(6 * START_STEP, "field", method).figures()  # type: ignore[arg-type]
+        real = study(REAL_FIELD_STEPS * STUDY_STEP_DEG, "field", method).figures()  # type: ignore[arg-type]
         yield Figure(f"paper's first step, real field{label}: mean", real["mean_mm"], "mm",
                      f"no noise; {100 * real['over_20_share']:.1f} % over 20 mm",
                      peer="prototype", peer_value=prototype)  # fmt: skip
@@ -107,101 +110,114 @@ def paper_figures() -> Iterator[Figure]:
 
 
 def pass_figures() -> Iterator[Figure]:
-    """The first estimate from one straight pass."""
-    name, seed = "one pass", SEED
-    made = visited(PASSES, "", seed)
-    found = [by_field(*one) for one in made]
-    baselines = [by_voting(*one) for one in made]
-    voted = errors_mm([one for _, one in baselines])
-    mean_voted = float(voted.mean())
-    how = f"{len(found)} passes, 230 mm, {NOMINAL}; prototype 1.51 of NNNS"
-    yield from _place(
-        name, found, seed, 1.5, 3.0, FAR_MM, "voting, the same passes", voted, how
-    )  # fmt: skip
-    far, theirs = (float((mm > FAR_MM).sum()) for mm in (errors_mm(found), voted))
-    yield Figure(f"{name}: over {FAR_MM:.0f} mm", far, "passes", "the same", 0.0, peer="voting",
-                 peer_value=theirs)  # fmt: skip
-    yield _right(name, found, seed, 92.0, "prototype", 91.0)
-    yield from _probabilities(name, found, seed)
-    ruled = errors_mm([one for one, _ in baselines])
-    yield Figure(f"{name}, paper's first step: mean", float(ruled.mean()), "mm",
-                 f"the same passes; {len(made) - len(ruled)} without a centre; SD "
-                 f"{ruled.std():.2f}, largest {ruled.max():.1f}",
-                 peer="prototype, real field, no noise", peer_value=10.0)  # fmt: skip
-    yield Figure(f"{name}, voting: mean", mean_voted, "mm",
-                 f"the same passes; {len(made) - len(voted)} without a centre; SD "
-                 f"{voted.std():.2f}, largest {voted.max():.1f}",
-                 peer="prototype, real field, no noise", peer_value=9.4)  # fmt: skip
+    """Score the first estimate from one straight pass."""
+    name, seed = "one pass", FIRST_SEED
+    visits = simulate_visits(SINGLE_PASSES, "", seed)
+    results = [solve_by_field(*visit) for visit in visits]
+    first_steps = [solve_first_steps(*visit) for visit in visits]
+    by_rules = errors_mm([rules for rules, _ in first_steps])
+    by_votes = errors_mm([votes for _, votes in first_steps])
+    how = f"{len(results)} passes, 230 mm, {NOMINAL}; prototype 1.51 of NNNS"
+    yield from _position_rows(
+        name,
+        results,
+        seed,
+        (1.5, 3.0, MAX_FIRST_ERROR_MM),
+        how,
+        "voting, the same passes",
+        by_votes,
+    )
+    large, large_by_votes = (
+        float((mm > MAX_FIRST_ERROR_MM).sum()) for mm in (errors_mm(results), by_votes)
+    )
+    yield Figure(f"{name}: over {MAX_FIRST_ERROR_MM:.0f} mm", large, "passes",
+                 "of the same passes", 0.0, peer="voting",
+                 peer_value=large_by_votes)  # fmt: skip
+    yield _correct_row(name, results, seed, 92.0, "prototype", 91.0)
+    yield from _probability_rows(name, results, seed)
+    for method, errors, prototype in (
+        (", paper's first step", by_rules, 10.0),
+        (", voting", by_votes, 9.4),
+    ):
+        yield Figure(f"{name}{method}: mean", float(errors.mean()), "mm",
+                     f"the same passes; {len(visits) - len(errors)} without a centre; SD "
+                     f"{errors.std():.2f}, largest {errors.max():.1f}",
+                     peer="prototype, real field, no noise",
+                     peer_value=prototype)  # fmt: skip
 
 
 def spin_figures() -> Iterator[Figure]:
-    """The same after a spin of 360 degrees, 7 mm off the centre in the mean."""
-    name, seed = "after a spin", SEED + 10_000
-    made = visited(VISITS, "spin", seed)
-    found = [by_field(*one) for one in made]
-    spun = [by_valleys(*one) for one in made]
-    valleys = errors_mm(spun)
-    yield from _place(name, found, seed, 0.5, None, None, "paper's valleys (NMV), the same spins",
-                      valleys, f"{len(found)} visits: a pass, back to 7 mm off the centre in the "
-                      f"mean, 360 degrees; {NOMINAL}")  # fmt: skip
-    read = [one for one in spun if math.isfinite(one.error_m)]
-    share = 100 * len(read) / len(spun)
-    right = 100 * float(np.mean([one.right for one in spun]))
-    yield _right(name, found, seed, 99.9, "paper's valleys", right)
-    yield from _probabilities(name, found, seed)
-    yield Figure(f"{name}, paper's valleys: mean", float(valleys.mean()), "mm",
-                 f"of the {share:.0f} % that it reads, of which "
-                 f"{100 * float(np.mean([one.right for one in read] or [False])):.1f} % right; "
-                 f"{100 * np.mean(valleys < 3):.0f} % below 3 mm, {100 * np.mean(valleys > 6):.0f} "
-                 "% above 6 mm; the paper: most below 3, some above 6")  # fmt: skip
+    """Score the estimate after a spin of 360 degrees, on average 7 mm from the centre."""
+    name, seed = "after a spin", FIRST_SEED + 10_000
+    visits = simulate_visits(LONG_VISITS, "spin", seed)
+    results = [solve_by_field(*visit) for visit in visits]
+    by_valleys = [solve_by_valleys(*visit) for visit in visits]
+    valleys_mm = errors_mm(by_valleys)
+    how = (
+        f"{len(results)} visits: a pass, return to 7 mm from the centre on average, 360 degrees; "
+        f"{NOMINAL}"
+    )
+    yield from _position_rows(
+        name, results, seed, (0.5, None, None), how, "paper's valleys (NMV), the same spins",
+        valleys_mm,
+    )  # fmt: skip
+    read = [result for result in by_valleys if math.isfinite(result.error_m)]
+    read_percent = 100 * len(read) / len(by_valleys)
+    correct_percent = 100 * float(np.mean([result.is_correct for result in by_valleys]))
+    yield _correct_row(name, results, seed, 99.9, "paper's valleys", correct_percent)
+    yield from _probability_rows(name, results, seed)
+    read_correct = 100 * float(np.mean([result.is_correct for result in read] or [False]))
+    yield Figure(f"{name}, paper's valleys: mean", float(valleys_mm.mean()), "mm",
+                 f"of the {read_percent:.0f} % that it reads, of which {read_correct:.1f} % are "
+                 f"correct; {100 * np.mean(valleys_mm < 3):.0f} % below 3 mm, "
+                 f"{100 * np.mean(valleys_mm > 6):.0f} % above 6 mm; the paper: most below 3, "
+                 "some above 6")  # fmt: skip
 
 
 def second_pass_figures() -> Iterator[Figure]:
-    """The same after a second pass, across the first."""
-    name, seed = "after a second pass", SEED + 20_000
-    made = visited(VISITS, "pass", seed)
-    found = [by_field(*one) for one in made]
-    yield from _place(name, found, seed, 0.5, None, None, None, None,
-                      f"{len(found)} visits: a pass, and one across it; {NOMINAL}")  # fmt: skip
-    yield _right(name, found, seed, 99.9, None, None)
-    yield from _probabilities(name, found, seed)
+    """Score the estimate after a second pass across the first."""
+    name, seed = "after a second pass", FIRST_SEED + 20_000
+    results = [solve_by_field(*visit) for visit in simulate_visits(LONG_VISITS, "pass", seed)]
+    how = f"{len(results)} visits: a pass, and one across it; {NOMINAL}"
+    yield from _position_rows(name, results, seed, (0.5, None, None), how)
+    yield _correct_row(name, results, seed, 99.9, None, None)
+    yield from _probability_rows(name, results, seed)
 
 
-def _place(
+def _position_rows(
     name: str,
-    found: Sequence[Found],
+    results: Sequence[VisitResult],
     seed: int,
-    mean: float | None,
-    p95: float | None,
-    largest: float | None,
-    peer: str | None,
-    theirs: Array | None,
+    targets_mm: tuple[float | None, float | None, float | None],
     how: str,
+    peer: str | None = None,
+    peer_errors_mm: Array | None = None,
 ) -> Iterator[Figure]:
-    """Errors of the place; the three numbers are what is promised."""
-    every = errors_mm(found)
-    lost = [one.number for one in found if not math.isfinite(one.error_m)]
-    said = f"; not found or refused: {_numbers(lost)} of seed {seed}" if lost else ""
-    if split := [one.number for one in found if one.visits > 1]:
-        said += f"; taken for several visits, of which the last counts: {_numbers(split)}"
-    worst = sorted((one for one in found if one.error_m > 0), key=lambda one: -one.error_m)[:3]
-    numbers = _numbers([one.number for one in worst])
+    """Yield errors of position and heading; the targets are those of mean, p95 and largest."""
+    errors = errors_mm(results)
+    missing = [result.number for result in results if not math.isfinite(result.error_m)]
+    remarks = f"; not detected or refused: {_list(missing)} of seed {seed}" if missing else ""
+    if divided := [result.number for result in results if result.visits > 1]:
+        remarks += f"; divided into several visits, of which the last counts: {_list(divided)}"
+    by_error = sorted((r for r in results if r.error_m > 0), key=lambda r: -r.error_m)
+    worst = [result.number for result in by_error[:3]]
     by_lines = ", ".join(
-        f"{errors_mm(some).mean():.2f} by {lines}"
+        f"{errors_mm(group).mean():.2f} by {lines}"
         for lines in (1, 2, 3)
-        if (some := [one for one in found if one.lines == lines])
+        if (group := [result for result in results if result.lines == lines])
     )
-    for label, value, target, other, told in (
-        ("mean", every.mean(), mean, np.mean, f"{how}{said}; mean {by_lines} lines of sensors"),
-        ("p95", np.quantile(every, 0.95), p95, lambda a: np.quantile(a, 0.95), "the same"),
-        ("largest", every.max(), largest, np.max, f"visits {numbers} of seed {seed}"),
+    target_mean, target_p95, target_largest = targets_mm
+    for label, statistic, target, detail in (
+        ("mean", _mean, target_mean, f"{how}{remarks}; mean {by_lines} lines of sensors"),
+        ("p95", _p95, target_p95, "of the same visits"),
+        ("largest", _largest, target_largest, f"visits {_list(worst)} of seed {seed}"),
     ):
-        value_theirs = None if theirs is None else float(other(theirs))
-        yield Figure(f"{name}: {label}", float(value), "mm", told, target,
-                     peer=peer, peer_value=value_theirs)  # fmt: skip
-    yield Figure(f"{name}: heading", rms_deg([one.heading_rad for one in found]), "deg",
-                 "rms, of the same")  # fmt: skip
-    nees = np.array([one.nees for one in found])
+        peer_value = None if peer_errors_mm is None else statistic(peer_errors_mm)
+        yield Figure(f"{name}: {label}", statistic(errors), "mm", detail, target,
+                     peer=peer, peer_value=peer_value)  # fmt: skip
+    yield Figure(f"{name}: heading", rms_deg([result.heading_rad for result in results]), "deg",
+                 "rms, of the same visits")  # fmt: skip
+    nees = np.array([result.nees for result in results])
     known = nees[np.isfinite(nees)] if np.isfinite(nees).any() else np.array([math.nan])
     yield Figure(f"{name}: NEES", float(known.mean()), "",
                  f"x, y and heading, at the last sample of the visit; median "
@@ -210,76 +226,90 @@ def _place(
                  peer="consistent", peer_value=3.0)  # fmt: skip
 
 
-def _right(
+def _mean(errors: Array) -> float:
+    return float(errors.mean())
+
+
+def _p95(errors: Array) -> float:
+    return float(np.quantile(errors, 0.95))
+
+
+def _largest(errors: Array) -> float:
+    return float(errors.max())
+
+
+def _correct_row(
     name: str,
-    found: Sequence[Found],
+    results: Sequence[VisitResult],
     seed: int,
     target: float,
     peer: str | None,
-    theirs: float | None,
+    peer_value: float | None,
 ) -> Figure:
-    wrong = [one.number for one in found if not one.right]
-    return Figure(f"{name}: pattern right", 100 * (1 - len(wrong) / len(found)), "%",
-                  f"all four bars, of {len(found)}; wrong, or not found: {_numbers(wrong)} of seed "
-                  f"{seed}", target, "higher", peer, theirs)  # fmt: skip
+    wrong = [result.number for result in results if not result.is_correct]
+    return Figure(f"{name}: pattern right", 100 * (1 - len(wrong) / len(results)), "%",
+                  f"all four bars, of {len(results)}; wrong, or not detected: {_list(wrong)} of "
+                  f"seed {seed}", target, "higher", peer, peer_value)  # fmt: skip
 
 
-def _probabilities(name: str, found: Sequence[Found], seed: int) -> Iterator[Figure]:
-    """Whether probabilities are what they say."""
-    off, bins = calibration(found)
-    yield Figure(f"{name}: calibration error", off, "",
+def _probability_rows(name: str, results: Sequence[VisitResult], seed: int) -> Iterator[Figure]:
+    """Yield the calibration of the reported probabilities."""
+    error, bins = calibration_error(results)
+    yield Figure(f"{name}: calibration error", error, "",
                  f"expected calibration error of the codes' probabilities: {bins}",
                  0.03)  # fmt: skip
-    entropy = [one.entropy for one in found if math.isfinite(one.entropy)] or [math.nan]
-    yield Figure(f"{name}: log loss", log_loss(found), "nats", "of the true codes",
+    entropies = [r.entropy for r in results if math.isfinite(r.entropy)] or [math.nan]
+    yield Figure(f"{name}: log loss", log_loss(results), "nats", "of the true codes",
                  peer="their own entropy: calibrated",
-                 peer_value=float(np.mean(entropy)))  # fmt: skip
-    sure = [one for one in found if one.probability > SURE]
-    wrong = [one.number for one in sure if not one.right]
-    share = 100 * len(wrong) / len(sure) if sure else math.nan
-    yield Figure(f"{name}: wrong above {100 * SURE:.0f} %", share, "%",
-                 f"of {len(sure)} codes told with more: {_numbers(wrong)} of seed {seed}",
-                 100 - 100 * SURE)  # fmt: skip
+                 peer_value=float(np.mean(entropies)))  # fmt: skip
+    confident = [result for result in results if result.probability > CONFIDENT_PROBABILITY]
+    wrong = [result.number for result in confident if not result.is_correct]
+    percent = 100 * len(wrong) / len(confident) if confident else math.nan
+    yield Figure(f"{name}: wrong above {100 * CONFIDENT_PROBABILITY:.0f} %", percent, "%",
+                 f"of {len(confident)} codes with a higher probability: {_list(wrong)} of seed "
+                 f"{seed}", 100 - 100 * CONFIDENT_PROBABILITY)  # fmt: skip
 
 
-def _numbers(which: Sequence[int]) -> str:
-    more = "" if len(which) <= 12 else f" and {len(which) - 12} more"
-    return ", ".join(map(str, which[:12])) + more if which else "none"
+def _list(numbers: Sequence[int]) -> str:
+    more = len(numbers) - MAX_LISTED_NUMBERS
+    text = ", ".join(map(str, numbers[:MAX_LISTED_NUMBERS]))
+    return (text + (f" and {more} more" if more > 0 else "")) or "none"
 
 
-# ---- standing
+# ---- robots at rest
 
 
-def stand_figures() -> Iterator[Figure]:
-    """A static fit of four values."""
+def stop_figures() -> Iterator[Figure]:
+    """Score the static fit of four values."""
     errors = "bars 4 % and 0.3 mm, gains 2 %, offsets 0.1 mT"
-    for name, anywhere, where in (
+    for name, anywhere, poses in (
         ("static at the landmark", False, "3 mm along each axis and 3 degrees off (1 sigma), all "
          "within 10 mm"),
         ("static within 10 mm", True, "anywhere on a disc of 10 mm and within 5 degrees; beyond "
-         "7.5 mm some bars' fields turn over"),
+         "7.5 mm the field of some bars changes its sign"),
     ):  # fmt: skip
-        found = stands(STANDS, SEED + 30, anywhere)
+        static = solve_stops(STOPPED_ROBOTS, FIRST_SEED + 30, anywhere)
         targets = (None, None) if anywhere else (0.4, 0.5)
-        how = f"{STANDS} robots, the code known, four values each; {where}; {errors}"
-        yield from _stood(name, found.field, how, targets)
-        yield Figure(f"{name}: NEES", float(found.nees.mean()), "", "x, y and heading",
+        how = f"{STOPPED_ROBOTS} robots, known code, four values each; {poses}; {errors}"
+        yield from _static_rows(name, static.field, how, targets)
+        yield Figure(f"{name}: NEES", float(static.nees.mean()), "", "x, y and heading",
                      peer="consistent", peer_value=3.0)  # fmt: skip
-        for label, way in (("linear", found.linear), ("by Newton's method", found.inverted)):
-            yield from _stood(f"{name}, --method paper, {label}", way, "the same values")
+        for label, by_paper in (("linear", static.linear), ("by Newton's method", static.newton)):
+            yield from _static_rows(f"{name}, --method paper, {label}", by_paper, "the same values")
 
 
-def _stood(
+def _static_rows(
     name: str,
     errors: Array,
     how: str,
     targets: tuple[float | None, float | None] = (None, None),
 ) -> Iterator[Figure]:
     known = errors[np.isfinite(errors[:, 0])]
-    away = 1e3 * np.hypot(known[:, 0], known[:, 1]) if len(known) else np.array([math.nan])
-    lost = f"; {len(errors) - len(known)} unsolved" if len(known) < len(errors) else ""
-    yield Figure(f"{name}: mean", float(away.mean()), "mm",
-                 f"{how}{lost}; p95 {np.quantile(away, 0.95):.2f}, largest {away.max():.2f}",
-                 targets[0], peer="paper", peer_value=1.0)  # fmt: skip
-    yield Figure(f"{name}: heading", rms_deg(list(known[:, 2])), "deg", "rms, the same",
+    distances = 1e3 * np.hypot(known[:, 0], known[:, 1]) if len(known) else np.array([math.nan])
+    unsolved = f"; {len(errors) - len(known)} unsolved" if len(known) < len(errors) else ""
+    yield Figure(f"{name}: mean", float(distances.mean()), "mm",
+                 f"{how}{unsolved}; p95 {np.quantile(distances, 0.95):.2f}, largest "
+                 f"{distances.max():.2f}", targets[0], peer="paper",
+                 peer_value=1.0)  # fmt: skip
+    yield Figure(f"{name}: heading", rms_deg(list(known[:, 2])), "deg", "rms, of the same",
                  targets[1], peer="paper", peer_value=1.5)  # fmt: skip

@@ -1,8 +1,7 @@
-"""Colours of a PDF without black ink: what black was made of is given to the other three.
+"""Colours of a PDF without black ink: black is replaced by the other three inks.
 
-A colour space says how many numbers make a colour; :func:`space` reads one from the
-document and knows how to turn such numbers into cyan, magenta and yellow. Everything
-here is of ISO 32000-1, chapters 7.10 (functions) and 8.6 (colour spaces).
+:func:`read_colour_space` reads a colour space and provides the conversion of its colours to cyan,
+magenta and yellow, according to ISO 32000-1, 7.10 (functions) and 8.6 (colour spaces).
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from pikepdf import Name
 
 Floats = NDArray[np.float64]
 
-FAMILIES = {
+COMPONENTS_BY_NAME = {
     "/DeviceGray": 1,
     "/G": 1,
     "/CalGray": 1,
@@ -34,18 +33,18 @@ INKS = ("/Cyan", "/Magenta", "/Yellow", "/Black")
 
 
 @dataclass(frozen=True)
-class Space:
-    """A colour space whose colours can be made without black.
+class ColourSpace:
+    """Colour space with a conversion to inks without black.
 
     Attributes
     ----------
     kind : {"grey", "rgb", "cmyk", "indexed", "tint", "inks"}
     components : int
     initial : tuple of float
-        The colour that is set together with the space.
+        Colour that is set together with the space.
     cmy : callable
-        (n, components) numbers as in the document to (n, 3) cyan, magenta and yellow,
-        each 0 for none to 1 for all.
+        Maps (n, components) numbers of the document to (n, 3) cyan, magenta and yellow, from 0
+        (no ink) to 1.
     high : int
         Largest index of an indexed space.
     """
@@ -58,75 +57,77 @@ class Space:
 
 
 def from_grey(values: Floats) -> Floats:
-    """(n, 1) grey to (n, 3): black is all three inks."""
+    """Convert grey (n, 1) to inks (n, 3): black is all three inks."""
     return np.repeat(1 - np.clip(values, 0, 1), 3, axis=1)
 
 
 def from_rgb(values: Floats) -> Floats:
-    """(n, 3) to (n, 3): each ink takes one light away."""
+    """Convert RGB (n, 3) to inks (n, 3): each ink absorbs one colour."""
     return 1 - np.clip(values, 0, 1)
 
 
 def from_cmyk(values: Floats) -> Floats:
-    """(n, 4) to (n, 3): black darkens what the other three leave, ``c + k - c k``.
+    """Convert CMYK (n, 4) to inks (n, 3): black absorbs the remaining light, ``c + k - c k``.
 
-    The sum ``c + k`` of ISO 32000-1 10.3.5 would make all dark colours the same black.
+    With the sum ``c + k`` of ISO 32000-1 10.3.5 all dark colours would become the same black.
     """
     ink, black = np.clip(values[:, :3], 0, 1), np.clip(values[:, 3:], 0, 1)
     return ink + black - ink * black
 
 
-GREY = Space("grey", 1, (0.0,), from_grey)
-RGB = Space("rgb", 3, (0.0, 0.0, 0.0), from_rgb)
-CMYK = Space("cmyk", 4, (0.0, 0.0, 0.0, 1.0), from_cmyk)
+GREY = ColourSpace("grey", 1, (0.0,), from_grey)
+RGB = ColourSpace("rgb", 3, (0.0, 0.0, 0.0), from_rgb)
+CMYK = ColourSpace("cmyk", 4, (0.0, 0.0, 0.0, 1.0), from_cmyk)
 BY_COMPONENTS = {1: GREY, 3: RGB, 4: CMYK}
 
 
-def space(found: pikepdf.Object | None, named: pikepdf.Object | None = None) -> Space | None:
-    """The colour space that ``found`` describes, None where it cannot be done without black.
+def read_colour_space(
+    definition: pikepdf.Object | None, named: pikepdf.Object | None = None
+) -> ColourSpace | None:
+    """Read a colour space; return None if it cannot be converted to inks without black.
 
     Parameters
     ----------
-    found : Name or Array
+    definition : Name or Array
     named : Dictionary, optional
-        ``ColorSpace`` of the resources, in which a name is looked up.
+        ``ColorSpace`` of the resources, in which names are looked up.
     """
-    if isinstance(found, Name):
-        if str(found) in FAMILIES:
-            return BY_COMPONENTS[FAMILIES[str(found)]]
-        inner = None if named is None else named.get(str(found))
-        # A name that stands for a name that stands for ... ends here.
-        return space(inner) if inner is not None and inner != found else None
-    if not isinstance(found, pikepdf.Array) or len(found) == 0:
+    if isinstance(definition, Name):
+        if str(definition) in COMPONENTS_BY_NAME:
+            return BY_COMPONENTS[COMPONENTS_BY_NAME[str(definition)]]
+        inner = None if named is None else named.get(str(definition))
+        # Names that refer to names are resolved once only, which excludes endless loops.
+        return read_colour_space(inner) if inner is not None and inner != definition else None
+    if not isinstance(definition, pikepdf.Array) or len(definition) == 0:
         return None
-    family = str(found[0])
-    if family in FAMILIES:
-        return BY_COMPONENTS[FAMILIES[family]]
+    family = str(definition[0])
+    if family in COMPONENTS_BY_NAME:
+        return BY_COMPONENTS[COMPONENTS_BY_NAME[family]]
     if family == "/ICCBased":
-        return _profile(found)
+        return _profile(definition)
     if family in ("/Indexed", "/I"):
-        return _indexed(found, named)
+        return _indexed(definition, named)
     if family == "/Separation":
-        return _tint(found, named)
+        return _tint(definition, named)
     if family == "/DeviceN":
-        return _inks(found)
+        return _inks(definition)
     return None
 
 
-def _profile(found: pikepdf.Array) -> Space | None:
-    stream = found[1]
+def _profile(definition: pikepdf.Array) -> ColourSpace | None:
+    stream = definition[1]
     alternate = stream.get("/Alternate")
     if isinstance(alternate, pikepdf.Array) and str(alternate[0]) == "/Lab":
         return None
     return BY_COMPONENTS.get(int(stream.get("/N", 0)))
 
 
-def _indexed(found: pikepdf.Array, named: pikepdf.Object | None) -> Space | None:
-    base = space(found[1], named)
+def _indexed(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
+    base = read_colour_space(definition[1], named)
     if base is None or base.kind == "indexed":
         return None
-    high = int(found[2])
-    table = found[3]
+    high = int(definition[2])
+    table = definition[3]
     data = table.read_bytes() if isinstance(table, pikepdf.Stream) else bytes(table)
     wanted = (high + 1) * base.components
     entries = np.frombuffer(data[:wanted].ljust(wanted, b"\0"), np.uint8) / 255.0
@@ -135,51 +136,53 @@ def _indexed(found: pikepdf.Array, named: pikepdf.Object | None) -> Space | None
     def look_up(values: Floats) -> Floats:
         return palette[np.clip(values[:, 0].astype(int), 0, high)]
 
-    return Space("indexed", 1, (0.0,), look_up, high)
+    return ColourSpace("indexed", 1, (0.0,), look_up, high)
 
 
-def _tint(found: pikepdf.Array, named: pikepdf.Object | None) -> Space | None:
-    """One ink: black itself, or a spot colour by its alternate."""
-    name = str(found[1])
-    if name in ("/Black", "/All"):  # /All is on every plate, so on that of black
-        return Space("tint", 1, (1.0,), lambda v: np.repeat(np.clip(v, 0, 1), 3, axis=1))
+def _tint(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
+    """Read a single ink: black itself, or a spot colour by its alternate space."""
+    name = str(definition[1])
+    if name in ("/Black", "/All"):  # /All is printed with all inks, including black
+        return ColourSpace("tint", 1, (1.0,), lambda v: np.repeat(np.clip(v, 0, 1), 3, axis=1))
     if name in INKS:
         plate = np.eye(4)[INKS.index(name), :3]
-        return Space("tint", 1, (1.0,), lambda v: np.clip(v, 0, 1) * plate)
-    alternate = space(found[2], named)
-    transform = function(found[3])
+        return ColourSpace("tint", 1, (1.0,), lambda v: np.clip(v, 0, 1) * plate)
+    alternate = read_colour_space(definition[2], named)
+    transform = read_function(definition[3])
     if alternate is None or transform is None:
         return None
-    return Space("tint", 1, (1.0,), lambda v: alternate.cmy(transform(np.clip(v[:, 0], 0, 1))))
+    return ColourSpace(
+        "tint", 1, (1.0,), lambda v: alternate.cmy(transform(np.clip(v[:, 0], 0, 1)))
+    )
 
 
-def _inks(found: pikepdf.Array) -> Space | None:
-    """Several inks, where all of them are process inks."""
-    names = [str(name) for name in found[1]]
+def _inks(definition: pikepdf.Array) -> ColourSpace | None:
+    """Read several inks if all of them are process inks."""
+    names = [str(name) for name in definition[1]]
     if not set(names) <= {*INKS, "/None"}:
         return None
-    into = np.array([[float(ink == name) for ink in INKS] for name in names])
-    return Space("inks", len(names), (1.0,) * len(names), lambda v: from_cmyk(v @ into))
+    to_cmyk = np.array([[float(ink == name) for ink in INKS] for name in names])
+    return ColourSpace("inks", len(names), (1.0,) * len(names), lambda v: from_cmyk(v @ to_cmyk))
 
 
-def function(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
-    """A function of one number, (n,) to (n, outputs); None for kinds that are not read.
+def read_function(definition: pikepdf.Object) -> Callable[[Floats], Floats] | None:
+    """Read a function of one number, (n,) to (n, outputs); return None for unsupported types.
 
-    Read are sampled (type 0), exponential (2) and stitched (3) functions, and lists of them
+    Supported are sampled (type 0), exponential (2) and stitched (3) functions, and lists of them
     with one output each.
     """
-    if isinstance(found, pikepdf.Array):
-        parts = [function(item) for item in found]
+    if isinstance(definition, pikepdf.Array):
+        parts = [read_function(item) for item in definition]
         if any(part is None for part in parts):
             return None
         return lambda x: np.hstack([part(x) for part in parts if part is not None])
-    kind = int(found.get("/FunctionType", -1))
-    made = {0: _sampled, 2: _exponential, 3: _stitched}.get(kind)
-    inner = made(found) if made is not None else None
+    kind = int(definition.get("/FunctionType", -1))
+    read = {0: _sampled, 2: _exponential, 3: _stitched}.get(kind)
+    inner = read(definition) if read is not None else None
     if inner is None:
         return None
-    low, high = numbers(found.Domain)[:2]
-    ends = numbers(found.Range).reshape(-1, 2) if "/Range" in found else None
+    low, high = numbers(definition.Domain)[:2]
+    ends = numbers(definition.Range).reshape(-1, 2) if "/Range" in definition else None
 
     def evaluate(x: Floats) -> Floats:
         result = inner(np.clip(x, low, high))
@@ -188,54 +191,54 @@ def function(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
     return evaluate
 
 
-def numbers(found: Any) -> Floats:
-    """A PDF array of numbers."""
-    return np.array([float(item) for item in found])
+def numbers(definition: Any) -> Floats:
+    """Convert a PDF array of numbers."""
+    return np.array([float(item) for item in definition])
 
 
-def _exponential(found: pikepdf.Object) -> Callable[[Floats], Floats]:
-    first = numbers(found.C0) if "/C0" in found else np.zeros(1)
-    last = numbers(found.C1) if "/C1" in found else np.ones(1)
-    power = float(found.N)
+def _exponential(definition: pikepdf.Object) -> Callable[[Floats], Floats]:
+    first = numbers(definition.C0) if "/C0" in definition else np.zeros(1)
+    last = numbers(definition.C1) if "/C1" in definition else np.ones(1)
+    power = float(definition.N)
     return lambda x: first + (x**power)[:, None] * (last - first)
 
 
-def _stitched(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
-    parts = [function(item) for item in found.Functions]
+def _stitched(definition: pikepdf.Object) -> Callable[[Floats], Floats] | None:
+    parts = [read_function(item) for item in definition.Functions]
     if any(part is None for part in parts):
         return None
-    domain, bounds = numbers(found.Domain)[:2], numbers(found.Bounds)
-    encode = numbers(found.Encode).reshape(-1, 2)
+    domain, bounds = numbers(definition.Domain)[:2], numbers(definition.Bounds)
+    encode = numbers(definition.Encode).reshape(-1, 2)
     edges = np.concatenate([domain[:1], bounds, domain[1:]])
 
     def evaluate(x: Floats) -> Floats:
-        which = np.searchsorted(bounds, x, side="right")
+        part_index = np.searchsorted(bounds, x, side="right")
         results = []
         for k, part in enumerate(parts):
             assert part is not None
             width = edges[k + 1] - edges[k]
-            share = (x - edges[k]) / width if width else np.zeros_like(x)
-            results.append(part(encode[k, 0] + share * (encode[k, 1] - encode[k, 0])))
-        return np.stack(results)[which, np.arange(len(x))]
+            fraction = (x - edges[k]) / width if width else np.zeros_like(x)
+            results.append(part(encode[k, 0] + fraction * (encode[k, 1] - encode[k, 0])))
+        return np.stack(results)[part_index, np.arange(len(x))]
 
     return evaluate
 
 
-def _sampled(found: pikepdf.Object) -> Callable[[Floats], Floats] | None:
-    size, bits = numbers(found.Size), int(found.BitsPerSample)
-    if len(size) != 1 or bits not in (8, 16, 32) or not isinstance(found, pikepdf.Stream):
+def _sampled(definition: pikepdf.Object) -> Callable[[Floats], Floats] | None:
+    size, bits = numbers(definition.Size), int(definition.BitsPerSample)
+    if len(size) != 1 or bits not in (8, 16, 32) or not isinstance(definition, pikepdf.Stream):
         return None
-    ends = numbers(found.Range).reshape(-1, 2)
-    samples = np.frombuffer(found.read_bytes(), f">u{bits // 8}")[: int(size[0]) * len(ends)]
+    ends = numbers(definition.Range).reshape(-1, 2)
+    samples = np.frombuffer(definition.read_bytes(), f">u{bits // 8}")[: int(size[0]) * len(ends)]
     samples = samples.reshape(int(size[0]), len(ends)) / (2.0**bits - 1)
-    decode = numbers(found.Decode).reshape(-1, 2) if "/Decode" in found else ends
+    decode = numbers(definition.Decode).reshape(-1, 2) if "/Decode" in definition else ends
     table = decode[:, 0] + samples * (decode[:, 1] - decode[:, 0])
-    low, high = numbers(found.Domain)[:2]
-    start, end = numbers(found.Encode)[:2] if "/Encode" in found else (0.0, size[0] - 1)
+    low, high = numbers(definition.Domain)[:2]
+    start, end = numbers(definition.Encode)[:2] if "/Encode" in definition else (0.0, size[0] - 1)
 
     def evaluate(x: Floats) -> Floats:
-        at = np.clip(start + (x - low) / (high - low) * (end - start), 0, size[0] - 1)
-        columns = [np.interp(at, np.arange(len(table)), column) for column in table.T]
+        position = np.clip(start + (x - low) / (high - low) * (end - start), 0, size[0] - 1)
+        columns = [np.interp(position, np.arange(len(table)), column) for column in table.T]
         return np.stack(columns, axis=1)
 
     return evaluate

@@ -1,9 +1,9 @@
-"""Pictures and shadings of a PDF without black ink.
+"""Images and shadings of a PDF without black ink.
 
-Samples are left as they are wherever a colour space can say the same of them: red, green
-and blue are the other side of cyan, magenta and yellow, and a list of 256 colours needs no
-black. So photos lose nothing and files grow by nothing; only where black is a channel of
-its own (CMYK), or a grey photo is a JPEG, are samples made anew.
+If possible, samples remain unchanged and only their colour space is replaced: red, green and blue
+are the complements of cyan, magenta and yellow, and a palette of 256 colours needs no black.
+Photos then lose no quality and files do not grow. Only if black is a channel (CMYK), or if a grey
+photo is a JPEG, new samples are computed.
 """
 
 from __future__ import annotations
@@ -17,35 +17,37 @@ from numpy.typing import NDArray
 from pikepdf import Array, Dictionary, Name, Pdf, Stream, StreamDecodeLevel
 
 from locatk.formats.printing.separation import colours
-from locatk.formats.printing.separation.colours import Floats, Space
+from locatk.formats.printing.separation.colours import ColourSpace, Floats
 
-JPEG_QUALITY = 95
-SHADES = 1024
-"""Steps of a shading's colours; a printer makes 256."""
+JPEG_QUALITY_PERCENT = 95
+SHADING_STEPS = 1024
+"""Colours of a shading; a printer reproduces 256."""
 
-BLOCK = 1 << 20
+BLOCK_PIXELS = 1 << 20
 """Pixels whose colours are computed at once."""
 
 Bytes = NDArray[np.uint8]
 
 
-class Left(Exception):
-    """What cannot be done without black; says why, in a few words in the plural."""
+class NotConvertible(Exception):
+    """Kind of objects, in the plural, that cannot be converted to inks without black."""
 
 
 def inks_space(pdf: Pdf) -> pikepdf.Object:
-    """Colour space of three numbers: cyan, magenta, yellow, and never black."""
+    """Create the colour space of cyan, magenta and yellow, without black."""
     to_cmyk = Stream(pdf, b"{0}")
     to_cmyk.FunctionType = 4
     to_cmyk.Domain = Array([0, 1] * 3)
     to_cmyk.Range = Array([0, 1] * 4)
     inks = Array([Name.Cyan, Name.Magenta, Name.Yellow])
-    made = Array([Name.DeviceN, inks, Name.DeviceCMYK, pdf.make_indirect(to_cmyk)])
-    return pdf.make_indirect(made)
+    converted = Array([Name.DeviceN, inks, Name.DeviceCMYK, pdf.make_indirect(to_cmyk)])
+    return pdf.make_indirect(converted)
 
 
-def picture(pdf: Pdf, image: Stream, named: pikepdf.Object | None, inks: pikepdf.Object) -> Stream:
-    """An image without black, as a new stream; ``image`` itself where it has no colours.
+def convert_image(
+    pdf: Pdf, image: Stream, named: pikepdf.Object | None, inks: pikepdf.Object
+) -> Stream:
+    """Return an image without black as a new stream, or ``image`` itself if it has no colours.
 
     Parameters
     ----------
@@ -59,127 +61,129 @@ def picture(pdf: Pdf, image: Stream, named: pikepdf.Object | None, inks: pikepdf
 
     Raises
     ------
-    Left
-        It cannot be converted.
+    NotConvertible
+        The object has to remain as it is.
     """
     if bool(image.get("/ImageMask", False)):
-        return image  # a stencil, in the colour that is set when it is painted
+        return image  # a stencil, painted in the current colour
     filters = _filters(image)
     if "/JPXDecode" in filters:
         return _jpeg_2000(pdf, image, named, inks)
-    found = colours.space(image.get("/ColorSpace"), named)
-    if found is None:
-        raise Left("images in a spot or Lab colour space")
+    space = colours.read_colour_space(image.get("/ColorSpace"), named)
+    if space is None:
+        raise NotConvertible("images in a spot or Lab colour space")
     bits = int(image.get("/BitsPerComponent", 8))
-    decode = _decode(image, found, bits)
+    decode = _decode(image, space, bits)
     is_jpeg = filters[-1:] == ["/DCTDecode"]
-    if found.kind == "rgb":
-        made = copy.copy(image)
-        made.ColorSpace = inks
-        made.Decode = Array([_number(1 - end) for end in decode.ravel()])
-        _convert_matte(pdf, made, found)
-    elif found.components == 1 and bits <= 8 and not (is_jpeg and found.kind != "indexed"):
+    if space.kind == "rgb":
+        converted = copy.copy(image)
+        converted.ColorSpace = inks
+        converted.Decode = Array([_number(1 - end) for end in decode.ravel()])
+        _convert_matte(pdf, converted, space)
+    elif space.components == 1 and bits <= 8 and not (is_jpeg and space.kind != "indexed"):
         _no_matte(image)
-        made = copy.copy(image)
-        made.ColorSpace = _palette(found, decode[0], bits)
-        if "/Decode" in made:
-            del made.Decode
+        converted = copy.copy(image)
+        converted.ColorSpace = _palette(space, decode[0], bits)
+        if "/Decode" in converted:
+            del converted.Decode
     else:
         if isinstance(image.get("/Mask"), Array):
-            raise Left("images with a transparent colour")
+            raise NotConvertible("images with a transparent colour")
         _no_matte(image)
-        made = _with_samples(pdf, image, _lights(image, found, decode, bits), is_jpeg, inks)
-    if "/Alternates" in made:
-        del made.Alternates
-    return made
+        converted = _with_samples(
+            pdf, image, _remaining_light(image, space, decode, bits), is_jpeg, inks
+        )
+    if "/Alternates" in converted:
+        del converted.Alternates
+    return converted
 
 
 def _filters(image: Stream) -> list[str]:
-    found = image.get("/Filter")
-    if found is None:
+    names = image.get("/Filter")
+    if names is None:
         return []
-    return [str(name) for name in found] if isinstance(found, Array) else [str(found)]
+    return [str(name) for name in names] if isinstance(names, Array) else [str(names)]
 
 
-def _decode(image: Stream, found: Space, bits: int) -> Floats:
-    """(components, 2): what the smallest and the largest sample mean."""
+def _decode(image: Stream, space: ColourSpace, bits: int) -> Floats:
+    """Return the values (components, 2) of the smallest and of the largest sample."""
     if "/Decode" in image:
         given = colours.numbers(image.Decode)
-        if given.size >= 2 * found.components:
-            return given[: 2 * found.components].reshape(-1, 2)
-    top = float((1 << bits) - 1) if found.kind == "indexed" else 1.0
-    return np.tile([0.0, top], (found.components, 1))
+        if given.size >= 2 * space.components:
+            return given[: 2 * space.components].reshape(-1, 2)
+    top = float((1 << bits) - 1) if space.kind == "indexed" else 1.0
+    return np.tile([0.0, top], (space.components, 1))
 
 
-def _palette(found: Space, decode: Floats, bits: int) -> Array:
+def _palette(space: ColourSpace, decode: Floats, bits: int) -> Array:
     top = (1 << bits) - 1
     values = decode[0] + np.arange(top + 1) * (decode[1] - decode[0]) / top
     table = np.zeros((top + 1, 4), np.uint8)
-    table[:, :3] = np.round(255 * found.cmy(values[:, None]))
+    table[:, :3] = np.round(255 * space.cmy(values[:, None]))
     return Array([Name.Indexed, Name.DeviceCMYK, top, pikepdf.String(table.tobytes())])
 
 
-def _lights(image: Stream, found: Space, decode: Floats, bits: int) -> Bytes:
-    """(height, width, 3): 255 where there is no ink."""
+def _remaining_light(image: Stream, space: ColourSpace, decode: Floats, bits: int) -> Bytes:
+    """Return the light (height, width, 3) that the inks do not absorb, 255 without ink."""
     width, height = int(image.Width), int(image.Height)
     if bits not in (8, 16):
-        raise Left("images of few bits in CMYK")
+        raise NotConvertible("images of few bits in CMYK")
     data = np.frombuffer(image.read_bytes(decode_level=StreamDecodeLevel.all), np.uint8)
     step = bits // 8
-    wanted = width * height * found.components * step
+    wanted = width * height * space.components * step
     if width < 1 or height < 1 or data.size < wanted:
-        raise Left("images that are cut short")
-    samples = data[:wanted:step].reshape(-1, found.components)
+        raise NotConvertible("images that are cut short")
+    samples = data[:wanted:step].reshape(-1, space.components)
     lights = np.empty((len(samples), 3), np.uint8)
-    for start in range(0, len(samples), BLOCK):
-        block = slice(start, start + BLOCK)
+    for start in range(0, len(samples), BLOCK_PIXELS):
+        block = slice(start, start + BLOCK_PIXELS)
         values = decode[:, 0] + samples[block] / 255.0 * (decode[:, 1] - decode[:, 0])
-        lights[block] = np.round(255 * (1 - found.cmy(values)))
+        lights[block] = np.round(255 * (1 - space.cmy(values)))
     return lights.reshape(height, width, 3)
 
 
 def _with_samples(
     pdf: Pdf, image: Stream, lights: Bytes, is_jpeg: bool, inks: pikepdf.Object
 ) -> Stream:
-    """A copy of ``image`` with other samples."""
-    made = pdf.make_stream(b"")
+    """Return a copy of ``image`` with other samples."""
+    converted = pdf.make_stream(b"")
     for key in image.keys():  # noqa: SIM118 - a Stream is no mapping
         if key not in ("/Length", "/Filter", "/DecodeParms", "/SMaskInData"):
-            made[key] = image[key]
-    made.ColorSpace = inks
-    made.BitsPerComponent = 8
-    made.Decode = Array([1, 0] * 3)
-    made.Height, made.Width = lights.shape[:2]
+            converted[key] = image[key]
+    converted.ColorSpace = inks
+    converted.BitsPerComponent = 8
+    converted.Decode = Array([1, 0] * 3)
+    converted.Height, converted.Width = lights.shape[:2]
     if is_jpeg:
-        import cv2
+        import cv2  # slow to import
 
-        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY_PERCENT]
         _, data = cv2.imencode(".jpg", lights[..., ::-1], options)
-        made.write(data.tobytes(), filter=Name.DCTDecode, type_check=False)
-        return made
-    # Differences from the row above pack far better (PNG's predictor "up").
+        converted.write(data.tobytes(), filter=Name.DCTDecode, type_check=False)
+        return converted
+    # Differences from the row above are far more compressible (PNG's predictor "up").
     rows = lights.reshape(len(lights), -1)
     coded = np.full((len(rows), rows.shape[1] + 1), 2, np.uint8)
     coded[:, 1:] = np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
     how = Dictionary(Predictor=15, Colors=3, BitsPerComponent=8, Columns=lights.shape[1])
     packed = zlib.compress(coded.tobytes(), 6)
-    made.write(packed, filter=Name.FlateDecode, decode_parms=how, type_check=False)
-    return made
+    converted.write(packed, filter=Name.FlateDecode, decode_parms=how, type_check=False)
+    return converted
 
 
 def _jpeg_2000(
     pdf: Pdf, image: Stream, named: pikepdf.Object | None, inks: pikepdf.Object
 ) -> Stream:
-    """JPEG 2000, which brings its own colours: to a JPEG, where it is grey or RGB."""
-    import cv2
+    """Convert a JPEG 2000, which contains its colour space, to a JPEG if it is grey or RGB."""
+    import cv2  # slow to import
 
     given = image.get("/ColorSpace")
-    found = None if given is None else colours.space(given, named)
-    plain = given is None or (found is not None and found.kind in ("grey", "rgb"))
+    space = None if given is None else colours.read_colour_space(given, named)
+    plain = given is None or (space is not None and space.kind in ("grey", "rgb"))
     if not plain or int(image.get("/SMaskInData", 0)) or "/Decode" in image:
-        raise Left("JPEG 2000 images")
+        raise NotConvertible("JPEG 2000 images")
     if isinstance(image.get("/Mask"), Array) or _filters(image) != ["/JPXDecode"]:
-        raise Left("JPEG 2000 images")
+        raise NotConvertible("JPEG 2000 images")
     _no_matte(image)
     data = np.frombuffer(image.read_raw_bytes(), np.uint8)
     try:
@@ -187,7 +191,7 @@ def _jpeg_2000(
     except cv2.error:
         pixels = None
     if pixels is None or pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] != 3):
-        raise Left("JPEG 2000 images")
+        raise NotConvertible("JPEG 2000 images")
     lights = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels[..., ::-1]
     return _with_samples(pdf, image, np.ascontiguousarray(lights), True, inks)
 
@@ -195,55 +199,55 @@ def _jpeg_2000(
 def _no_matte(image: Stream) -> None:
     mask = image.get("/SMask")
     if mask is not None and "/Matte" in mask:
-        raise Left("images blended with a matte")
+        raise NotConvertible("images blended with a matte")
 
 
-def _convert_matte(pdf: Pdf, made: Stream, found: Space) -> None:
-    mask = made.get("/SMask")
+def _convert_matte(pdf: Pdf, converted: Stream, space: ColourSpace) -> None:
+    mask = converted.get("/SMask")
     if mask is not None and "/Matte" in mask:
         changed = copy.copy(mask)
-        matte = found.cmy(colours.numbers(mask.Matte)[None, :])[0]
+        matte = space.cmy(colours.numbers(mask.Matte)[None, :])[0]
         changed.Matte = Array([_number(value) for value in matte])
-        made.SMask = pdf.make_indirect(changed)
+        converted.SMask = pdf.make_indirect(changed)
 
 
-def shading(
+def convert_shading(
     pdf: Pdf, shaded: pikepdf.Object, named: pikepdf.Object | None, inks: pikepdf.Object
 ) -> pikepdf.Object:
-    """A shading without black, as a new object.
+    """Return a shading without black as a new object.
 
     Raises
     ------
-    Left
-        It cannot be converted.
+    NotConvertible
+        The object has to remain as it is.
     """
     kind = int(shaded.ShadingType)
-    found = colours.space(shaded.get("/ColorSpace"), named)
-    if found is None or kind == 1:
-        raise Left("shadings by a formula, or in a spot or Lab colour space")
-    made = copy.copy(shaded)
+    space = colours.read_colour_space(shaded.get("/ColorSpace"), named)
+    if space is None or kind == 1:
+        raise NotConvertible("shadings by a formula, or in a spot or Lab colour space")
+    converted = copy.copy(shaded)
     if "/Background" in shaded:
-        cmy = found.cmy(colours.numbers(shaded.Background)[None, :])[0]
-    if "/Function" in shaded or (kind >= 4 and found.components == 1):
+        cmy = space.cmy(colours.numbers(shaded.Background)[None, :])[0]
+    if "/Function" in shaded or (kind >= 4 and space.components == 1):
         low, high = _parameter(shaded, kind)
-        made.Function = _colours_along(pdf, shaded, found, low, high)
-        made.ColorSpace = Name.DeviceCMYK
+        converted.Function = _colours_along(pdf, shaded, space, low, high)
+        converted.ColorSpace = Name.DeviceCMYK
         background = [*cmy, 0.0] if "/Background" in shaded else None
-    elif kind >= 4 and found.kind == "rgb":
+    elif kind >= 4 and space.kind == "rgb":
         decode = colours.numbers(shaded.Decode)
         decode[4:] = 1 - decode[4:]
-        made.Decode = Array([_number(value) for value in decode])
-        made.ColorSpace = inks
+        converted.Decode = Array([_number(value) for value in decode])
+        converted.ColorSpace = inks
         background = [*cmy] if "/Background" in shaded else None
     else:
-        raise Left("shadings of a mesh in CMYK")
+        raise NotConvertible("shadings of a mesh in CMYK")
     if background is not None:
-        made.Background = Array([_number(value) for value in background])
-    return made
+        converted.Background = Array([_number(value) for value in background])
+    return converted
 
 
 def _parameter(shaded: pikepdf.Object, kind: int) -> tuple[float, float]:
-    """Range of the number that the colours of a shading are a function of."""
+    """Return the range of the parameter of a shading."""
     if kind >= 4:
         low, high = colours.numbers(shaded.Decode)[4:6]
     else:
@@ -252,29 +256,29 @@ def _parameter(shaded: pikepdf.Object, kind: int) -> tuple[float, float]:
 
 
 def _colours_along(
-    pdf: Pdf, shaded: pikepdf.Object, found: Space, low: float, high: float
+    pdf: Pdf, shaded: pikepdf.Object, space: ColourSpace, low: float, high: float
 ) -> pikepdf.Object:
-    """A sampled function from the parameter to CMYK without K."""
-    along = np.linspace(low, high, SHADES)
+    """Return a sampled function from the parameter to CMYK with zero black."""
+    along = np.linspace(low, high, SHADING_STEPS)
     if "/Function" in shaded:
-        inner = colours.function(shaded.Function)
+        inner = colours.read_function(shaded.Function)
         if inner is None:
-            raise Left("shadings by a formula, or in a spot or Lab colour space")
+            raise NotConvertible("shadings by a formula, or in a spot or Lab colour space")
         values = inner(along)
     else:
         values = along[:, None]
-    table = np.zeros((SHADES, 4), np.uint8)
-    table[:, :3] = np.round(255 * found.cmy(values))
-    made = Stream(pdf, table.tobytes())
-    made.FunctionType = 0
-    made.Domain = Array([_number(low), _number(high)])
-    made.Range = Array([0, 1] * 4)
-    made.Size = Array([SHADES])
-    made.BitsPerSample = 8
-    return pdf.make_indirect(made)
+    table = np.zeros((SHADING_STEPS, 4), np.uint8)
+    table[:, :3] = np.round(255 * space.cmy(values))
+    converted = Stream(pdf, table.tobytes())
+    converted.FunctionType = 0
+    converted.Domain = Array([_number(low), _number(high)])
+    converted.Range = Array([0, 1] * 4)
+    converted.Size = Array([SHADING_STEPS])
+    converted.BitsPerSample = 8
+    return pdf.make_indirect(converted)
 
 
 def _number(value: float) -> float | int:
-    """As short as it can be written."""
+    """Round a number to six decimals; integers are written as such."""
     rounded = round(float(value), 6)
     return int(rounded) if rounded == int(rounded) else rounded

@@ -93,7 +93,7 @@ def test_a_family_is_drawn_whole(locatk, family_file: Path, tmp_path: Path) -> N
     assert all(f"id {number}\r" in words(out) for number in range(0, 510, 17))
     stranger = locatk("print", "tag", family_file, "--id", 3, "-o", tmp_path / "b.pdf")
     assert stranger.exit_code == 1
-    assert "id 3 is no member of the family" in stranger.stderr
+    assert "id 3 is not in the family" in stranger.stderr
     assert str(family_file) in stranger.stderr
     assert not (tmp_path / "b.pdf").exists()
 

@@ -14,7 +14,7 @@ from locatk.core.dots.calibration.printed_fields import FieldScore
 from locatk.core.dots.calibration.printer import PrinterReport, calibrate, find_sheet, recommend
 from locatk.core.dots.drawing.test_sheet import PrinterSheet, marker_dictionary, printer_sheet
 from locatk.core.errors import DegenerateError, InputError
-from locatk.formats.printing.test_sheet import render
+from locatk.formats.printing.pattern import render_test_sheet
 
 Ink = NDArray[np.uint8]
 SCAN_DPI = 450.0
@@ -26,7 +26,7 @@ GREY = np.rint(255 * (1.055 * LIGHT ** (1 / 2.4) - 0.055)).astype(np.uint8)
 
 def printed(sheet: PrinterSheet) -> Ink:
     """A perfect print, by a renderer that is not ours: 255 where there is ink."""
-    page = pypdfium2.PdfDocument(render(sheet))[0]
+    page = pypdfium2.PdfDocument(render_test_sheet(sheet))[0]
     picture = page.render(scale=sheet.dpi / 72).to_numpy()[..., 0]
     return np.where(picture < 128, np.uint8(255), np.uint8(0))
 

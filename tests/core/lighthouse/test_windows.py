@@ -79,7 +79,7 @@ def test_too_low_a_rate_is_refused() -> None:
 @pytest.mark.slow
 def test_published_windows_are_read(data: Path) -> None:
     """More than the published decoder reads (79.6 %), and no station that is not there."""
-    from locatk.formats.benchmarks.infrared.suite import published_windows
+    from locatk.formats.benchmarks.infrared import published_windows
 
     rows = published_windows(data / "lighthouse")
     matches = read_windows(rows).matches

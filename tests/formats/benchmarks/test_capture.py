@@ -1,4 +1,4 @@
-"""The figures of capture, on a small scale: every promise has its row, and is measured."""
+"""The benchmark of capture on a small scale: losses, recovery and speed."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from locatk.formats.benchmarks import Figure
-from locatk.formats.benchmarks.capture import faults as capture_faults
-from locatk.formats.benchmarks.capture import speed as capture_speed
+from locatk.formats.benchmarks import capture
+from locatk.formats.benchmarks.figures import Figure
 
 if sys.platform == "win32":
     pytest.skip("no pseudo-terminals", allow_module_level=True)
@@ -21,7 +20,7 @@ def named(figures: Iterable[Figure]) -> dict[str, Figure]:
 
 @pytest.mark.slow
 def test_a_short_soak() -> None:
-    found = named(capture_faults.soak_figures(1.0))
+    found = named(capture.soak_figures(1.0))
     assert found["soak: bytes lost or wrong"].value == 0
     assert found["soak: bad or missing frames"].value == 0
     assert found["soak: one core"].target == 60
@@ -32,30 +31,28 @@ def test_a_short_soak() -> None:
     ("found", "wrong"),
     [(b"cdefgh", 0), (b"cdxfgh", 1), (b"cdef", 2), (b"cdefghi", 1), (b"zz", 8)],
 )
-def test_what_is_wrong_is_counted(
-    found: bytes, wrong: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From the first byte that arrived on."""
-    monkeypatch.setattr(capture_faults, "FIRST", 2)
-    assert capture_faults.wrong_bytes(found, b"abcdefgh") == wrong
+def test_wrong_bytes_are_counted(found: bytes, wrong: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bytes before the first recorded one do not count."""
+    monkeypatch.setattr(capture, "SYNC_BYTES", 2)
+    assert capture.count_wrong_bytes(found, b"abcdefgh") == wrong
 
 
 @pytest.mark.slow
 def test_a_kill() -> None:
-    found = named(capture_faults.kill_figures(1))
+    found = named(capture.kill_figures(1))
     assert found["kill -9: longest loss"].target == 0.5
     assert 0 <= (found["kill -9: longest loss"].value or 0) < 5
     assert found["kill -9: made whole by recover"].value == 100
 
 
 def test_damages() -> None:
-    found = named(capture_faults.damage_figures(9))
+    found = named(capture.damage_figures(9))
     assert found["recover: whole chunks saved"].value == 100
     assert found["recover: altered messages returned"].value == 0
     assert found["recover: outputs unreadable or refused"].value == 0
 
 
 def test_info_of_a_large_file() -> None:
-    figure = capture_speed.info_figure(2_000_000)
+    figure = capture.info_figure(2_000_000)
     assert figure.target == 1.0
     assert (figure.value or 0) > 0

@@ -1,18 +1,16 @@
-"""The figures of light: each promise is measured, and kept."""
+"""The benchmark of light: figures and their targets."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from locatk.core.lighthouse.demodulation import identification
-from locatk.formats.benchmarks import Figure
-from locatk.formats.benchmarks.infrared import identification as infrared_places
-from locatk.formats.benchmarks.infrared import libsurvive as infrared_survive
-from locatk.formats.benchmarks.infrared import microcontroller as infrared_microcontroller
-from locatk.formats.benchmarks.infrared import suite as infrared
+from locatk.formats.benchmarks import infrared
+from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 
 
@@ -26,19 +24,20 @@ def missed(figures: Iterable[Figure]) -> list[str]:
 
 @pytest.mark.slow
 def test_the_demodulation_capture(data: Path) -> None:
-    found = named(infrared._demodulation(data / "lighthouse"))
+    found = named(infrared.demodulation_figures(data / "lighthouse"))
     assert missed(found.values()) == []
     assert (found["bursts decoded of 11,136"].target, found["false polynomials"].target) == (
         98.5,
         0.05,
     )
-    # What a rim counts for must not be what anything would count for.
+    # Fragments must agree with the sent sequence only.
     assert (found["rims taken for a wrong place"].value or 0) < 1.5
     assert (found["bursts read by themselves"].value or 0) > 96.5
 
 
+@pytest.mark.slow
 def test_windows_beat_the_peer_and_the_paper_is_the_paper(data: Path) -> None:
-    found = named(infrared._windows(data / "lighthouse"))
+    found = named(infrared.window_figures(data / "lighthouse"))
     assert (found["windows of 16 us read"].value or 0) > 95
     assert found["windows: false polynomials"].value == 0
     paper = found["windows read by --method paper"]
@@ -47,16 +46,16 @@ def test_windows_beat_the_peer_and_the_paper_is_the_paper(data: Path) -> None:
 
 
 def test_strong_and_weak_recordings_of_the_deck(data: Path) -> None:
-    found = infrared._fpga(data / "lighthouse")
+    found = infrared.fpga_figures(data / "lighthouse")
     assert [figure.target for figure in found] == [103, 95]
     assert missed(found) == []
 
 
 def test_table_iii_of_the_paper_is_in_its_captures(data: Path) -> None:
-    """The lines of the firmware's stages stand beside that of the light."""
+    """The captures contain a line for each stage of the firmware."""
     if not (data / "lighthouse/benchmarks/twoLH_2D/Logic_analyser_capture.sal").exists():
-        pytest.skip("the captures are not there")
-    found = named(infrared_microcontroller.figures(data / "lighthouse"))
+        pytest.skip("the captures are missing")
+    found = named(infrared.firmware_figures(data / "lighthouse"))
     for stage, pulses, mean_us, sd_us in (
         ("demodulation", 10_807, 623.15, 3.65),
         ("polynomial", 10_807, 127.42, 26.95),
@@ -80,35 +79,35 @@ def test_table_iii_of_the_paper_is_in_its_captures(data: Path) -> None:
 
 
 @pytest.mark.slow
-def test_stored_calibrations_are_told_from_wrong_ones(data: Path) -> None:
-    path = data / "lighthouse" / "libsurvive" / infrared_survive.RECORDING
+def test_differences_from_stored_calibrations_are_counted(data: Path) -> None:
+    path = data / "lighthouse" / "libsurvive" / infrared.TRACKER_RECORDING
     session = read_libsurvive([path])
-    assert infrared_survive._calibrations(session, path).value == 0
+    assert infrared.compare_calibrations(session, path).value == 0
     for station in session.stations[:1]:
         assert station.calibration is not None
         station.calibration.sweeps[1, 3] += 2e-6  # of 1e-6 that libsurvive's file holds
-    assert infrared_survive._calibrations(session, path).value == 1
+    assert infrared.compare_calibrations(session, path).value == 1
 
 
-def test_a_wrong_place_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert infrared_places.wrong_places(3) == 0
+def test_wrong_windows_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert infrared.count_wrong_windows(3) == 0
     monkeypatch.setattr(identification, "MIN_PREDICTED_BITS", 50)  # more than 60 bits can show
-    assert infrared_places.wrong_places(3) == 131_071
+    assert infrared.count_wrong_windows(3) == 131_071
 
 
 def test_noise_that_passes_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(infrared_places, "NOISE", 3_000)
-    assert infrared_places.noise_share() < 0.005
-    monkeypatch.setattr(infrared_places, "MIN_STANDALONE_EVIDENCE_BITS", 10.0)
-    assert infrared_places.noise_share() > 0.05
+    monkeypatch.setattr(infrared, "NOISE_BURSTS", 3_000)
+    assert infrared.false_alarm_fraction() < 0.005
+    monkeypatch.setattr(infrared, "MIN_STANDALONE_EVIDENCE_BITS", 10.0)
+    assert infrared.false_alarm_fraction() > 0.05
 
 
 def test_without_data_each_figure_says_why(tmp_path: Path) -> None:
     (tmp_path / "lighthouse").mkdir()
-    for measure in (infrared._demodulation, infrared._fpga):
-        (row,) = infrared._or_why(measure, tmp_path / "lighthouse", {"a figure": "%"})
+    for measure in (infrared.demodulation_figures, infrared.fpga_figures):
+        (row,) = infrared.explain(partial(measure, tmp_path / "lighthouse"), {"a figure": "%"})
         assert row.value is None
         assert row.how.startswith("not measured")
-    rows = infrared_survive.figures(tmp_path)
+    rows = infrared.tracker_figures(tmp_path / "lighthouse")
     assert len(rows) == 3
     assert all(row.value is None and row.met is None for row in rows)

@@ -1,10 +1,9 @@
-"""The figures of the landmarks: every promise has its row, and the scores are what they say."""
+"""The benchmark of landmarks: every target has its row, and scores are correct."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,14 @@ from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
 from locatk.core.landmarks.solver import solve
 from locatk.core.solution import Solution
-from locatk.formats.benchmarks import Figure, timing
-from locatk.formats.benchmarks.landmarks import closed_loop as landmarks_closed_loop
+from locatk.formats.benchmarks import timing
+from locatk.formats.benchmarks.figures import Duration, Figure
 from locatk.formats.benchmarks.landmarks import global_localization as landmarks_global
 from locatk.formats.benchmarks.landmarks import sessions as landmarks_sessions
 from locatk.formats.benchmarks.landmarks import speed as landmarks_speed
-from locatk.formats.benchmarks.landmarks import study as landmarks_study
 from locatk.formats.benchmarks.landmarks import suite as landmarks
-from locatk.formats.benchmarks.landmarks.study import Found
+from locatk.formats.benchmarks.landmarks import visits as landmarks_visits
+from locatk.formats.benchmarks.landmarks.visits import VisitResult
 
 PROMISED = {
     "paper's first step, half-discs: mean, off the paper's": 0.5,
@@ -53,7 +52,7 @@ PROMISED = {
     "field of four bars, times as fast as magpylib": 20.0,
     "field of a bar, difference to magpylib": 1e-12,
 }
-"""Of the issue, without the maps that these tests leave out."""
+"""Targets, without the maps that these tests leave out."""
 
 EXACT = (
     "one pass: over 15 mm",
@@ -62,35 +61,35 @@ EXACT = (
     "L sessions: right cells, and poses given",
     "field of a bar, difference to magpylib",
 )
-"""Met by however few."""
+"""Figures whose targets are met by any number of cases."""
 
 
-def here(call: str) -> list[float]:
-    """Instead of a process of its own."""
-    expression = call.removeprefix("landmarks.speed.")
-    return [float(value) for value in eval(expression, vars(landmarks_speed))]
+def time_once(call: Callable[[], object], *options: object) -> Duration:
+    """Run a call once, with a fixed duration."""
+    call()
+    return Duration(0.5, 1.0)
 
 
 @pytest.fixture(scope="module")
-def quick() -> Iterator[None]:
-    """Few of everything: the road, not the figures."""
+def quick(run_here: Callable[[str], list[float]]) -> Iterator[None]:
+    """Use few cases: the code is tested, not the accuracy."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(landmarks, "PASSES", 6)
-        patch.setattr(landmarks, "VISITS", 3)
-        patch.setattr(landmarks, "STANDS", 4)
-        patch.setattr(landmarks, "START_STEP", 30)
-        patch.setattr(landmarks_closed_loop, "ROBOTS", 2)
-        patch.setattr(landmarks_closed_loop, "DRIVEN_SESSIONS", 1)
-        patch.setattr(landmarks_global, "EVERY", 300)
-        patch.setattr(landmarks_sessions, "SESSIONS", 1)
-        patch.setattr(landmarks_sessions, "SESSION_LANDMARKS", 3)
-        patch.setattr(landmarks_speed, "ESTIMATES", 1)
+        patch.setattr(landmarks, "SINGLE_PASSES", 6)
+        patch.setattr(landmarks, "LONG_VISITS", 3)
+        patch.setattr(landmarks, "STOPPED_ROBOTS", 4)
+        patch.setattr(landmarks, "STUDY_STEP_DEG", 30)
+        patch.setattr(landmarks_sessions, "SEARCHING_ROBOTS", 2)
+        patch.setattr(landmarks_sessions, "CLOSED_LOOP_SESSIONS", 1)
+        patch.setattr(landmarks_global, "START_STRIDE", 300)
+        patch.setattr(landmarks_sessions, "SIMULATED_SESSIONS", 1)
+        patch.setattr(landmarks_sessions, "MISREAD_SESSION_LANDMARKS", 3)
+        patch.setattr(landmarks_speed, "TIMED_ESTIMATES", 1)
         patch.setattr(landmarks_speed, "MAP_SEEDS", 1)
-        patch.setattr(landmarks_speed, "POINTS", 2000)
-        patch.setattr(landmarks_speed, "MAPS", landmarks_speed.MAPS[:1])
-        patch.setattr(landmarks_speed, "cpu_seconds", lambda call, repeats=1: (call(), 0.5)[1])
-        patch.setattr(landmarks_speed, "alone", here)
-        patch.setattr(timing, "alone", here)
+        patch.setattr(landmarks_speed, "FIELD_POINTS", 2000)
+        patch.setattr(landmarks_speed, "SEARCHED_MAPS", landmarks_speed.SEARCHED_MAPS[:1])
+        patch.setattr(landmarks_speed, "time_call", time_once)
+        patch.setattr(landmarks_speed, "run_single_threaded", run_here)
+        patch.setattr(timing, "run_single_threaded", run_here)
         yield
 
 
@@ -107,12 +106,12 @@ def rows(quick: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Fig
 def test_every_promise_has_its_row(rows: dict[str, Figure]) -> None:
     for name, target in PROMISED.items():
         assert rows[name].target == pytest.approx(target), name
-    sizes = {(side, window, alphabet) for side, window, alphabet, *_ in landmarks_speed.MAPS}
-    assert (7, "L", "6") in sizes
-    assert landmarks_study.SURE == 0.99
+    assert (7, "L", "6") in {searched[:3] for searched in landmarks_speed.SEARCHED_MAPS}
+    assert landmarks_visits.CONFIDENT_PROBABILITY == 0.99
 
 
-def test_rows_are_whole_and_absent_data_is_said(rows: dict[str, Figure]) -> None:
+@pytest.mark.slow
+def test_rows_are_complete_and_missing_data_are_reported(rows: dict[str, Figure]) -> None:
     for name, figure in rows.items():
         assert figure.how
         assert isinstance(figure.unit, str)
@@ -133,17 +132,18 @@ def test_rows_are_whole_and_absent_data_is_said(rows: dict[str, Figure]) -> None
         assert rows[name].value is not None
 
 
+@pytest.mark.slow
 def test_a_figure_of_speed_is_taken_in_a_process_of_its_own() -> None:
-    found, seconds = timing.alone("landmarks.speed.search_time(5, 'L', '16', 2)")
+    found, seconds, _ = timing.run_single_threaded("landmarks.speed.time_search(5, 'L', '16', 2)")
     assert found == 2
     assert 0 < seconds < math.inf
 
 
-def test_what_cannot_be_measured_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_measurements_are_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(call: str) -> list[float]:
         raise OSError("no such thing")
 
-    monkeypatch.setattr(landmarks_speed, "alone", fails)
+    monkeypatch.setattr(landmarks_speed, "run_single_threaded", fails)
     for figure in [*landmarks_speed.field_figures()[:2], *landmarks_speed.estimate_figures()]:
         assert figure.value is None
         assert "no such thing" in figure.how
@@ -154,11 +154,11 @@ def test_published_maps_are_unique(data: Path, tmp_path: Path) -> None:
     if not folder.is_dir():
         pytest.skip("no published maps")
     assert landmarks_speed.published_maps(folder).value == 0
-    floor, which = landmarks_global.the_floor(folder)
+    floor, which = landmarks_global.standard_floor(folder)
     assert (floor.shape, which) == ((24, 24), "published map")
     # A map with two rows exchanged is not.
     floor.codes[[3, 9]] = floor.codes[[9, 3]]
-    for name in landmarks_global.PUBLISHED:
+    for name in landmarks_global.PUBLISHED_SIDES:
         (tmp_path / f"{name}.txt").write_text((folder / f"{name}.txt").read_text())
     lines = ["head", *("".join(f"{code:x}" for code in row) for row in floor.codes)]
     (tmp_path / "or16_L_24x24.txt").write_text("\n".join(lines))
@@ -177,41 +177,41 @@ def spun() -> list[SinglePass]:
 
 def test_a_visit_without_errors_has_none(spun: list[SinglePass]) -> None:
     for number, one in enumerate(spun):
-        found = landmarks_study.by_field(number, one)
+        found = landmarks_visits.solve_by_field(number, one)
         assert found.error_m < 0.1e-3
         assert abs(found.heading_rad) < 1e-3
-        assert found.right
+        assert found.is_correct
         assert found.visits == 1
         assert found.true_probability == pytest.approx(found.probability)
-        by_valleys = landmarks_study.by_valleys(number, one)
-        assert by_valleys.right
+        by_valleys = landmarks_visits.solve_by_valleys(number, one)
+        assert by_valleys.is_correct
         assert by_valleys.error_m < 3.5e-3  # 2.6 mm by construction
         assert abs(by_valleys.heading_rad) < math.radians(8)
 
 
 def test_a_wrong_landmark_is_not_right(spun: list[SinglePass]) -> None:
     one = replace(spun[0], code=spun[0].code ^ 1)
-    assert not landmarks_study.by_field(0, one).right
-    assert landmarks_study.by_field(0, one).true_probability < 1e-6
-    assert not landmarks_study.by_valleys(0, one).right
+    assert not landmarks_visits.solve_by_field(0, one).is_correct
+    assert landmarks_visits.solve_by_field(0, one).true_probability < 1e-6
+    assert not landmarks_visits.solve_by_valleys(0, one).is_correct
 
 
 def test_a_visit_to_nothing_is_not_right() -> None:
     (one,) = simulate_passes(1, errors=NONE, start=(0.0, 0.0))
     quiet = replace(one, samples=replace(one.samples, field_t=0 * one.samples.field_t + 1e-6))
-    found = landmarks_study.by_field(7, quiet)
-    assert (found.number, found.right) == (7, False)
+    found = landmarks_visits.solve_by_field(7, quiet)
+    assert (found.number, found.is_correct) == (7, False)
     assert math.isnan(found.error_m)
-    assert landmarks_study.log_loss([found]) == pytest.approx(-math.log(1e-9))
+    assert landmarks_visits.log_loss([found]) == pytest.approx(-math.log(1e-9))
 
 
 @pytest.mark.slow
 def test_baselines_are_about_as_good_as_the_facts_say() -> None:
-    made = landmarks_study.visited(40, "", 5)
+    made = landmarks_visits.simulate_visits(40, "", 5)
     assert len(made) == 40
     assert all(one.lines for _, one in made)
-    for found in zip(*(landmarks_study.by_voting(*one) for one in made), strict=True):
-        assert 5 < landmarks_study.errors_mm(found).mean() < 15
+    for found in zip(*(landmarks_visits.solve_first_steps(*one) for one in made), strict=True):
+        assert 5 < landmarks_visits.errors_mm(found).mean() < 15
 
 
 def test_errors_do_not_depend_on_the_frames_quarter_turns() -> None:
@@ -220,44 +220,48 @@ def test_errors_do_not_depend_on_the_frames_quarter_turns() -> None:
         turn = quarters * math.pi / 2
         cos, sin = math.cos(turn), math.sin(turn)
         own = np.array([cos * 0.01 + sin * -0.02, cos * -0.02 - sin * 0.01, 0.3 - turn])
-        assert landmarks_study.error(own, true) == pytest.approx(np.zeros(3), abs=1e-12)
-        assert landmarks_study.centre_error(own, true) == pytest.approx(0, abs=1e-12)
-        off = landmarks_study.error(own + [0, 0, 0.1], true)
+        assert landmarks_visits.pose_error(own, true) == pytest.approx(np.zeros(3), abs=1e-12)
+        assert landmarks_visits.centre_error(own, true) == pytest.approx(0, abs=1e-12)
+        off = landmarks_visits.pose_error(own + [0, 0, 0.1], true)
         assert off == pytest.approx([0, 0, 0.1], abs=1e-12)
-    # A turned robot sees the centre elsewhere.
-    assert landmarks_study.centre(np.array([0.1, 0.0, math.pi / 2])) == pytest.approx([0, 0.1])
-    assert landmarks_study.centre_error(true + [3e-3, 4e-3, 0], true) == pytest.approx(5e-3)
+    # In the frame of a rotated robot the centre is in another direction.
+    assert landmarks_visits.landmark_centre(np.array([0.1, 0.0, math.pi / 2])) == pytest.approx(
+        [0, 0.1]
+    )
+    assert landmarks_visits.centre_error(true + [3e-3, 4e-3, 0], true) == pytest.approx(5e-3)
 
 
 def test_calibration_is_how_far_shares_are_from_what_was_told() -> None:
-    def told(probability: float, right: int, of: int) -> list[Found]:
-        return [Found(k, 3, right=k < right, probability=probability) for k in range(of)]
+    def told(probability: float, right: int, of: int) -> list[VisitResult]:
+        return [VisitResult(k, 3, is_correct=k < right, probability=probability) for k in range(of)]
 
     even = [*told(0.95, 19, 20), *told(0.6, 12, 20), *told(1.0, 20, 20)]
-    assert landmarks_study.calibration(even)[0] == pytest.approx(0)
+    assert landmarks_visits.calibration_error(even)[0] == pytest.approx(0)
     vain = [*told(0.95, 10, 20), *told(1.0, 19, 20)]
-    off, words = landmarks_study.calibration(vain)
+    off, words = landmarks_visits.calibration_error(vain)
     assert off == pytest.approx((0.45 + 0.05) / 2)
-    assert "20 told 95.0 % are 50.0 % right" in words
-    assert landmarks_study.log_loss(
-        [Found(0, 1, true_probability=p) for p in (1.0, 0.5)]
+    assert "20 with 95.0 % are 50.0 % correct" in words
+    assert landmarks_visits.log_loss(
+        [VisitResult(0, 1, true_probability=p) for p in (1.0, 0.5)]
     ) == pytest.approx(math.log(2) / 2)
 
 
 def test_nothing_found_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(landmarks, "PASSES", 2)
-    monkeypatch.setattr(landmarks, "by_field", lambda number, one: Found(number, one.lines))
+    monkeypatch.setattr(landmarks, "SINGLE_PASSES", 2)
+    monkeypatch.setattr(
+        landmarks, "solve_by_field", lambda number, one: VisitResult(number, one.lines)
+    )
     found = {figure.name: figure for figure in landmarks.pass_figures()}
     assert found["one pass: mean"].met is False
     assert found["one pass: pattern right"].met is False
-    assert "not found or refused" in found["one pass: mean"].how
+    assert "not detected or refused" in found["one pass: mean"].how
 
 
 def test_robots_stand_where_it_is_said() -> None:
     rng = np.random.default_rng(1)
     for anywhere, mean_m in ((False, 3.76e-3), (True, 6.67e-3)):
-        away = np.hypot(*landmarks_study.stops(4000, anywhere, rng)[:, :2].T)
-        assert away.max() <= landmarks_study.FARTHEST_M
+        away = np.hypot(*landmarks_visits.random_stops(4000, anywhere, rng)[:, :2].T)
+        assert away.max() <= landmarks_visits.MAX_STOP_DISTANCE_M
         assert away.mean() == pytest.approx(mean_m, rel=0.05)
 
 
@@ -266,11 +270,11 @@ def test_robots_stand_where_it_is_said() -> None:
 
 @pytest.fixture(scope="module")
 def floor() -> FloorMap:
-    return landmarks_global.the_floor(Path("nowhere"))[0]
+    return landmarks_global.standard_floor(Path("nowhere"))[0]
 
 
 def test_windows_and_walks_go_from_cell_to_cell(floor: FloorMap) -> None:
-    walks = landmarks_global.windows_of(floor)
+    walks = landmarks_global.window_walks(floor)
     assert len(walks) == len(windows.window_readings(floor)) == 4 * 23 * 23
     rng = np.random.default_rng(0)
     walks = walks[::97] + [
@@ -278,12 +282,12 @@ def test_windows_and_walks_go_from_cell_to_cell(floor: FloorMap) -> None:
         for h in range(4)
     ]  # fmt: skip
     for walk in walks:
-        assert len(walk.cells) in (3, landmarks_global.LONGEST)
+        assert len(walk.cells) in (3, landmarks_global.WALK_LANDMARKS)
         for n, (here, there) in enumerate(zip(walk.cells, walk.cells[1:], strict=False)):
             # It looks along the way on which it came.
             assert neighbour(here, walk.quarters[n + 1]) == there
             assert 0 <= min(there) <= max(there) < 24
-    left = landmarks_global.windows_of(floor)[0]
+    left = landmarks_global.window_walks(floor)[0]
     assert [(q - left.quarters[0]) % 4 for q in left.quarters] == [0, 0, 1]
 
 
@@ -291,7 +295,7 @@ def test_sightings_are_what_the_robot_reads(floor: FloorMap) -> None:
     rng = np.random.default_rng(4)
     walk = landmarks_global.random_walk(floor, (5, 6), 2, rng)
     laid = {walk.cells[1]: int(floor.codes[walk.cells[1]]) ^ 3}
-    seen = landmarks_global.sightings(floor, walk, laid, rng)
+    seen = landmarks_global.simulate_observations(floor, walk, laid, rng)
     for n, (cell, quarters) in enumerate(zip(walk.cells, walk.quarters, strict=True)):
         code = rotated(seen[n].best.code, quarters)
         assert (code == floor.codes[cell]) == (n != 1)
@@ -299,7 +303,7 @@ def test_sightings_are_what_the_robot_reads(floor: FloorMap) -> None:
         assert abs(seen[n].best.pose[2]) < 0.15
     steps = np.hypot(*np.diff([one.odometry[:2] for one in seen], axis=0).T)
     assert steps == pytest.approx(floor.pitch_m, abs=0.02)
-    wrong = landmarks_global.misread(floor, rng)
+    wrong = landmarks_global.random_misreadings(floor, rng)
     assert 5 < len(wrong) < 60
     assert all(0 <= code < CODE_COUNT and code != floor.codes[cell] for cell, code in wrong.items())
 
@@ -307,7 +311,7 @@ def test_sightings_are_what_the_robot_reads(floor: FloorMap) -> None:
 def test_a_filter_that_is_sure_of_another_place_is_caught(
     floor: FloorMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(landmarks_global, "EVERY", 500)
+    monkeypatch.setattr(landmarks_global, "START_STRIDE", 500)
 
     def sure(floor: FloorMap, seen: list[Any]) -> Any:
         return [((-1, -1), 0, 0.5), ((-1, -1), 0, 0.99999)], [((-1, -1), 0, 0.5)] * 2
@@ -318,7 +322,7 @@ def test_a_filter_that_is_sure_of_another_place_is_caught(
 
     walked = landmarks_global.random_walk
     monkeypatch.setattr(landmarks_global, "random_walk", truncated)
-    monkeypatch.setattr(landmarks_global, "told_places", sure)
+    monkeypatch.setattr(landmarks_global, "localize_stops", sure)
     wrong, remarked, needed, _ = landmarks_global.misread_figures(floor, "map")
     assert wrong.value == 5
     assert "walks 0, 1, 2, 3, 4" in wrong.how
@@ -335,14 +339,14 @@ def test_a_solved_session_is_compared_with_the_truth(
     solved: tuple[SimulatedSession, Solution],
 ) -> None:
     made, solution = solved
-    one = landmarks_sessions.judged(made, solution)
-    assert one.given
-    assert not one.lost
+    one = landmarks_sessions.score_session(made, solution)
+    assert one.has_poses
+    assert not one.is_wrong
     assert np.quantile(one.error_m, 0.9) < 0.01
     track = solution.trajectories[0]
     moved = replace(track, position=track.position + [0.2, 0, 0])
-    one = landmarks_sessions.judged(made, replace(solution, trajectories=(moved,)))
-    assert one.lost
+    one = landmarks_sessions.score_session(made, replace(solution, trajectories=(moved,)))
+    assert one.is_wrong
     assert one.error_m.mean() == pytest.approx(0.2, abs=0.01)
 
 
@@ -351,22 +355,11 @@ def test_a_wrong_cell_is_seen(solved: tuple[SimulatedSession, Solution]) -> None
     *others, last = solution.detections
     row, column = last.cell
     detections = (*others, replace(last, cell=(row, column + 1)))
-    assert landmarks_sessions.judged(made, replace(solution, detections=detections)).wrong == 1
+    assert (
+        landmarks_sessions.score_session(made, replace(solution, detections=detections)).wrong_cells
+        == 1
+    )
     detections = (*others, replace(last, cell=None))
     unlocalised = replace(solution, detections=detections, trajectories=())
-    one = landmarks_sessions.judged(made, unlocalised)
-    assert (one.given, one.lost, one.wrong) == (False, False, 0)
-
-
-def test_the_command_lists_them(
-    locatk, tmp_path: Path, rows: dict[str, Figure], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(landmarks, "figures", lambda data: list(rows.values()))
-    result = locatk("bench", "landmarks", "--data", tmp_path, "--json")
-    assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
-    assert answer["system"] == "landmarks"
-    assert [figure["name"] for figure in answer["figures"]] == list(rows)
-    table = locatk("bench", "landmarks", "--data", tmp_path)
-    assert table.exit_code == 0, table.stderr
-    assert "one pass: mean" in table.stdout
+    one = landmarks_sessions.score_session(made, unlocalised)
+    assert (one.has_poses, one.is_wrong, one.wrong_cells) == (False, False, 0)

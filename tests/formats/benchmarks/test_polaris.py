@@ -1,8 +1,7 @@
-"""The figures of Polaris: every promise has its row, and the scores are what they say."""
+"""The benchmark of Polaris: every target has its row, and scores are correct."""
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +16,9 @@ from locatk.core.polaris.published.ddtw import distances, prepare
 from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.polaris.simulation.session import SimulatedSession, SimulationOptions, simulate
 from locatk.core.polaris.tag import Tags, cell_positions, symbol_angles
-from locatk.formats.benchmarks import Figure
+from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.polaris import passes as polaris_passes
 from locatk.formats.benchmarks.polaris import speed as polaris_speed
-from locatk.formats.benchmarks.polaris import study as polaris_study
 from locatk.formats.benchmarks.polaris import suite as polaris
 
 PROMISED = {
@@ -67,7 +66,7 @@ PROMISED = {
     "DDTW, 180 templates of 80 samples": 2.0,
     "180 templates of 80 samples made": 5.0,
 }
-"""Of the issue, without the faults and the set of templates that these tests leave out."""
+"""Targets, without the faults and the set of templates that these tests leave out."""
 
 RELEASED = polaris.PUBLISHED_TAGS
 TAG = 255183
@@ -75,15 +74,15 @@ TAG = 255183
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
-    """All figures without the published runs, of few passes: the road, not the figures."""
+    """Return all figures of few passes, without the published runs."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(polaris_study, "HEADINGS_DEG", (30,))
-        for name in ("REPEATS", "CASES", "PASSES"):
-            patch.setattr(polaris_study, name, 1)
-        faults = {"one dead sensor": polaris_study.FAULTS["one dead sensor"]}
-        patch.setattr(polaris_study, "FAULTS", faults)
-        patch.setattr(polaris_speed, "SETS", {180: polaris_speed.SETS[180]})
-        patch.setattr(polaris_speed, "PEERS", ("no-such-library",))
+        patch.setattr(polaris_passes, "HEADINGS_DEG", (30,))
+        for name in ("HEADING_REPEATS", "RANDOM_DESIGNS", "REPEATED_PASSES"):
+            patch.setattr(polaris_passes, name, 1)
+        faults = {"one dead sensor": polaris_passes.FAULTS["one dead sensor"]}
+        patch.setattr(polaris_passes, "FAULTS", faults)
+        patch.setattr(polaris_speed, "TARGETS_MS", {180: polaris_speed.TARGETS_MS[180]})
+        patch.setattr(polaris_speed, "LIBRARIES", ("no-such-library",))
         found = polaris.figures(tmp_path_factory.mktemp("empty"))
     by_name = {figure.name: figure for figure in found}
     assert len(by_name) == len(found)
@@ -95,11 +94,12 @@ def test_every_promise_has_its_row(rows: dict[str, Figure]) -> None:
     for name, target in PROMISED.items():
         assert rows[name].target == pytest.approx(target), name
         assert rows[name].how
-    assert set(polaris_speed.SETS) == {180, 1800}
-    assert len(polaris_study.FAULTS) >= 7
+    assert set(polaris_speed.TARGETS_MS) == {180, 1800}
+    assert len(polaris_passes.FAULTS) >= 7
 
 
-def test_absent_runs_are_said_and_cost_no_other_figure(rows: dict[str, Figure]) -> None:
+@pytest.mark.slow
+def test_missing_runs_are_reported_and_affect_no_other_figure(rows: dict[str, Figure]) -> None:
     for name, figure in rows.items():
         if name.startswith(("published", "default:", "varying:", "time a run")):
             assert figure.value is None
@@ -117,8 +117,8 @@ def test_absent_runs_are_said_and_cost_no_other_figure(rows: dict[str, Figure]) 
 
 @pytest.mark.slow
 def test_published_runs_are_as_promised(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(polaris, "_times", lambda folder, absent: [])
-    monkeypatch.setattr(polaris, "RUNS", {"default": 3, "varying": 3})
+    monkeypatch.setattr(polaris, "_duration_figures", lambda folder, error: [])
+    monkeypatch.setattr(polaris, "SET_RUNS", {"default": 3, "varying": 3})
     found = {figure.name: figure for figure in polaris.published_figures(data / "polaris")}
     for figure in found.values():
         assert figure.value is not None
@@ -170,21 +170,21 @@ def test_the_authors_metric_has_two_anchors_and_no_rotation() -> None:
     assert polaris.anchored_error(there * [1, -1], TAG) > 40
 
 
-def test_half_turns_are_counted_against_the_layout() -> None:
+def test_opposite_orientations_are_counted_against_the_layout() -> None:
     layout = codec.layout_of(RELEASED, TAG)
     true = symbol_angles(RELEASED, layout.symbols)
-    run = polaris.Run(TAG, True, 0, layout_m(), true + 0.3, 0.3, 1.0, 1.0)
+    run = polaris.PublishedRun(TAG, True, 0, layout_m(), true + 0.3, 0.3, 1.0, 1.0)
     other = replace(run, angle_rad=true + 0.3 + [0, math.pi, 1.4, -math.pi, math.tau])
     lost = replace(run, angle_rad=np.full(5, np.nan), heading_rad=math.nan)
-    assert polaris._half_turns([run, lost]) == 0
-    assert polaris._half_turns([run, other]) == 2
+    assert polaris.count_opposite([run, lost]) == 0
+    assert polaris.count_opposite([run, other]) == 2
 
 
 def test_heading_of_the_position_pattern_is_absolute_and_in_degrees() -> None:
-    assert polaris._pattern_heading_deg(turned(layout_m(), -0.1)) == pytest.approx(
+    assert polaris.absolute_pattern_heading_deg(turned(layout_m(), -0.1)) == pytest.approx(
         math.degrees(0.1)
     )
-    assert math.isnan(polaris._pattern_heading_deg(np.full((5, 2), np.nan)))
+    assert math.isnan(polaris.absolute_pattern_heading_deg(np.full((5, 2), np.nan)))
 
 
 def test_scatter_is_about_each_magnets_own_mean() -> None:
@@ -235,20 +235,20 @@ def detection(tag_id: int | None, cells: Any) -> TagDetection:
 
 def test_a_run_is_what_its_detections_say() -> None:
     cells = codec.layout_of(RELEASED, TAG).cells
-    run = polaris.as_run([detection(TAG ^ 0b101 << 10, cells)], TAG)
-    assert (run.read, run.wrong_bits) == (True, 2)
-    assert run.unruled_m == pytest.approx(layout_m())
+    run = polaris.summarize_run([detection(TAG ^ 0b101 << 10, cells)], TAG)
+    assert (run.is_read, run.wrong_bits) == (True, 2)
+    assert run.unscaled_position_m == pytest.approx(layout_m())
     assert run.angle_rad == pytest.approx(0.1 * np.arange(5))
-    twice = polaris.as_run([detection(TAG, cells), detection(TAG ^ 1, cells)], TAG)
+    twice = polaris.summarize_run([detection(TAG, cells), detection(TAG ^ 1, cells)], TAG)
     assert twice.wrong_bits == 1
-    refused = polaris.as_run([detection(None, cells)], TAG)
-    assert (refused.read, refused.wrong_bits) == (False, 0)
-    assert np.isfinite(refused.place_m).all()
+    refused = polaris.summarize_run([detection(None, cells)], TAG)
+    assert (refused.is_read, refused.wrong_bits) == (False, 0)
+    assert np.isfinite(refused.position_m).all()
     for nothing in ([], [detection(None, cells[:4])]):
-        run = polaris.as_run(nothing, TAG)
-        assert not run.read
-        assert math.isnan(polaris.rigid_error(run.place_m, TAG))
-        assert Figure("f", polaris.RIGID([run]), "mm", "how", 0.75).met is False
+        run = polaris.summarize_run(nothing, TAG)
+        assert not run.is_read
+        assert math.isnan(polaris.rigid_error(run.position_m, TAG))
+        assert Figure("f", polaris.RIGID_ERROR([run]), "mm", "how", 0.75).met is False
 
 
 # ---- scores of a simulated pass
@@ -284,26 +284,26 @@ def told(made: SimulatedSession, tag_id: int | None, refused: str | None = None)
 def test_the_truth_has_no_errors_in_any_order(made: SimulatedSession) -> None:
     found = told(made, 1234)
     found = replace(found, magnets=found.magnets[::-1])
-    outcome = polaris_study.judged(made, [found])
+    outcome = polaris_passes.score_pass(made, [found])
     assert (outcome.verdict, outcome.missed, outcome.reasons) == ("right", 0, ())
     assert outcome.magnets == pytest.approx(np.zeros((5, 3)), abs=1e-9)
     assert outcome.pose == pytest.approx(np.zeros(3), abs=1e-9)
     first, *others = found.magnets
     moved = replace(first, x_m=first.x_m + 2e-3)
     found = replace(found, magnets=(moved, *others), y_m=found.y_m - 0.9e-3)
-    outcome = polaris_study.judged(made, [found])
-    assert polaris_study.rms(outcome.magnets)[0] == pytest.approx(2e-3 / math.sqrt(5))
+    outcome = polaris_passes.score_pass(made, [found])
+    assert polaris_passes.rms(outcome.magnets)[0] == pytest.approx(2e-3 / math.sqrt(5))
     assert outcome.pose == pytest.approx([0, -0.9e-3, 0], abs=1e-9)
 
 
 def test_a_right_id_at_another_place_is_misplaced(made: SimulatedSession) -> None:
     found = told(made, 1234)
     found = replace(found, x_m=found.x_m + 2e-3)
-    assert polaris_study.judged(made, [found]).verdict == "misplaced"
+    assert polaris_passes.score_pass(made, [found]).verdict == "misplaced"
     found = replace(found, sigma_x_m=1e-3)
-    assert polaris_study.judged(made, [found]).verdict == "right"
+    assert polaris_passes.score_pass(made, [found]).verdict == "right"
     found = replace(found, heading_rad=found.heading_rad + math.radians(2))
-    assert polaris_study.judged(made, [found]).verdict == "misplaced"
+    assert polaris_passes.score_pass(made, [found]).verdict == "misplaced"
 
 
 def test_a_pass_is_right_wrong_refused_or_silent(made: SimulatedSession) -> None:
@@ -320,26 +320,26 @@ def test_a_pass_is_right_wrong_refused_or_silent(made: SimulatedSession) -> None
     )
     outcomes = []
     for detections, verdict, missed in cases:
-        outcome = polaris_study.judged(made, detections)
+        outcome = polaris_passes.score_pass(made, detections)
         assert (outcome.verdict, outcome.missed) == (verdict, missed)
         outcomes.append(outcome)
     assert np.isnan(outcomes[3].pose).all()
-    assert polaris_study._share(outcomes) == pytest.approx(100 / 3)
-    assert polaris_study._said(outcomes[3:4]) == "1 refused; 1 tie"
+    assert polaris_passes.correct_percent(outcomes) == pytest.approx(100 / 3)
+    assert polaris_passes.describe_outcomes(outcomes[3:4]) == "1 refused; 1 tie"
 
 
 def test_nothing_read_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(polaris_study, "PASSES", 1)
-    monkeypatch.setattr(polaris_study, "CASES", 1)
-    solve = polaris_study.solve
+    monkeypatch.setattr(polaris_passes, "REPEATED_PASSES", 1)
+    monkeypatch.setattr(polaris_passes, "RANDOM_DESIGNS", 1)
+    solve = polaris_passes.solve
 
     def blind(*args: Any) -> Any:
         return replace(solve(*args), detections=())
 
-    monkeypatch.setattr(polaris_study, "solve", blind)
+    monkeypatch.setattr(polaris_passes, "solve", blind)
     faults = {"offsets": {"offset_t": 1e-4}}
-    monkeypatch.setattr(polaris_study, "FAULTS", faults)
-    rows = [*polaris_study.random_figures(), *polaris_study.fault_figures()]
+    monkeypatch.setattr(polaris_passes, "FAULTS", faults)
+    rows = [*polaris_passes.random_figures(), *polaris_passes.fault_figures()]
     met = {figure.name: figure.met for figure in rows}
     assert met["random designs: every bit right"] is False
     assert met["random designs: magnets missed"] is False
@@ -348,7 +348,7 @@ def test_nothing_read_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_random_designs_fit_under_the_bar() -> None:
     for seed in range(200):
-        tags, heading = polaris_study.random_design(np.random.default_rng(seed))
+        tags, heading = polaris_passes.random_design(np.random.default_rng(seed))
         grid = tuple((c, r) for c in range(tags.order) for r in range(tags.order))
         across = turned(cell_positions(tags, grid), -heading)[:, 1]
         assert np.abs(across).max() < 0.0826
@@ -364,14 +364,3 @@ def test_the_window_that_is_timed_is_one_of_the_templates() -> None:
     assert (window.shape, field.shape) == ((80, 3), (180, 80, 3))
     assert distances(window, prepare(field)).argmin() == 60
     assert polaris_speed.window_and_templates(1800)[1].shape == (1800, 80, 3)
-
-
-def test_the_command_lists_them(
-    locatk, tmp_path: Path, rows: dict[str, Figure], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(polaris, "figures", lambda data: list(rows.values()))
-    result = locatk("bench", "polaris", "--data", tmp_path, "--json")
-    assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
-    assert answer["system"] == "polaris"
-    assert [figure["name"] for figure in answer["figures"]] == list(rows)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.lighthouse.recording import Edges
-from locatk.formats.benchmarks.infrared import microcontroller as infrared_microcontroller
+from locatk.formats.benchmarks import infrared
 from locatk.formats.importers.saleae import digital_lines as saleae_lines
 from locatk.formats.importers.saleae.recording import read_capture, read_light
 
@@ -636,7 +636,7 @@ def test_durations_of_the_stages_of_a_firmware(tmp_path: Path) -> None:
         path.parent.mkdir(parents=True)
         edges = {"LH2 - Data": light(), **{key: pulses(value) for key, value in lines.items()}}
         capture(path, {key: channel(value, [0, RATE // 100]) for key, value in edges.items()})
-    found = {row.name: row for row in infrared_microcontroller.figures(tmp_path)}
+    found = {row.name: row for row in infrared.firmware_figures(tmp_path)}
     assert {name.removeprefix("microcontroller"): row.value for name, row in found.items()} == {
         ", demodulation: mean": pytest.approx(625.0),
         ", demodulation: SD": pytest.approx(25.0),
@@ -654,7 +654,7 @@ def test_durations_of_the_stages_of_a_firmware(tmp_path: Path) -> None:
         (tmp_path / "benchmarks/twoLH_2D/Logic_analyser_capture.sal").read_bytes()
     )
     with pytest.raises(InputError, match="apply_homography"):
-        infrared_microcontroller.figures(tmp_path)
+        infrared.firmware_figures(tmp_path)
 
 
 @pytest.mark.parametrize(("level", "widths_us"), [(0, [2.0, 3.0]), (1, [3.0])])
@@ -665,5 +665,5 @@ def test_a_pulse_is_between_a_rising_and_a_falling_edge(
     edges = [40, 120, 240, 360, 800] if level == 0 else [40, 120, 240, 360]
     coded = channel(edges, [0, 4000], level=level)
     (line,) = read_light(capture(tmp_path / "run.sal", {"busy": coded}), ["busy"])
-    found = infrared_microcontroller.pulse_widths_us(line)
+    found = infrared.pulse_widths_us(line)
     assert found.tolist() == pytest.approx(widths_us)

@@ -20,7 +20,7 @@ from pikepdf import Array, Dictionary, Name, Pdf, Stream
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core.errors import FormatError, InputError, MissingDataError
-from locatk.formats.printing.overlay import Overlaid, overlay, page_sizes
+from locatk.formats.printing.overlay import OverlaidDocument, overlay, page_sizes
 
 WIDTH, HEIGHT = 384.0, 288.0
 """Points: 800 x 600 px of 150 dpi."""
@@ -514,9 +514,9 @@ def test_bad_documents_are_refused_in_one_line(tmp_path: Path) -> None:
 
 def test_stamps_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     document = drawing(tmp_path / "in.pdf", 2)
-    with pytest.raises(InputError, match="1 pages to lay over 2"):
+    with pytest.raises(InputError, match="1 pages cannot be drawn over 2"):
         overlay(document, stamp(), strip_black=False)
     with pytest.raises(InputError, match="page 2"):
         overlay(document, stamp((WIDTH, HEIGHT), (WIDTH, HEIGHT + 3)), strip_black=False)
     close = stamp((WIDTH + 0.1, HEIGHT), (WIDTH, HEIGHT - 0.1))
-    assert isinstance(overlay(document, close, strip_black=False), Overlaid)
+    assert isinstance(overlay(document, close, strip_black=False), OverlaidDocument)

@@ -190,10 +190,10 @@ def test_other_pitches_and_printers_are_exact() -> None:
 
 
 def test_long_rows_are_several_strings(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert pattern.LONGEST <= 32_767  # ISO 32000-1 annex C
+    assert pattern.MAX_STRING_BYTES <= 32_767  # ISO 32000-1 annex C
     made = sheets("A5")
     whole = pattern.render(made, marks=False)
-    monkeypatch.setattr(pattern, "LONGEST", 100)
+    monkeypatch.setattr(pattern, "MAX_STRING_BYTES", 100)
     cut = pattern.render(made, marks=False)
     with pikepdf.open(io.BytesIO(cut)) as pdf:
         texts = re.findall(rb"\(([udlr]*)\)", content(pdf, 0))
@@ -298,7 +298,7 @@ def test_narrow_margins_stay_empty() -> None:
         raster = rasterise(pattern.render(made, crop=True), 300)
         raster[box_px(layout)] = 255
         assert (raster.min() > PAPER) == bare
-        assert pattern.cramped(made) == (["sheet-1"] if bare else [])
+        assert pattern.sheets_without_margin(made) == (["sheet-1"] if bare else [])
 
 
 def test_crop_marks_are_at_the_corners_of_the_pattern() -> None:
@@ -441,8 +441,8 @@ def test_png_is_the_page(
     at_size = data.index(b"pHYs") + 4
     assert int.from_bytes(data[at_size : at_size + 4], "big") == round(dpi / 0.0254)
     # In whichever portions it is made.
-    monkeypatch.setattr(rasters, "MOST_PIXELS", 100_000)
-    monkeypatch.setattr(rasters, "BAND", 50)
+    monkeypatch.setattr(rasters, "MAX_BAND_PIXELS", 100_000)
+    monkeypatch.setattr(rasters, "BAND_ROWS", 50)
     np.testing.assert_array_equal(png(made)[1], found)
 
 

@@ -24,8 +24,7 @@ from locatk.core.drawing import Group, Line, Mark, Page, Text
 from locatk.core.errors import InputError
 from locatk.core.polaris.drawing.cards import draw_tag_cards
 from locatk.core.polaris.tag import AsBuiltTag, Magnet, TagLayout, Tags, free_cells
-from locatk.formats.printing import tag_svg
-from locatk.formats.printing.drawings import render_pages
+from locatk.formats.printing.drawings import render_pages, render_svg
 
 DPI = 300
 A4, LETTER = (210.0, 297.0), (215.9, 279.4)
@@ -216,7 +215,7 @@ def test_tags_share_pages_without_touching(
         inside = np.zeros_like(dark, bool)
         inside[edge:-edge, edge:-edge] = True
         assert dark[~inside].max() == 0, "the margin is not empty"
-        root = Xml.fromstring(tag_svg.render(page, "test"))
+        root = Xml.fromstring(render_svg(page, "test"))
         groups = root.findall("s:g/s:g", SVG)
         assert groups[0].attrib["id"] == "page"
         ruler = group_box(groups[0])
@@ -254,7 +253,7 @@ def test_words_are_not_drawn_over(tags: Tags, mirror: bool) -> None:
 
 def test_svg_is_what_the_pdf_shows_in_mm() -> None:
     made = draw_tag_cards(FULL, some(FULL, 2), A4)
-    data = tag_svg.render(made.pages[0], "two tags")
+    data = render_svg(made.pages[0], "two tags")
     root = Xml.fromstring(data)
     assert (root.attrib["width"], root.attrib["height"]) == ("210mm", "297mm")
     assert root.attrib["viewBox"] == "0 0 210 297"
@@ -326,7 +325,7 @@ def test_tags_are_drawn_as_designed_and_always_the_same() -> None:
     again = replace(FULL, built={1000: built})
     first, second = (draw_tag_cards(tags, wanted, A4).pages for tags in (FULL, again))
     assert render_pages(first, "t") == render_pages(second, "t")
-    assert tag_svg.render(first[1], "t") == tag_svg.render(second[1], "t")
+    assert render_svg(first[1], "t") == render_svg(second[1], "t")
 
 
 def test_one_ink_and_no_scaling() -> None:

@@ -1,1 +1,0 @@
-"""Benchmark of capture and recovery."""

@@ -1,1 +1,0 @@
-"""Benchmark of evaluation, reports and the demo."""
