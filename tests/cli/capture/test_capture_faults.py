@@ -205,16 +205,16 @@ def test_doubled_signals(
 
 HANG = """
 import sys, time
-from locatk.formats.capture import receiver, serial_link
-receiver.MAX_STOP_WAIT_S = 15.0
-real = serial_link.DescriptorLink.read
+from locatk.formats.capture import links, reader_thread
+reader_thread.MAX_STOP_WAIT_S = 15.0
+real = links.DescriptorLink.read
 def read(self, wait_s):
     data = real(self, wait_s)
     if b"hang" in data:
         print("it hangs", file=sys.stderr, flush=True)
         time.sleep(60)
     return data
-serial_link.DescriptorLink.read = read
+links.DescriptorLink.read = read
 """
 
 
@@ -280,7 +280,7 @@ def test_unplugged_and_plugged_in_again(
     capture.until("connection lost")
     other, _ = os.openpty()  # so that it comes back as another terminal
     port.plug()
-    capture.until("connected again")
+    capture.until("reconnected")
     port.send(b"6\na,b\n7,8\n9,10\n")
     time.sleep(0.2)
     assert capture.stop() == 3
@@ -375,7 +375,7 @@ def test_a_disk_that_fills(line: Any, process: Any, small_disk: Path, raw_bytes:
     capture.until("Recording")
     with sending(port, 1.2e6) as sent:
         assert capture.end() == 3
-    assert "the disk is full in" in capture.stderr
+    assert "the disk will be full in" in capture.stderr
     assert "Incomplete: the disk is full up to --reserve" in capture.stderr
     assert Session.open(path).damage is None
     kept = raw_bytes(path)

@@ -601,7 +601,7 @@ def test_the_next_part_cannot_be_begun(port: Any, start: Any, raw_bytes: Any) ->
     recorded = running.result()
     assert recorded.failed
     assert "run-002.mcap" in recorded.ended
-    assert "3 bytes that were received are not in it" in recorded.ended
+    assert "3 received bytes are not in the file" in recorded.ended
     assert "removed" not in recorded.ended
     assert recorded.paths == [parts.part_path(running.wanted.output, 1)]
     assert raw_bytes(*recorded.paths) == b"kept"
