@@ -273,7 +273,7 @@ TUM = "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n3 1 1 0 0 0 0 1\n"
         (TUM.splitlines()[0], TUM, ("--offset", "auto"), "only 0 poses"),
         ("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n", TUM, ("--align", "se3"), "collinear"),
         (TUM.replace("1 0 0 0", "0 0 0 0"), TUM, ("--align", "se2", "--offset", "9"), "time"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n", TUM, (), "KITTI tells no times"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", TUM, (), "KITTI has no times"),
     ],
 )
 def test_bad_input_is_one_line_and_a_hint(
