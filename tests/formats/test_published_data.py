@@ -10,9 +10,7 @@ from locatk.core.errors import MissingDataError
 from locatk.formats.published_data import VARIABLE, data_folder
 
 
-def test_the_order_of_the_folders(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_order_of_the_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given, named, beside = tmp_path / "given", tmp_path / "named", tmp_path / "shared" / "data"
     work = tmp_path / "work"
     for folder in (given, named, beside, work):
