@@ -25,7 +25,6 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 from mcap import records
 from mcap.opcode import Opcode
-from mcap_protobuf.schema import build_file_descriptor_set
 
 from locatk.formats.schemas import lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2
 from locatk.formats.sessions.mcap_file import (
@@ -447,6 +446,9 @@ def restore_channels(index: Index) -> None:
     Such channels are in the metadata record :data:`CHANNELS_RECORD`. Their schemas are those of
     this version of locatk and of its foxglove package.
     """
+    # This import takes 0.12 s, mostly for importlib.metadata, and every reader imports this module.
+    from mcap_protobuf.schema import build_file_descriptor_set
+
     for key, text in index.metadata.get(CHANNELS_RECORD, {}).items():
         topic, _, name = text.rpartition(" ")
         if not (key.isascii() and key.isdigit() and len(key) <= MAX_CHANNEL_DIGITS):

@@ -112,7 +112,7 @@ def test_receivers_and_what_stations_sent(
     assert given["receivers"].keys() == {"red"}
     first, second = solution.warnings
     assert first.code == "other_station_id"
-    assert first.message.startswith("on channel 2 the scene has the station 0000000c")
+    assert first.message.startswith("channel 2: the scene contains station 0000000c")
     assert second == OF_SOLVER
 
 
