@@ -334,7 +334,7 @@ class Reader:
 
     def store(self, bucket: str) -> None:
         """A bucket with the sessions of the folder, where the page names it first."""
-        from locatk.formats.pipeline.locations import facts_of
+        from locatk.formats.pipeline.locations import read_facts
 
         if bucket in self.buckets:
             return
@@ -356,7 +356,7 @@ class Reader:
         store = fsspec.S3FileSystem(skip_instance_cache=True)
         store.mkdir(bucket)
         for path in self.folder.rglob("*.mcap"):
-            if facts_of(str(path)).get("kind") == "solution":
+            if read_facts(str(path)).get("kind") == "solution":
                 continue
             store.put_file(str(path), f"{bucket}/{path.relative_to(self.folder).as_posix()}")
 

@@ -496,7 +496,7 @@ def test_passes_say_how_a_tag_was_built(locatk, solver: Solver, tmp_path: Path) 
     assert {m["passes"] for m in tag["magnets"]} == {4}
     assert max(m["scatter_m"] for m in tag["magnets"]) < 1e-9
     text = locatk("calibrate", "tag", *sessions, "-o", out, "--overwrite").stdout
-    assert f"tag {ID} from 4 passes" in text
+    assert f"tag {ID}, 4 passes" in text
 
 
 def test_the_mean_offset_and_turn_are_none() -> None:
