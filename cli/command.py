@@ -8,7 +8,7 @@
     def command(...): ...
 
 Options outside of any section are listed first, under "Options"; those that most commands have
-(:data:`GENERAL_PARAMETERS`) are last, under "General".
+(:data:`GENERAL_OPTIONS`) are last, under "General".
 
 cloup 4.0 and rich-click 1.9 offer the same. The help of a command with 15 options took 45 ms of
 processor time with click alone, 50 ms with this module, 86 ms with cloup and 118 ms with
@@ -29,8 +29,8 @@ SECTIONS = "__locatk_sections__"
 DEFAULT_SECTION = "Options"
 GENERAL_SECTION = "General"
 
-GENERAL_PARAMETERS = {"as_json", "quiet", "verbose", "help"}
-"""Parameters that belong to the last section unless a command assigns another one."""
+GENERAL_OPTIONS = {"--json", "--quiet", "--verbose", "--help"}
+"""Options that belong to the last section unless a command assigns another one."""
 
 
 def combine(*decorators: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -74,7 +74,7 @@ class Command(click.Command):
             if record is None or isinstance(parameter, click.Argument):
                 continue
             title = self.section_of(parameter)
-            if title == DEFAULT_SECTION and parameter.name in GENERAL_PARAMETERS:
+            if title == DEFAULT_SECTION and GENERAL_OPTIONS.intersection(parameter.opts):
                 general.append(record)
             else:
                 sections.setdefault(title, []).append(record)
