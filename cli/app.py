@@ -26,19 +26,19 @@ COMMANDS = {
         "locatk.cli.capture.command",
         "Record a device from a port, or a camera, into a session.",
     ),
-    "emulate": ("locatk.cli.emulate", "Be a device on a pseudo-terminal, without hardware."),
+    "emulate": ("locatk.cli.emulate", "Simulate a device on a pseudo-terminal, without hardware."),
     "import": ("locatk.cli.import_.command", "Turn recordings of other tools into a session."),
-    "simulate": ("locatk.cli.simulate", "Make a session with known truth, without hardware."),
+    "simulate": ("locatk.cli.simulate", "Simulate a session with known truth."),
     "decode": ("locatk.cli.decode", "Decode the raw bytes of a recording again."),
     "recover": ("locatk.cli.recover", "Salvage a damaged recording."),
     "info": ("locatk.cli.info.command", "Describe a session, a solution or an artifact."),
     "calibrate": ("locatk.cli.calibrate", "Calibrate an artifact from recordings."),
     "solve": ("locatk.cli.solve.command", "Solve recorded sessions into poses."),
     "eval": ("locatk.cli.eval.command", "Compare poses with the truth."),
-    "report": ("locatk.cli.report", "Show solutions on one page that opens anywhere."),
+    "report": ("locatk.cli.report", "Show solutions on one HTML page."),
     "export": ("locatk.cli.export", "Write poses for other tools."),
     "demo": ("locatk.cli.demo.command", "Simulate, solve and evaluate, without hardware."),
-    "bench": ("locatk.cli.bench", "Measure what the project promises, on published data."),
+    "bench": ("locatk.cli.bench", "Measure accuracy and speed against targets."),
 }
 """Module and short help of each command. The module holds it as ``command``."""
 

@@ -20,7 +20,7 @@ FRACTION = click.FloatRange(0, 1)
 POSITIVE = click.FloatRange(0, min_open=True)
 
 
-@click.command(cls=Command, short_help="Be a device on a pseudo-terminal, without hardware.")
+@click.command(cls=Command, short_help="Simulate a device on a pseudo-terminal, without hardware.")
 @click.argument("source", metavar="SESSION|SYSTEM")
 @section(
     "Basic",

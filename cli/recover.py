@@ -112,7 +112,7 @@ def _text(recovered: Any) -> str:
         for loss in recovered.losses[:MAX_LISTED_LOSSES]
     ]
     if losses:
-        lines += ["", console.table(("from byte", "to", "unreadable", "recorded"), losses)]
+        lines += ["", console.table(("from byte", "to", "unreadable", "recorded (UTC)"), losses)]
     if len(recovered.losses) > MAX_LISTED_LOSSES:
         lines.append(f"... and {len(recovered.losses) - MAX_LISTED_LOSSES} more: see --json")
     return "\n".join(lines)
@@ -146,9 +146,14 @@ def _lost(recovered: Any) -> str:
 
 
 def _times(loss: Any) -> str:
+    """Format the recorded time of lost data; the date only once."""
     if loss.start_ns is None or loss.end_ns is None:
         return "-"
-    return f"{when(loss.start_ns)} to {when(loss.end_ns)}"
+    start, end = (
+        str(when(time_ns)).removesuffix("+00:00") for time_ns in (loss.start_ns, loss.end_ns)
+    )
+    date = f"{start.partition('T')[0]}T"
+    return f"{start} to {end.removeprefix(date)}"
 
 
 def _number(value: int | None) -> str:

@@ -24,11 +24,9 @@ COMMANDS = {
 """Name of a command to its module and short help. The module holds it as ``command``."""
 
 
-@click.group(
-    cls=LazyGroup, table=COMMANDS, short_help="Make a session with known truth, without hardware."
-)
+@click.group(cls=LazyGroup, table=COMMANDS, short_help="Simulate a session with known truth.")
 def command() -> None:
-    """Make a session with known truth, without hardware.
+    """Simulate a session with known truth, without hardware.
 
     All settings of a simulation are in a TOML file with comments (--print-config, --config); the
     most common ones are options as well.

@@ -93,9 +93,9 @@ def _detection_table(report: SolveReport) -> str:
     if report.system not in ("polaris", "landmarks") or not report.detections:
         return ""
     if report.system == "polaris":
-        detected = tag_table(report.detections)
+        detected = tag_table(report.detections, compact=True)
     else:
-        detected = landmark_table(report.detections, MAX_LANDMARKS)
+        detected = landmark_table(report.detections, MAX_LANDMARKS, compact=True)
     table = console.table(detected.header, detected.rows)
     more = f"\n... and {detected.omitted} more: see --json" if detected.omitted else ""
     return f"{table}{more}"

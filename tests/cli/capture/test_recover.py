@@ -155,7 +155,7 @@ def test_info_points_to_recover(locatk, chunked: Path) -> None:
     chunked.write_bytes(data[: len(data) // 2])
     result = locatk("info", chunked)
     assert result.exit_code == 3
-    assert "`locatk recover` saves what is left" in result.stderr
+    assert "`locatk recover` saves the rest" in result.stderr
     assert result.stderr.count("\n") == 1
     answer = json.loads(locatk("info", chunked, "--json").stdout)
     assert answer["recoverable"]

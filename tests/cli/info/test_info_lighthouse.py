@@ -133,7 +133,7 @@ def test_another_station_than_that_of_the_scene(locatk, write, tmp_path: Path) -
     place = Station(1, np.zeros(3), np.eye(3), FACTORY, id=0xBAD)
     path = write(tmp_path / "1.mcap", stations=HEARD, scene=Scene(stations=(place,)))
     [note] = facts(locatk, path)["notes"]
-    assert note.startswith("on channel 1 the scene has the station 00000bad")
+    assert note.startswith("channel 1: the scene contains station 00000bad")
     assert note in " ".join(locatk("info", path).stdout.split())
 
 

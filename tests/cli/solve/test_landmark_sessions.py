@@ -378,7 +378,7 @@ def test_people_see_a_table_of_landmarks(locatk, solver: Solver, tmp_path: Path)
     assert result.exit_code == 0
     first, second = (line.split() for line in result.stdout.splitlines() if "NNNS" in line)
     assert first[:4] == ["22:13:20.100", "0,0", "NNNS", "98.8"]
-    assert first[4:] == ["1.00", "-2.00", "28.65", "0.1", "0.2", "0.057"]
+    assert first[4:] == ["1.00", "±", "0.1", "-2.00", "±", "0.2", "28.65", "±", "0.057"]
     assert second[:4] == ["22:13:20.300", "1,0", "NNNS", ">99.9"]
     assert "rejected: 1 too short" in result.stdout
     assert "run.mcap: a note" in result.stderr

@@ -450,7 +450,7 @@ def test_photodiodes_at_one_place_do_not_keep_the_sweeps_out(tmp_path: Path) -> 
     room.lines.insert(0, (0.0, f"WM0 CONFIG {json.dumps(config)}"))
     session = read_libsurvive([room.write(tmp_path, config=False)])
     assert session.receivers == {}
-    assert "two photodiodes at the place of photodiode 0" in session.warnings[0]
+    assert "two sensors at the position of sensor 0" in session.warnings[0]
     assert len(session.sweeps) == sum(" W " in line for _, line in room.lines)
 
 

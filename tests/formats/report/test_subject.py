@@ -13,7 +13,7 @@ from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters import trajectory_text as trajectories
+from locatk.formats.exporters.tum import write_tum
 from locatk.formats.report.subject import _find_session, load_subject
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.solutions import write_solution
@@ -124,7 +124,7 @@ def test_a_damaged_session_does_not_stop_the_report(session: Path, tmp_path: Pat
 
 
 def test_a_truth_file_replaces_the_truth_of_the_session(session: Path, tmp_path: Path) -> None:
-    trajectories.write_tum(tmp_path / "camera.tum", track(off_m=5e-3))
+    write_tum(tmp_path / "camera.tum", track(off_m=5e-3))
     subject = load_subject(solved(tmp_path / "solved.mcap"), truth=tmp_path / "camera.tum")
     assert subject.evaluation is not None
     assert subject.evaluation.median == pytest.approx(3e-3)
