@@ -14,7 +14,7 @@ from locatk.formats.tables.delimited import Table, read_table
 
 Array = NDArray[np.float64]
 
-POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9], COLUMNS[9:]
+POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9], COLUMNS[9:13]
 
 MAX_NORM_ERROR = 1e-2
 """Largest deviation of a quaternion from unit length that passes for rounding by its writer."""
