@@ -7,6 +7,7 @@ Their contents are listed in docs/formats.md. :mod:`locatk.formats.sessions.writ
 from __future__ import annotations
 
 import os
+import shlex
 import stat
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -109,15 +110,18 @@ class Session:
         """
         with open_mcap(path) as stream:
             try:
-                return cls(path, read_index(stream))
+                index = read_index(stream)
             except DamageError as damage:
                 if not damaged_ok:
                     raise
                 found = salvage(stream)
                 if found.is_empty:
                     raise
-                found.index.damage = _describe(damage)
-                return cls(path, found.index)
+                index = found.index
+                index.damage = _describe(damage)
+            if index.damage is not None and not damaged_ok:  # Its writer made no summary.
+                raise DamageError(index.damage)
+            return cls(path, index)
 
     def topics(self, prefix: str, schema: str | None = None) -> tuple[str, ...]:
         """Return the topics that start with ``prefix`` and, if given, have this schema; sorted."""
@@ -270,6 +274,9 @@ class RandomAccess:
 def read_index(stream: IO[bytes]) -> Index:
     """Read the index of a file; if its writer made none, all records are read.
 
+    In the latter case damage does not raise an error: the index lists the intact contents, and
+    ``damage`` of the index describes the damage.
+
     Raises
     ------
     DamageError
@@ -334,9 +341,10 @@ def damage_as_format_error(path: str | os.PathLike[str]) -> Iterator[None]:
             hint="Give a session made by `locatk capture`, `import` or `simulate`",
         ) from None
     except DamageError as damage:
+        command = f"locatk recover {shlex.quote(os.fspath(path))} -o whole.mcap"
         raise FormatError(
             str(damage),
             file=path,
             where=None if damage.offset is None else f"byte {damage.offset}",
-            hint=f"`locatk recover {os.fspath(path)} -o whole.mcap` saves the undamaged rest",
+            hint=f"`{command}` saves the undamaged rest",
         ) from None

@@ -31,11 +31,12 @@ from locatk.formats.sessions.mcap_file import (
     iter_records,
     parse,
     read_attachment,
+    read_messages,
     read_segment,
 )
-from locatk.formats.sessions.reader import open_mcap
+from locatk.formats.sessions.reader import open_mcap, read_index
 from locatk.formats.sessions.recovery.salvage import Loss, Salvage, salvage
-from locatk.formats.sessions.recovery.validation import inspect_chunk
+from locatk.formats.sessions.recovery.validation import check_records
 from locatk.formats.sessions.writer import PROFILE
 
 RECOVERED_RECORD = "recovered"
@@ -221,14 +222,27 @@ def iter_contents(
     ]
     with open_mcap(path) as stream:
         for offset, item in sorted(items, key=lambda entry: entry[0]):
-            if isinstance(item, Metadata):
-                yield item
-            elif isinstance(item, Segment):
-                data = read_segment(stream, item)
-                inspect_chunk(data)
-                yield data
-            else:
-                yield read_attachment(stream, offset)
+            try:
+                content = _read_item(stream, offset, item)
+            except DamageError:
+                raise FormatError(
+                    "the file changes while it is read",
+                    file=path,
+                    where=f"byte {offset}",
+                    hint="Wait until its recording has ended",
+                ) from None
+            yield content
+
+
+def _read_item(stream: IO[bytes], offset: int, item: Any) -> Any:
+    """Read an item of :func:`iter_contents`; raise DamageError if it is no longer intact."""
+    if isinstance(item, Metadata):
+        return item
+    if isinstance(item, Segment):
+        data = read_segment(stream, item)
+        check_records(data)
+        return data
+    return read_attachment(stream, offset)
 
 
 class Rewriter:
@@ -360,13 +374,20 @@ def verify(stream: IO[bytes], rewriter: Rewriter) -> None:
     DamageError
         It is damaged, or differs in number from what was written.
     """
-    found = salvage(stream)
-    if not found.is_whole:
-        raise DamageError("the file is damaged")
-    if found.index.counts != rewriter.counts:
+    index = read_index(stream)
+    counts: Counter[int] = Counter()
+    for segment in index.segments:
+        counts.update(channel for channel, _, _ in read_messages(stream, segment, index.channels))
+    for entry in index.attachments:
+        read_attachment(stream, entry.offset)
+    if index.damage is not None:
+        raise DamageError(index.damage)
+    if counts != rewriter.counts or index.counts != rewriter.counts:
         raise DamageError("other messages than were written")
-    if len(found.index.attachments) != rewriter.attachments:
+    if len(index.attachments) != rewriter.attachments:
         raise DamageError("other attachments than were written")
+    if index.metadata_count != rewriter.metadata + 1:  # with the record RECOVERED_RECORD
+        raise DamageError("other metadata than were written")
 
 
 def _no_message_error(path: str | os.PathLike[str], recovered: Recovered) -> FormatError:

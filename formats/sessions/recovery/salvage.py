@@ -37,23 +37,34 @@ from locatk.formats.sessions.mcap_file import (
     Index,
     Segment,
     iter_records,
+    parse,
 )
 from locatk.formats.sessions.recovery.validation import (
     MAX_RECORD_BYTES,
     READERS,
     DamagedFile,
+    Definition,
     parse_exactly,
 )
 
 _FOOTER = struct.Struct("<QQI")
+
+_SUMMARY_KINDS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 
 _WITH_CHECKSUM = (Opcode.CHUNK, Opcode.ATTACHMENT)
 _ANCHORS = (*_WITH_CHECKSUM, Opcode.METADATA, Opcode.DATA_END, Opcode.FOOTER)
 _ANCHORS_WITHOUT_CHUNKS = (*_ANCHORS, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 """Kinds of records at which a search may end, in files with chunks and without."""
 
-SCHEMAS = (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2)
+REGISTERED_SCHEMAS = (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2)
 """Modules whose import registers the messages of locatk in the descriptor pool."""
+
+_DAMAGE_NAMES = {
+    "bytes": "damaged bytes",
+    "zeros": "zeros",
+    "metadata": "a damaged metadata record",
+}
+"""Descriptions of losses; the others are "a damaged" and their kind."""
 
 MAX_CHANNEL_DIGITS = 5
 """Digits of the largest channel id, 65,535."""
@@ -158,7 +169,8 @@ def salvage(stream: IO[bytes]) -> Salvage:
 def describe_damage(result: Salvage) -> str | None:
     """Describe the first damage of a file; None if it is whole."""
     for loss in (*result.losses, *result.index_losses):
-        return f"a damaged {loss.what} at byte {loss.start}"
+        name = _DAMAGE_NAMES.get(loss.what, f"a damaged {loss.what}")
+        return f"{name} at byte {loss.start}"
     return None if result.ended else f"the file is cut short at byte {result.size}"
 
 
@@ -186,7 +198,7 @@ class _Search:
         self._summary_start = 0
         self._recordings = 0
         self._chunk_keys: set[tuple[int, int]] = set()
-        self._verified_definitions: dict[tuple[Opcode, int], bytes] = {}
+        self._verified_definitions: dict[tuple[Opcode, int], Definition] = {}
         # Runs of messages outside chunks
         self._runs: list[Segment] = []
         self._in_run = False
@@ -196,7 +208,7 @@ class _Search:
     def run(self) -> Salvage:
         """Search from the first byte to the last."""
         result, file = self._result, self._file
-        first, position = file.record(len(MAGIC)), 0
+        first, position = file.read_record(len(MAGIC)), 0
         if file.read(0, len(MAGIC)) != MAGIC and first is not None and first[0] == Opcode.HEADER:
             position = len(MAGIC)
             result.index_losses.append(Loss(0, position))
@@ -222,7 +234,7 @@ class _Search:
         file = self._file
         if file.read(position, len(MAGIC)) == MAGIC:
             return position + len(MAGIC)
-        found = file.record(position)
+        found = file.read_record(position)
         if found is None:
             return None
         opcode, end = found
@@ -239,21 +251,22 @@ class _Search:
         elif opcode in (Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX):
             self.has_chunks = True
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._define(opcode, file.content(position, end), is_verified=False)
+            definition = parse_exactly(READERS[opcode], file.read_content(position, end))
+            self._define(opcode, definition, is_verified=False)
         elif opcode == Opcode.METADATA:
             self._accept_metadata(
-                position, parse_exactly(READERS[opcode], file.content(position, end))
+                position, parse_exactly(READERS[opcode], file.read_content(position, end))
             )
         elif opcode == Opcode.HEADER:
             if not self._recordings:
-                header = parse_exactly(READERS[opcode], file.content(position, end))
+                header = parse_exactly(READERS[opcode], file.read_content(position, end))
                 self._result.index.header = header
             self._recordings += 1
             self._in_data_section, self._result.ended = True, False
         return end
 
     def _accept_chunk(self, position: int, end: int) -> int | None:
-        content = self._file.chunk(position, end)
+        content = self._file.read_chunk(position, end)
         if content is None:
             return None
         self._is_verified, self.has_chunks, self._in_run = True, True, False
@@ -299,7 +312,7 @@ class _Search:
             return end
         if (
             not self._file.is_record_or_end(end)
-            and self._file.search(position + 1, end, self._anchors) < end
+            and self._file.find_record(position + 1, end, self._anchors) < end
         ):
             return None  # its length is wrong: it would contain other records
         head = self._file.read(position + RECORD_HEAD.size, MESSAGE_HEAD.size)
@@ -339,11 +352,17 @@ class _Search:
             result.index_losses.append(Loss(self._summary_start or position, end, "index"))
             return
         start, summary_records, is_verified = summary
-        for opcode, content in summary_records:
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(Opcode(opcode), content, is_verified=is_verified)
-            elif opcode == Opcode.STATISTICS:
-                result.statistics = parse_exactly(READERS[opcode], content)
+        for opcode, record in summary_records:
+            if opcode == Opcode.STATISTICS:
+                result.statistics = record
+            else:
+                self._define(opcode, record, is_verified=is_verified)
+        if is_verified:  # Its checksum is right, although it may contain texts with NUL.
+            result.index_losses = [
+                loss
+                for loss in result.index_losses
+                if not (start <= loss.start and loss.end <= position)
+            ]
         # The bytes lost in front of the footer may be this summary, which is intact.
         if result.losses and result.losses[-1].end == position:
             loss = result.losses.pop()
@@ -352,17 +371,17 @@ class _Search:
 
     def _read_summary(
         self, position: int, end: int
-    ) -> tuple[int, list[tuple[int, bytes]], bool] | None:
+    ) -> tuple[int, list[tuple[Opcode, Any]], bool] | None:
         """Read the summary that belongs to the footer at ``position``.
 
         Returns
         -------
-        (int, list of (opcode, content), bool) or None
-            Start, records, and whether they have a checksum. None if the checksum or a record
-            is wrong.
+        (int, list of (Opcode, record), bool) or None
+            Start; schemas, channels and statistics; whether they have a checksum. None if the
+            checksum or a record is wrong.
         """
         file = self._file
-        stated_start, _, crc = _FOOTER.unpack(file.content(position, end))
+        stated_start, _, crc = _FOOTER.unpack(file.read_content(position, end))
         footer = file.read(position, end - position - 4)
         # Missing or additional bytes in front of the summary move it from its stated position.
         for start in (stated_start, self._summary_start):
@@ -372,22 +391,23 @@ class _Search:
             if crc and zlib.crc32(footer, zlib.crc32(data)) != crc:
                 continue
             try:
-                found = [(opcode, data[a:b]) for opcode, a, b in iter_records(data, start)]
+                found = [
+                    (Opcode(opcode), _parse_summary_record(opcode, data[a:b], start, bool(crc)))
+                    for opcode, a, b in iter_records(data, start)
+                    if opcode in _SUMMARY_KINDS
+                ]
             except DamageError:
                 continue
             return start, found, bool(crc)
         return None
 
-    def _define(self, opcode: Opcode, content: bytes, *, is_verified: bool) -> None:
+    def _define(self, opcode: Opcode, record: Definition, *, is_verified: bool) -> None:
         """Register a schema or a channel; one with a checksum replaces one without."""
-        record: Any = parse_exactly(READERS[opcode], content)
-        if record is None:
-            return
         index, key = self._result.index, (opcode, record.id)
         known: dict[int, Any] = index.schemas if opcode == Opcode.SCHEMA else index.channels
         if not is_verified:
             known.setdefault(record.id, record)
-        elif self._verified_definitions.setdefault(key, content) == content:
+        elif self._verified_definitions.setdefault(key, record) == record:
             known[record.id] = record
         else:
             self._result.conflicts.add(key)
@@ -400,18 +420,18 @@ class _Search:
         if self._unverified_start is not None:
             # The length of the last record has no checksum: the record may hide another one.
             start, self._unverified_start = self._unverified_start, None
-            hidden = file.search(start + 1, position, _WITH_CHECKSUM)
+            hidden = file.find_record(start + 1, position, _WITH_CHECKSUM)
             if hidden < position:
                 result.losses.append(Loss(start, hidden))
                 return hidden
         loss = self._classify(position)
         end = loss.end
         if end == position:
-            end = file.search(position + 1, file.size, self._anchors)
+            end = file.find_record(position + 1, file.size, self._anchors)
         elif not loss.name:
             # The length may be wrong and end at another record by chance: search inside, except
             # inside an attachment with a readable name, which may itself be a recording.
-            end = file.search(position + 1, end, _WITH_CHECKSUM)
+            end = file.find_record(position + 1, end, _WITH_CHECKSUM)
         if loss.what == "bytes" and file.is_zero(position, end):
             loss = replace(loss, what="zeros")
         self._in_run = False
@@ -437,6 +457,16 @@ class _Search:
         return Loss(position, end, what if attachment is None else "attachment", name)
 
 
+def _parse_summary_record(opcode: int, content: bytes, offset: int, is_verified: bool) -> Any:
+    """Return a record of the summary at ``offset``; raise DamageError if it is damaged."""
+    if is_verified:
+        return parse(READERS[opcode], content, offset)
+    record = parse_exactly(READERS[opcode], content)
+    if record is None:
+        raise DamageError("the summary is damaged", offset)
+    return record
+
+
 # ---- channels without definition
 
 
@@ -446,10 +476,13 @@ def restore_channels(index: Index) -> None:
     Such channels are in the metadata record :data:`CHANNELS_RECORD`. Their schemas are those of
     this version of locatk and of its foxglove package.
     """
+    listed = index.metadata.get(CHANNELS_RECORD)
+    if not listed:
+        return
     # This import takes 0.12 s, mostly for importlib.metadata, and every reader imports this module.
     from mcap_protobuf.schema import build_file_descriptor_set
 
-    for key, text in index.metadata.get(CHANNELS_RECORD, {}).items():
+    for key, text in listed.items():
         topic, _, name = text.rpartition(" ")
         if not (key.isascii() and key.isdigit() and len(key) <= MAX_CHANNEL_DIGITS):
             continue

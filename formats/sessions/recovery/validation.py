@@ -2,7 +2,8 @@
 
 A chunk and an attachment are accepted by their checksum. If the writer left it out, their
 lengths must agree and the content of a chunk must consist of records. Records of other kinds
-must have lengths that agree to the last byte, and texts in UTF-8. No length is used before it
+must have lengths that agree to the last byte, and texts in UTF-8 without NUL, because a power cut
+leaves zeros. Inside a chunk with the right checksum, NUL is accepted. No length is used before it
 was checked, so that a flipped bit costs neither memory nor time.
 Specification: https://mcap.dev/spec
 """
@@ -65,6 +66,9 @@ _NEVER_AFTER_DATA_END = (Opcode.HEADER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MES
 _CONTENT_BYTES = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
 
 
+Definition = records.Schema | records.Channel
+
+
 class ChunkContent(NamedTuple):
     """Content of a chunk.
 
@@ -74,15 +78,15 @@ class ChunkContent(NamedTuple):
         Messages by channel.
     span : (int, int) or None
         First and last log time in ns.
-    definitions : list of (Opcode, bytes)
-        Schemas and channels.
+    definitions : list of (Opcode, Schema or Channel)
+        In their order.
     key : (int, int)
         Length and checksum, by which copies of the chunk are recognized.
     """
 
     counts: Counter[int]
     span: tuple[int, int] | None
-    definitions: list[tuple[Opcode, bytes]]
+    definitions: list[tuple[Opcode, Definition]]
     key: tuple[int, int]
 
 
@@ -107,12 +111,12 @@ class DamagedFile:
         end = position + RECORD_HEAD.size + length
         return (opcode, end) if end <= self.size else None
 
-    def content(self, position: int, end: int) -> bytes:
+    def read_content(self, position: int, end: int) -> bytes:
         """Read the content of the record from ``position`` to ``end``."""
         return self.read(position + RECORD_HEAD.size, end - position - RECORD_HEAD.size)
 
-    def record(self, position: int) -> tuple[Opcode, int] | None:
-        """Return kind and end of the record at ``position``; None if its lengths disagree."""
+    def read_record(self, position: int) -> tuple[Opcode, int] | None:
+        """Read kind and end of the record at ``position``; None if its lengths disagree."""
         head = self.record_head(position)
         if head is None or not 0 < head[0] <= Opcode.DATA_END:
             return None
@@ -158,13 +162,13 @@ class DamagedFile:
         is_valid = length == _CHUNK.size + name_length + 8 + data_length
         return (start_ns, end_ns, size) if is_valid else None
 
-    def chunk(self, position: int, end: int) -> ChunkContent | None:
-        """Return the content of a chunk whose head is valid; None if it is damaged."""
+    def read_chunk(self, position: int, end: int) -> ChunkContent | None:
+        """Read the content of a chunk whose head is valid; None if it is damaged."""
         head = self.chunk_head(position)
         if head is None or head[2] > MAX_RECORD_BYTES:
             return None
         try:
-            return inspect_chunk(decompress(self.content(position, end), position))
+            return check_records(decompress(self.read_content(position, end), position))
         except DamageError:
             return None
 
@@ -203,7 +207,7 @@ class DamagedFile:
         return (
             position == self.size
             or self.read(position, len(MAGIC)) == MAGIC
-            or self.record(position) is not None
+            or self.read_record(position) is not None
         )
 
     def _crc(self, start: int, end: int) -> int:
@@ -221,8 +225,8 @@ class DamagedFile:
 
     # ---- search for the next record after damage
 
-    def search(self, start: int, limit: int, kinds: Collection[Opcode]) -> int:
-        """Return the first position from ``start`` of an acceptable record of one of ``kinds``.
+    def find_record(self, start: int, limit: int, kinds: Collection[Opcode]) -> int:
+        """Find the first position from ``start`` of an acceptable record of one of ``kinds``.
 
         Returns ``limit`` if there is none before it.
         """
@@ -255,28 +259,28 @@ class DamagedFile:
             yield offset + int(position)
 
     def _is_acceptable(self, position: int, kinds: Collection[Opcode]) -> bool:
-        found = self.record(position)
+        found = self.read_record(position)
         if found is None or found[0] not in kinds:
             return False
         opcode, end = found
         if opcode == Opcode.CHUNK:
-            return self.chunk(position, end) is not None
+            return self.read_chunk(position, end) is not None
         if opcode == Opcode.ATTACHMENT:
             return self.is_attachment_intact(position, end)
         if opcode == Opcode.FOOTER:
             return self.read(end, len(MAGIC)) == MAGIC
         if opcode == Opcode.DATA_END:
-            next_record = self.record(end)
+            next_record = self.read_record(end)
             return next_record is not None and next_record[0] not in _NEVER_AFTER_DATA_END
         if opcode == Opcode.MESSAGE:
             return self._begins_chain(position)
         # Zeros parse as a record without a name.
-        record = parse_exactly(READERS[opcode], self.content(position, end))
+        record = parse_exactly(READERS[opcode], self.read_content(position, end))
         return bool(record.topic if opcode == Opcode.CHANNEL else record.name)
 
     def _begins_chain(self, position: int) -> bool:
         for _ in range(MIN_CHAIN_RECORDS):
-            found = self.record(position)
+            found = self.read_record(position)
             if found is None:
                 return False
             position = found[1]
@@ -322,8 +326,8 @@ def _parse_filling(reader: Callable[[ReadDataStream], Any], source: IO[bytes], l
     return record if stream.count == length else None
 
 
-def inspect_chunk(data: bytes | memoryview) -> ChunkContent:
-    """List the content of a decompressed chunk.
+def check_records(data: bytes | memoryview) -> ChunkContent:
+    """Check the records of a decompressed chunk, and list its content.
 
     Raises
     ------
@@ -332,16 +336,14 @@ def inspect_chunk(data: bytes | memoryview) -> ChunkContent:
     """
     times: list[int] = []
     counts: Counter[int] = Counter()
-    definitions: list[tuple[Opcode, bytes]] = []
+    definitions: list[tuple[Opcode, Definition]] = []
     for opcode, start, end in iter_records(data, 0):
         if opcode == 5:  # Opcode.MESSAGE; a chunk may hold tens of thousands
             channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(data, start)
             counts[channel] += 1
             times.append(time_ns)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            content = bytes(data[start:end])
-            parse(READERS[opcode], content, start)
-            definitions.append((Opcode(opcode), content))
+            definitions.append((Opcode(opcode), parse(READERS[opcode], data[start:end], start)))
     return ChunkContent(
         counts,
         (min(times), max(times)) if times else None,

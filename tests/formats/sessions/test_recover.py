@@ -550,6 +550,39 @@ def test_an_output_that_cannot_be_read_back_is_removed(
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_an_output_without_a_metadata_record_is_noticed(
+    good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(good.data)
+    add_metadata = mcap.writer.Writer.add_metadata
+
+    def forget_state(writer: mcap.writer.Writer, name: str, data: dict[str, str]) -> None:
+        if name != "state":
+            add_metadata(writer, name, data)
+
+    monkeypatch.setattr(mcap.writer.Writer, "add_metadata", forget_state)
+    with pytest.raises(LocatkError, match="other metadata"):
+        recover(path, tmp_path / "out.mcap")
+
+
+def test_nul_in_texts_is_preserved(tmp_path: Path) -> None:
+    path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
+    with path.open("wb") as stream:
+        writer = mcap.writer.Writer(stream)
+        writer.start()
+        schema = writer.register_schema("Thing", "jsonschema", b"{}")
+        channel = writer.register_channel("/thing\0", "json", schema, {"key": "a\0b"})
+        for number in range(50):
+            writer.add_message(channel, number, b"{}", number)
+        writer.finish()
+    result = recover(path, output)
+    assert result.messages == 50
+    assert result.complete
+    assert not result.damaged
+    assert stock(output) == stock(path)
+
+
 def test_a_file_that_changes_during_recovery(
     good: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -570,8 +603,9 @@ def test_a_file_that_changes_during_recovery(
         change_before_registration(change)
         for options in ({}, {"use_chunking": False}):
             write(path, **options)
-            with pytest.raises(FormatError):
+            with pytest.raises(FormatError, match="the file changes while it is read") as caught:
                 recover(path, output)
+            assert "recover" not in (caught.value.hint or "")
             assert list(tmp_path.iterdir()) == [path]
 
 

@@ -390,10 +390,59 @@ def test_damage_of_a_file_without_index_is_described(tmp_path: Path) -> None:
     data = path.read_bytes()
     position = data.index(bytes([Opcode.CHUNK]), 500)
     path.write_bytes(data[: position + 60] + b"\xff" + data[position + 61 :])
-    session = Session.open(path)
+    with pytest.raises(FormatError, match="a damaged chunk at byte") as caught:
+        Session.open(path)
+    assert "recover" in (caught.value.hint or "")
+    session = Session.open(path, damaged_ok=True)
     assert session.damage is not None
-    assert session.damage.startswith("a damaged ")
+    assert session.damage.startswith("a damaged chunk at byte ")
     assert 0 < len(list(session.messages())) < 100
+
+
+def test_a_damaged_metadata_record_of_a_file_without_index_is_described(tmp_path: Path) -> None:
+    path = tmp_path / "bad.mcap"
+    foreign(path, index_types=mcap.writer.IndexType.NONE)
+    path.write_bytes(path.read_bytes().replace(b"\3\0\0\0who", b"\3\0\0\1who"))
+    with pytest.raises(FormatError, match="a damaged metadata record at byte"):
+        Session.open(path)
+
+
+def test_a_damaged_metadata_record_is_named(file: Path, tmp_path: Path) -> None:
+    data = bytearray(file.read_bytes())
+    offset = data.index(bytes([Opcode.METADATA]), len(mcap_file.MAGIC) + 9)
+    while data[offset + 9 : offset + 19] != b"\x06\0\0\0locatk":
+        offset = data.index(bytes([Opcode.METADATA]), offset + 1)
+    data[offset] = 0x7F
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="no metadata record where the index names one") as caught:
+        Session.open(path)
+    assert caught.value.where == f"byte {offset}"
+
+
+@pytest.mark.parametrize("index_types", [mcap.writer.IndexType.ALL, mcap.writer.IndexType.NONE])
+def test_nul_in_texts_of_a_chunk(tmp_path: Path, index_types: mcap.writer.IndexType) -> None:
+    path = tmp_path / "nul.mcap"
+    with path.open("wb") as stream:
+        writer = mcap.writer.Writer(stream, index_types=index_types)
+        writer.start()
+        schema = writer.register_schema("Thing\0", "jsonschema", b"{}")
+        channel = writer.register_channel("/thing\0", "json", schema, {"key\0": "\0"})
+        for number in range(50):
+            writer.add_message(channel, number, b"{}", number)
+        writer.finish()
+    session = Session.open(path)
+    assert session.damage is None
+    assert session.channels == (Channel("/thing\0", "Thing\0", "json", 50),)
+    assert len(list(session.messages())) == 50
+
+
+def test_the_hint_quotes_the_path(file: Path, tmp_path: Path) -> None:
+    path = tmp_path / "my run.mcap"
+    path.write_bytes(file.read_bytes()[:-20])
+    with pytest.raises(FormatError) as caught:
+        Session.open(path)
+    assert f"locatk recover '{path}' -o" in (caught.value.hint or "")
 
 
 # ---- single messages
