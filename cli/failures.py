@@ -25,6 +25,9 @@ from locatk.core.errors import LocatkError
 INTERRUPTED_STATUS = 130
 """Exit status of a command that Ctrl-C ended: 128 and the number of SIGINT (POSIX shells)."""
 
+REPORT_HINT = "Please report it, with the traceback from -v"
+"""Hint of errors of the program."""
+
 _OS_HINTS = {
     errno.EACCES: "Check the permissions of the file and of its folder",
     errno.EPERM: "Check the permissions of the file and of its folder",
@@ -93,7 +96,7 @@ def report(error: BaseException) -> int:
         return 1
     _print_error(
         f"internal error, {type(error).__name__}: {error}",
-        "Please report it, with the traceback from -v",
+        REPORT_HINT,
     )
     return 1
 

@@ -15,7 +15,8 @@ from locatk.cli.command import Command, section
 from locatk.cli.solve import text as solve_text
 
 if TYPE_CHECKING:
-    from locatk.formats.pipeline import Outcome, SolveJob
+    from locatk.core.errors import LocatkError
+    from locatk.formats.pipeline import Outcome, SolveFailure, SolveJob
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 
@@ -198,6 +199,7 @@ def command(
         resume=resume,
         scene_output=save_scene,
         is_remote=scheduler is not None,
+        with_detections=as_json,
     )
     solve = _solve_one if len(work) == 1 else _solve_several
     solve(work, as_json, workers=jobs, scheduler=scheduler)
@@ -225,7 +227,7 @@ def _solve_one(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> None:
         ]
     if isinstance(outcome, pipeline.SolveFailure):
         console.detail(outcome.traceback.rstrip())
-        raise outcome.error
+        raise _error(outcome)
     _print_outcome(outcome, jobs[0], as_json)
     losses = _losses(outcome)
     for loss in losses[1:]:
@@ -285,7 +287,7 @@ def _print_outcome(outcome: Outcome, job: SolveJob, as_json: bool) -> None:
 
     if isinstance(outcome, pipeline.SolveFailure):
         if as_json:
-            error = outcome.error
+            error = _error(outcome)
             failure = {"session": outcome.session, "error": error.message, "hint": error.hint}
             console.emit_json({"version": 1, "sessions": [failure]})
         if outcome.traceback:
@@ -306,8 +308,15 @@ def _losses(outcome: Outcome) -> list[str]:
     from locatk.formats import pipeline
 
     if isinstance(outcome, pipeline.SolveFailure):
-        return [failures.describe(outcome.error)]
+        return [failures.describe(_error(outcome))]
     return [f"{outcome.session}: {loss.message}" for loss in outcome.losses]
+
+
+def _error(failure: SolveFailure) -> LocatkError:
+    """Return the error of a session, with the hint of the command line on internal errors."""
+    if failure.is_internal:
+        failure.error.hint = failures.REPORT_HINT
+    return failure.error
 
 
 class _BatchProgress:

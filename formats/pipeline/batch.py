@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.errors import InputError, LocatkError, OutputExistsError
+from locatk.formats.files import read_bytes
 from locatk.formats.pipeline import execution, locations, provenance
 from locatk.formats.pipeline.outcome import Outcome, SolveFailure
 from locatk.formats.pipeline.solving import SolveJob, default_output, plan_job, run_job
@@ -128,13 +129,18 @@ def plan_jobs(
         Other machines run the jobs: the files of the request travel with them.
     options
         Further attributes of :class:`SolveJob`.
+
+    Raises
+    ------
+    MissingDataError, InputError
+        A file of the request cannot be read.
     """
     carried = []
     if is_remote:
         for field in fields(request):
             value = getattr(request, field.name)
             if isinstance(value, Path):
-                carried.append((field.name, value.name, value.read_bytes()))
+                carried.append((field.name, value.name, read_bytes(value)))
     options["options_sha256"] = provenance.options_digest(request)
     options["carried_files"] = tuple(carried)
     return [

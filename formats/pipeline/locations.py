@@ -19,7 +19,6 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from locatk.core.errors import (
-    FormatError,
     InputError,
     LocatkError,
     MissingDataError,
@@ -196,11 +195,11 @@ def _expand(name: str) -> list[str] | None:
         return _expand_url(name)
     if os.path.isdir(name):
         files = _matching_files(os.path.join(glob.escape(name), "*.mcap"))
-        return _require_files(sorted(files), name, f"no *.mcap in the folder {name}")
+        return _require_files(sorted(files), f"no *.mcap in the folder {name}")
     if os.path.exists(name):
         return None
     if glob.has_magic(name):
-        return _require_files(sorted(_matching_files(name)), name, f"no file matches {name}")
+        return _require_files(sorted(_matching_files(name)), f"no file matches {name}")
     if not name:
         raise InputError("a file name is empty", hint="Check the variables of the shell")
     raise MissingDataError(
@@ -242,10 +241,10 @@ def _expand_url(url: str) -> list[str] | None:
         pattern = key if is_pattern else f"{key.rstrip('/')}/*.mcap"
         files = [str(store.unstrip_protocol(path)) for path in store.glob(pattern)]
     problem = f"no file matches {url}" if is_pattern else f"no *.mcap in {url}"
-    return _require_files(sorted(files), url, problem)
+    return _require_files(sorted(files), problem)
 
 
-def _require_files(files: list[str], name: str, problem: str) -> list[str]:
+def _require_files(files: list[str], problem: str) -> list[str]:
     if not files:
         raise MissingDataError(problem, hint="Check the spelling, and that there are sessions")
     return files
@@ -425,7 +424,7 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
             hint='Install it: pip install "locatk[s3]"',
         ) from None
     except ValueError as error:
-        raise FormatError(short_reason(error), file=url) from None
+        raise InputError(short_reason(error), file=url, hint=hint) from None
     except Exception as error:  # Some stores connect at once.
         raise _access_error(error, url, hint) from error
     try:

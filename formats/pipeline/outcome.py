@@ -53,7 +53,12 @@ class SolveReport:
         In the order of the solution.
     rejected : dict of str to int
         Number of observations that were not used, by reason.
-    detections, facts, warnings
+    detections : tuple
+        As in :class:`locatk.core.solution.Solution`. A report that was made without detections
+        contains those of tags and landmarks only.
+    facts : LandmarkFacts or None
+        As in the solution of landmarks; None for other systems, and without detections.
+    warnings : tuple of SolverWarning
         As in :class:`locatk.core.solution.Solution`.
     losses : tuple of SolverWarning
         Devices and observations that are unsolved; the codes are ``no_pose``,
@@ -98,20 +103,33 @@ class SolveFailure:
         One of the classes in :mod:`locatk.core.errors`, with the file names of the user.
     traceback : str
         Traceback of the original exception; empty if its process died.
+    is_internal : bool
+        The exception is an error of the program, which should be reported.
     """
 
     session: str
     error: LocatkError
     traceback: str = ""
+    is_internal: bool = False
 
 
 Outcome = SolveReport | SolveFailure
 
 
 def summarize(
-    session: str, output: str, solution: Solution, solve_s: float | None = None
+    session: str,
+    output: str,
+    solution: Solution,
+    solve_s: float | None = None,
+    *,
+    with_detections: bool = True,
 ) -> SolveReport:
-    """Return the report of a solution that was written to ``output``."""
+    """Return the report of a solution that was written to ``output``.
+
+    Without detections it contains only those of tags and landmarks, which are few.
+    """
+    has_table = solution.system in ("polaris", "landmarks")
+    has_facts = with_detections and solution.system == "landmarks"
     return SolveReport(
         session=session,
         output=output,
@@ -123,8 +141,8 @@ def summarize(
             for track in solution.trajectories
         ),
         rejected=solution.rejected,
-        detections=solution.detections,
-        facts=solution.facts,
+        detections=solution.detections if with_detections or has_table else (),
+        facts=solution.facts if has_facts else None,
         warnings=tuple(solution.warnings),
         losses=find_losses(solution),
         is_metric=not (isinstance(solution.artifact, Scene) and solution.artifact.scale == "unit"),

@@ -71,7 +71,10 @@ def command_line(session: str, request: SolveRequest) -> str:
     words = ["locatk", "solve", session]
     for name, value in asdict(request).items():
         if value is not None:
-            words += [f"--{name}", value.name if isinstance(value, Path) else str(value)]
+            words += [
+                f"--{name.replace('_', '-')}",
+                value.name if isinstance(value, Path) else str(value),
+            ]
     return shlex.join(words)
 
 

@@ -53,6 +53,9 @@ class SolveJob:
         Files of the request that travel with the job: name of the option, file name, content.
     scratch : str, optional
         Folder for temporary files.
+    with_detections : bool
+        The report contains all detections and facts. Otherwise it contains only what the tables
+        of `locatk solve` show, which travels faster between processes.
     """
 
     session: str
@@ -66,17 +69,36 @@ class SolveJob:
     scene_output: Path | None = None
     carried_files: tuple[tuple[str, str, bytes], ...] = ()
     scratch: str | None = None
+    with_detections: bool = True
 
 
-def plan_job(session: str, output: str, request: SolveRequest, **fields: Any) -> SolveJob:
-    """Return the job for a session; ``fields`` are further attributes of :class:`SolveJob`."""
+def plan_job(
+    session: str,
+    output: str,
+    request: SolveRequest,
+    *,
+    options_sha256: str | None = None,
+    **fields: Any,
+) -> SolveJob:
+    """Return the job for a session.
+
+    Parameters
+    ----------
+    session, output : str
+        Locations as the user gave them.
+    request : SolveRequest
+    options_sha256 : str, optional
+        Digest of the request, if it is known from another job; computed by default.
+    fields
+        Further attributes of :class:`SolveJob`.
+    """
     return SolveJob(
         session,
         output,
         locations.absolute(session),
         locations.absolute(output),
         request,
-        fields.pop("options_sha256", None) or provenance.options_digest(request),
+        options_sha256 or provenance.options_digest(request),
         **fields,
     )
 
@@ -112,7 +134,8 @@ def solve_file(
     Raises
     ------
     LocatkError
-        The session cannot be read or solved, or the output cannot be written.
+        The session cannot be read or solved, or the output cannot be written. A note of the
+        exception (PEP 678) contains the traceback of its cause.
 
     Examples
     --------
@@ -130,6 +153,7 @@ def solve_file(
     )
     outcome = run_job(job)
     if isinstance(outcome, SolveFailure):
+        outcome.error.add_note(outcome.traceback)
         raise outcome.error
     return outcome
 
@@ -141,12 +165,14 @@ def run_job(job: SolveJob) -> Outcome:
         with contextlib.ExitStack() as stack:
             return _run_steps(job, stack, user_names)
     except Exception as error:  # The other sessions of a batch are solved nevertheless.
-        cause = portable_error(_as_locatk_error(error, job.session), user_names)
-        return SolveFailure(job.session, cause, traceback.format_exc())
+        known = _as_known_error(error, job.session)
+        cause = portable_error(known or _internal_error(error, job.session), user_names)
+        is_internal = known is None
+        return SolveFailure(job.session, cause, traceback.format_exc(), is_internal)
 
 
-def _as_locatk_error(error: Exception, session: str) -> LocatkError:
-    """Return an error with a message for people."""
+def _as_known_error(error: Exception, session: str) -> LocatkError | None:
+    """Return an error with a message for people; None for an error of the program."""
     if isinstance(error, LocatkError):
         return error
     if isinstance(error, OSError):
@@ -154,10 +180,14 @@ def _as_locatk_error(error: Exception, session: str) -> LocatkError:
     if isinstance(error, MemoryError):
         hint = "Solve shorter sessions, or fewer at a time"
         return LocatkError("not enough memory", file=session, hint=hint)
+    return None
+
+
+def _internal_error(error: Exception, session: str) -> LocatkError:
     return LocatkError(
         f"internal error, {type(error).__name__}: {error}",
         file=session,
-        hint="Please report it, with the traceback from -v",
+        hint="Please report it, with its traceback",
     )
 
 
@@ -208,7 +238,9 @@ def _run_steps(
                 raise
     if job.scene_output is not None and (existing is None or not job.scene_output.exists()):
         scene_files.write_scene(job.scene_output, solution.artifact, overwrite=job.overwrite)
-    return summarize(job.session, job.output, solution, solve_s)
+    return summarize(
+        job.session, job.output, solution, solve_s, with_detections=job.with_detections
+    )
 
 
 def _unpack_files(

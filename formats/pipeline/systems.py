@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -110,10 +110,12 @@ class System:
                 f"no method {request.method!r} for {self.name}",
                 hint=f"Use --method {' or '.join(self.methods)}",
             )
-        for name in ("scene", "camera", "speed", "templates"):
-            if name not in self.options and getattr(request, name) is not None:
+        used = {"method", "artifact", *self.options}
+        for field in fields(request):
+            if field.name not in used and getattr(request, field.name) is not None:
+                option = f"--{field.name.replace('_', '-')}"
                 raise InputError(
-                    f"--{name} is not an option of {self.name}", hint=f"Leave out --{name}"
+                    f"{option} is not an option of {self.name}", hint=f"Leave out {option}"
                 )
 
 

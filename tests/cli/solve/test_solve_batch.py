@@ -250,6 +250,7 @@ def test_results_do_not_depend_on_jobs(
     assert list(reasons) == names
     assert [name for name in names if reasons[name] is None] == ["dots", "lighthouse", "polaris"]
     assert reasons["broken"] == "internal error, ZeroDivisionError: by nought"
+    assert "Please report it, with the traceback from -v" in errors[0]
     assert "Incomplete: 5 of 8 sessions could not be solved." in errors[0]
 
 

@@ -98,3 +98,11 @@ def test_any_name_is_found_or_one_error(name: str) -> None:
     except LocatkError:
         return
     assert found.sessions
+
+
+def test_an_unknown_protocol_is_an_error_of_the_input() -> None:
+    pytest.importorskip("fsspec")
+    with pytest.raises(InputError, match="Protocol not known") as caught:
+        locations.exists("teleport://bucket/run.mcap")
+    assert type(caught.value) is InputError
+    assert caught.value.file == "teleport://bucket/run.mcap"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -90,3 +91,13 @@ def test_only_our_own_is_replaced(source: Path, tmp_path: Path) -> None:
     out.write_text("precious")
     assert not provenance.is_replaceable(out, "run.mcap")
     assert not provenance.is_replaceable(tmp_path / "absent", "run.mcap")
+
+
+def test_the_command_has_the_names_of_options() -> None:
+    @dataclass(frozen=True)
+    class Request:
+        grid_size: int | None = None
+        artifact: Path | None = None
+
+    command = provenance.command_line("my run.mcap", Request(3, Path("a/tag.toml")))  # type: ignore[arg-type]
+    assert command == "locatk solve 'my run.mcap' --grid-size 3 --artifact tag.toml"

@@ -5,11 +5,12 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from locatk.core.errors import DegenerateError, LocatkError, OutputExistsError
+from locatk.core.errors import DegenerateError, LocatkError, MissingDataError, OutputExistsError
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.pipeline import (
@@ -96,7 +97,46 @@ def test_a_failure_is_an_error_of_the_library(record: Callable[[str], Path]) -> 
     with pytest.raises(DegenerateError, match="sensor 3 stood still") as failed:
         solve_file(session)
     assert failed.value.file == str(session)
+    (note,) = failed.value.__notes__
+    assert "PluginError" in note
     assert not session.with_name("still-solved.mcap").exists()
+
+
+def test_an_internal_error_names_no_option(
+    record: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(session: Session, request: SolveRequest) -> SolvedSession:
+        raise ZeroDivisionError("by zero")
+
+    session = record("run")
+    monkeypatch.setitem(systems.SYSTEMS, "lighthouse", fail)
+    with pytest.raises(LocatkError, match="internal error, ZeroDivisionError: by zero") as failed:
+        solve_file(session)
+    assert "-v" not in (failed.value.hint or "")
+    assert "by zero" in failed.value.__notes__[0]
+
+
+@pytest.mark.parametrize("system", ["dots", "lighthouse", "polaris", "landmarks"])
+def test_reports_contain_detections_and_facts_if_used(system: str) -> None:
+    """Tables of tags and landmarks are printed in any case, facts of landmarks only as JSON."""
+    detection = SimpleNamespace(tag_id=1, refused="")
+    facts = SimpleNamespace(robots={})
+    solution = Solution(
+        system, "bundle", (track("red", 3),), detections=(detection,), facts=facts
+    )
+    full = summarize("in", "out", solution)
+    small = summarize("in", "out", solution, with_detections=False)
+    assert full.detections == (detection,)
+    assert full.facts is (facts if system == "landmarks" else None)
+    assert small.detections == ((detection,) if system in ("polaris", "landmarks") else ())
+    assert small.facts is None
+    assert small.losses == full.losses
+
+
+def test_a_missing_file_of_the_request_is_reported(tmp_path: Path) -> None:
+    request = SolveRequest(artifact=tmp_path / "none.toml")
+    with pytest.raises(MissingDataError, match="no such file"):
+        plan_jobs(["a.mcap"], ["b.mcap"], request, is_remote=True)
 
 
 def test_a_batch_has_an_outcome_for_each_session(record: Callable[[str], Path]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -120,3 +120,12 @@ def test_receivers_and_what_stations_sent(
 def test_templates_are_for_polaris(system: str) -> None:
     with pytest.raises(InputError, match=f"--templates is not an option of {system}"):
         SYSTEMS[system](None, SolveRequest(templates="36,5,80"))  # type: ignore[arg-type]
+
+
+def test_every_option_is_checked() -> None:
+    @dataclass(frozen=True)
+    class Request(SolveRequest):
+        grid_size: int | None = None
+
+    with pytest.raises(InputError, match="--grid-size is not an option of dots"):
+        SYSTEMS["dots"](None, Request(grid_size=3))  # type: ignore[arg-type]
