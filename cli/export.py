@@ -105,7 +105,7 @@ def command(
     tracks = select_devices(read_trajectories(solution), devices, solution)
     poses = sum(map(len, tracks))
     if format_name != "parquet":  # Parquet has null for values that are not numbers.
-        tracks = [exports.finite_poses(track) for track in tracks]
+        tracks = [exports.with_finite_poses(track) for track in tracks]
     lost = poses - sum(map(len, tracks))
     if lost == poses:
         raise InputError(f"none of the {poses} poses is a number", file=solution)

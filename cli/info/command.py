@@ -62,8 +62,7 @@ def _artifact(file: Path) -> dict[str, Any]:
     from locatk.formats.artifacts import receiver as receivers
     from locatk.formats.artifacts import scene as artifacts
     from locatk.formats.artifacts.schema import read_format
-    from locatk.formats.sessions import description as describe
-    from locatk.formats.sessions import lighthouse_description
+    from locatk.formats.sessions import description, lighthouse_description
 
     kinds: dict[str, Callable[[], dict[str, Any]]] = {
         artifacts.SCENE_FORMAT: lambda: {
@@ -74,32 +73,32 @@ def _artifact(file: Path) -> dict[str, Any]:
         sheets.MANIFEST_FORMAT: lambda: {
             "kind": "manifest",
             "system": "dots",
-            **describe.manifest(sheets.read_manifest(file)),
+            **description.manifest(sheets.read_manifest(file)),
         },
         sheets.CAMERA_FORMAT: lambda: {
             "kind": "camera",
             "system": "dots",
-            "camera": describe.camera(sheets.read_camera(file)),
+            "camera": description.camera(sheets.read_camera(file)),
         },
         tags.TAG_FORMAT: lambda: {
             "kind": "tag",
             "system": "polaris",
-            **describe.tags(tags.read_tags(file)),
+            **description.tags(tags.read_tags(file)),
         },
         tags.ARRAY_FORMAT: lambda: {
             "kind": "array",
             "system": "polaris",
-            "arrays": [describe.array(tags.read_array(file))],
+            "arrays": [description.array(tags.read_array(file))],
         },
         maps.MAP_FORMAT: lambda: {
             "kind": "map",
             "system": "landmarks",
-            **describe.floor(maps.read_map(file)),
+            **description.floor(maps.read_map(file)),
         },
         maps.HALLS_FORMAT: lambda: {
             "kind": "halls",
             "system": "landmarks",
-            "halls": [describe.hall_sensors(maps.read_halls(file))],
+            "halls": [description.hall_sensors(maps.read_halls(file))],
         },
         receivers.RECEIVER_FORMAT: lambda: {
             "kind": "receiver",
@@ -112,7 +111,7 @@ def _artifact(file: Path) -> dict[str, Any]:
 
 def _recording(file: Path) -> dict[str, Any]:
     """Describe a session, a solution, or a recording of another tool."""
-    from locatk.formats.sessions import capture_record as captured
+    from locatk.formats.sessions import capture_record
     from locatk.formats.sessions.reader import Session
 
     session = Session.open(file, damaged_ok=True)
@@ -125,9 +124,9 @@ def _recording(file: Path) -> dict[str, Any]:
         "library": session.library,
         "start_ns": session.start_ns,
         "end_ns": session.end_ns,
-        "duration_s": captured.duration_s(session),
+        "duration_s": capture_record.duration_s(session),
         "streams": _streams(session),
-        "capture": captured.capture(session),
+        "capture": capture_record.capture(session),
         "attachments": [
             {"name": item.name, "media_type": item.media_type, "bytes": item.size}
             for item in session.attachments()
@@ -142,26 +141,26 @@ def _recording(file: Path) -> dict[str, Any]:
 
         described |= lighthouse_description.recording(session)
     elif facts.get("system") in ("dots", "polaris", "landmarks"):
-        from locatk.formats.sessions import description as describe
+        from locatk.formats.sessions import description
 
-        described |= getattr(describe, facts["system"])(session)
+        described |= getattr(description, facts["system"])(session)
     return described
 
 
 def _streams(session: Session) -> list[dict[str, Any]]:
     """Describe the channels of a recording."""
-    from locatk.formats.sessions import capture_record as captured
+    from locatk.formats.sessions import capture_record
 
-    samples = {each.topic: captured.samples(session, each.topic) for each in session.channels}
+    samples = {each.topic: capture_record.samples(session, each.topic) for each in session.channels}
     return [
         {
             "topic": channel.topic,
             "schema": channel.schema,
             "encoding": channel.encoding,
             "messages": channel.count,
-            "rate_hz": captured.rate_hz(session, channel.count),
+            "rate_hz": capture_record.rate_hz(session, channel.count),
             "samples": samples[channel.topic],
-            "samples_hz": captured.rate_hz(session, samples[channel.topic]),
+            "samples_hz": capture_record.rate_hz(session, samples[channel.topic]),
         }
         for channel in session.channels
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -149,19 +149,14 @@ def write_times(path: Path, trajectory: Trajectory, *, overwrite: bool = False) 
         stream.writelines(f"{time}\n" for time in times)
 
 
-def finite_poses(trajectory: Trajectory) -> Trajectory:
-    """Return the poses that are finite; only Parquet can represent the others."""
+def with_finite_poses(trajectory: Trajectory) -> Trajectory:
+    """Return the poses of which position and orientation are finite.
+
+    Only Parquet can represent the others.
+    """
     pose = np.hstack([trajectory.position, trajectory.quaternion])
-    is_finite = np.isfinite(pose).all(axis=1)
-    if is_finite.all():
-        return trajectory
-    return replace(
-        trajectory,
-        time_ns=trajectory.time_ns[is_finite],
-        position=trajectory.position[is_finite],
-        quaternion=trajectory.quaternion[is_finite],
-        covariance=trajectory.covariance[is_finite],
-    )
+    is_finite = np.asarray(np.isfinite(pose).all(axis=1))
+    return trajectory if is_finite.all() else trajectory.select(is_finite)
 
 
 def read_origin(path: Path) -> dict[str, str]:

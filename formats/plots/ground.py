@@ -103,16 +103,16 @@ class Ground:
         )
 
 
-def finite_poses(trajectory: Trajectory) -> Trajectory:
-    """Return the poses with finite positions, which alone can be compared with the truth."""
+def with_finite_positions(trajectory: Trajectory) -> Trajectory:
+    """Return the poses with a finite position, which alone can be compared with the truth."""
     is_finite = np.asarray(np.isfinite(trajectory.position).all(axis=1))
     return trajectory if is_finite.all() else trajectory.select(is_finite)
 
 
 def evaluate_unaligned(solution: Solution, truth: Sequence[Trajectory]) -> Evaluation | None:
     """Evaluate the solution without alignment; None if no pose has truth."""
-    truth_of = {t.device: finite_poses(t) for t in truth}
-    solved = [finite_poses(t) for t in solution.trajectories]
+    truth_of = {t.device: with_finite_positions(t) for t in truth}
+    solved = [with_finite_positions(t) for t in solution.trajectories]
     pairs = [(t, truth_of[t.device]) for t in solved if t.device in truth_of and len(t)]
     try:
         return evaluate(pairs) if pairs else None

@@ -548,7 +548,8 @@ class ValueRow:
 
     def magnitudes(self) -> Array:
         """Return the finite absolute values of all devices."""
-        return np.concatenate([np.abs(s.value[np.isfinite(s.value)]) for s in self.values.values()])
+        values = [np.abs(s.value[np.isfinite(s.value)]) for s in self.values.values()]
+        return np.concatenate(values) if values else np.empty(0)
 
     def limit(self, reference: float | None) -> float:
         """Return the upper limit of the value axis, which includes a reference value."""
@@ -673,9 +674,9 @@ def _value_traces(
         "marker": {"color": color, "size": 3.5 if limit is None else 4, "opacity": 0.8},
         "hovertemplate": "%{x:.3f} s<br>%{y:.4g}",
     }
-    is_outlier = y > np.inf if limit is None else y > limit
-    if not is_outlier.any():
+    if limit is None or not (y > limit).any():
         return [trace]
+    is_outlier = y > limit
     triangles = {
         "x": x[is_outlier],
         "y": np.full(np.count_nonzero(is_outlier), 0.975),

@@ -8,7 +8,7 @@ from plotly.graph_objects import Figure
 from locatk.core.evaluation import CHI2_95_QUANTILES, Evaluation, Statistics
 from locatk.core.evaluation.consistency import NORMAL_95_QUANTILE
 from locatk.core.solution import Solution
-from locatk.formats.plots.ground import finite_poses, is_shown_unscaled, is_unscaled
+from locatk.formats.plots.ground import is_shown_unscaled, is_unscaled, with_finite_positions
 from locatk.formats.plots.series import (
     Series,
     axis_limit,
@@ -101,7 +101,7 @@ def summarize(subject: Subject) -> str:
 
 def _invalid_poses_note(solution: Solution) -> str:
     """Return a sentence on poses that are not finite, empty without any."""
-    count = solution.poses - sum(len(finite_poses(t)) for t in solution.trajectories)
+    count = solution.poses - sum(len(with_finite_positions(t)) for t in solution.trajectories)
     if not count:
         return ""
     verb = "is" if count == 1 else "are"
@@ -116,7 +116,7 @@ def why_not_evaluated(subject: Subject) -> str:
                 "The scene has no scale (its unit is the distance of the first two stations) and "
                 "is not compared with the truth in metres; --align sim3 estimates the scale."
             )
-        if not any(len(finite_poses(t)) for t in subject.solution.trajectories):
+        if not any(len(with_finite_positions(t)) for t in subject.solution.trajectories):
             return "No pose is finite: there are no errors."
         return "No pose has truth of its device at its time: there are no errors."
     if subject.session is not None:

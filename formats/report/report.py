@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from locatk.core.errors import LocatkError
 from locatk.formats.output import atomic_write, check_output, tool_version
 from locatk.formats.plots.ground import build_ground, is_shown_unscaled
 from locatk.formats.plots.series import origin_ns, overlap_in_time, pose_span_ns
@@ -22,11 +21,9 @@ from locatk.formats.report.evaluation import (
 from locatk.formats.report.panels import Panel, Table
 from locatk.formats.report.rejections import rejection_panel
 from locatk.formats.report.run import run_panels
-from locatk.formats.report.signals import signal_panels
+from locatk.formats.report.signals import SIGNALS_TITLE, signal_panels
 from locatk.formats.report.subject import Subject
 from locatk.formats.report.trajectory_map import map_panels
-
-SIGNALS_TITLE = "Signals"
 
 
 def write_report(
@@ -162,12 +159,7 @@ def _signal_panels(subject: Subject) -> list[Panel]:
                 f"begins {format_time(session.start_ns or 0)}.",
             )
         ]
-    try:
-        return signal_panels(session, subject.solution)
-    except LocatkError as error:
-        # The report is on the solution, which is complete.
-        note = f"The session cannot be shown: {error}. {error.hint or ''}"
-        return [Panel(SIGNALS_TITLE, note)]
+    return signal_panels(session, subject.solution)
 
 
 def _describe_run(subject: Subject) -> str:

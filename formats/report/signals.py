@@ -23,7 +23,7 @@ from locatk.formats.sessions.mcap_file import DamageError, Segment, read_message
 from locatk.formats.sessions.messages import BatchError
 from locatk.formats.sessions.reader import Session, open_mcap
 
-TITLE = "Raw signals"
+SIGNALS_TITLE = "Signals"
 
 MODULES = {
     system: f"locatk.formats.report.systems.{system}"
@@ -50,17 +50,20 @@ def signal_panels(session: Session, solution: Solution) -> list[Panel]:
     """
     module = MODULES.get(solution.system)
     if module is None:
-        return [Panel(TITLE, f"Signals of the system {solution.system!r} cannot be drawn.")]
+        return [Panel(SIGNALS_TITLE, f"Signals of the system {solution.system!r} cannot be drawn.")]
     draw: Callable[[Session, Solution], list[Panel]] = import_module(module).signal_panels
     try:
         panels = draw(session, solution)
     except LocatkError as error:
-        return [Panel(TITLE, f"The recording cannot be drawn: {error.message}.")]
+        # The report is on the solution, which is complete.
+        hint = f"{error.hint}." if error.hint else ""
+        note = join_sentences(f"The recording cannot be drawn: {error}.", hint)
+        return [Panel(SIGNALS_TITLE, note)]
     if panels:
         return panels
     system = session.facts.get("system")
     problem = f"it is of {system}" if system not in (None, solution.system) else "it has none"
-    return [Panel(TITLE, f"No signals of {solution.system} in the recording: {problem}.")]
+    return [Panel(SIGNALS_TITLE, f"No signals of {solution.system} in the recording: {problem}.")]
 
 
 @dataclass(frozen=True)
@@ -159,11 +162,7 @@ def read_excerpt(session: Session, topics: Collection[str]) -> Excerpt:
     names = {
         entry.id: entry.topic for entry in session.index.channels.values() if entry.topic in topics
     }
-    segments = [
-        segment
-        for segment in session.index.segments
-        if segment.channels is None or not segment.channels.isdisjoint(names)
-    ]
+    segments = session.index.segments_with(names)
     chosen = _select_segments(segments, MAX_READ_BYTES)
     payloads: dict[str, list[bytes]] = {topic: [] for topic in sorted(topics)}
     damaged = 0

@@ -201,7 +201,6 @@ button.copy {
 .pictures figure { margin: 0; flex: 1 1 220px; max-width: 480px; }
 .pictures img { width: 100%; height: auto; border: 1px solid #d5dbe1; display: block; }
 .pictures figcaption { font-size: 13.5px; color: #5b6875; }
-details summary { cursor: pointer; color: #0060a0; font-size: 14.5px; }
 body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bottom: 36px; }
 @media (max-width: 600px) {
   main, body > header, body > footer { padding-left: 10px; padding-right: 10px; }

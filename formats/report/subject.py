@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,10 +10,11 @@ from typing import Literal
 
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
+from locatk.core.natural_order import natural_key
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers import trajectories
-from locatk.formats.plots.ground import finite_poses, is_unscaled
+from locatk.formats.plots.ground import is_unscaled, with_finite_positions
 from locatk.formats.plots.series import overlap_in_time
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution
@@ -97,12 +97,8 @@ def load_subject(
 
 def _sort_devices(solution: Solution) -> Solution:
     """Return the solution with its devices in natural order, ``robot-2`` before ``robot-10``."""
-
-    def key(t: Trajectory) -> list[tuple[bool, int, str]]:
-        parts = re.findall(r"([0-9]+)|([^0-9]+)", t.device)
-        return [(not digits, int(digits or 0), text) for digits, text in parts]
-
-    return replace(solution, trajectories=tuple(sorted(solution.trajectories, key=key)))
+    ordered = sorted(solution.trajectories, key=lambda t: natural_key(t.device))
+    return replace(solution, trajectories=tuple(ordered))
 
 
 def _open_session(path: str | os.PathLike[str], solution: Solution) -> Session:
@@ -158,8 +154,8 @@ def _evaluate(
     """Evaluate the solution; None if no pose has truth, or lengths cannot be compared."""
     if is_unscaled(solution) and not align.startswith("sim"):
         return None
-    solved = [t for t in map(finite_poses, solution.trajectories) if len(t)]
-    pairs, _ = pair_devices(solved, [t for t in map(finite_poses, truth) if len(t)])
+    solved = [t for t in map(with_finite_positions, solution.trajectories) if len(t)]
+    pairs, _ = pair_devices(solved, [t for t in map(with_finite_positions, truth) if len(t)])
     if not pairs:
         return None
     try:

@@ -21,8 +21,7 @@ from locatk.core.polaris.array import Samples, SensorArray
 from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import maps, sheets
 from locatk.formats.artifacts import tags as tag_files
-from locatk.formats.sessions import capture_record as captured
-from locatk.formats.sessions import frames
+from locatk.formats.sessions import capture_record, frames
 from locatk.formats.sessions.field_samples import (
     HALLS,
     MAGNETOMETERS,
@@ -100,7 +99,7 @@ def dots(session: Session) -> dict[str, Any]:
         if lens is not None:
             described["camera"] = camera(lens)
         topics = [t for schema in frames.SCHEMAS for t in session.topics(frames.TOPIC, schema)]
-        if topics and not captured.is_few(session, topics):
+        if topics and not capture_record.is_few(session, topics):
             described |= _counted_frames(session, topics)
         elif topics:
             cameras = frames.read_frames(session)
@@ -120,7 +119,7 @@ def _counted_frames(session: Session, topics: list[str]) -> dict[str, Any]:
     cameras = [
         {
             "device": topic.removeprefix(frames.TOPIC),
-            "frames": captured.messages(session, topic),
+            "frames": capture_record.messages(session, topic),
             "size_px": None,
         }
         for topic in sorted(topics)
@@ -129,7 +128,7 @@ def _counted_frames(session: Session, topics: list[str]) -> dict[str, Any]:
         "cameras": cameras,
         "devices": [each["device"] for each in cameras],
         "frames": sum(each["frames"] for each in cameras),
-        "unread_bytes": captured.held_bytes(session, topics),
+        "unread_bytes": capture_record.held_bytes(session, topics),
     }
 
 
@@ -234,8 +233,8 @@ def _describe_samples(
         if artifact is not None:
             described |= describe_artifact(artifact)
         topics = kind.topics(session)
-        is_small = captured.is_small(session, topics)
-        if topics and is_small and all(captured.messages(session, topic) for topic in topics):
+        is_small = capture_record.is_small(session, topics)
+        if topics and is_small and all(capture_record.messages(session, topic) for topic in topics):
             recordings = read_samples()
             described[key] = [{**_recorded(each), **sensors} for each, sensors in recordings]
             described["samples"] = sum(len(each) for each, _ in recordings)
@@ -244,7 +243,9 @@ def _describe_samples(
             described[key] = [{**entry, **describe_sensors(known)} for entry, known in entries]
             counts = [entry["samples"] for entry, _ in entries]
             described["samples"] = None if None in counts else sum(counts)
-            described["unread_bytes"] = None if is_small else captured.held_bytes(session, topics)
+            described["unread_bytes"] = (
+                None if is_small else capture_record.held_bytes(session, topics)
+            )
         if topics:
             described["devices"] = [each["device"] for each in described[key]]
     except MissingGeometryError as error:
@@ -260,11 +261,11 @@ def _unread(session: Session, kind: SensorKind[Any], topic: str) -> tuple[dict[s
     geometry = kind.attached(session, device)
     if geometry is None:
         raise FormatError(f"no geometry of the {kind.geometry} {device!r}")
-    count = captured.samples(session, topic) if captured.messages(session, topic) else 0
+    count = capture_record.samples(session, topic) if capture_record.messages(session, topic) else 0
     entry = {
         "device": device,
         "samples": count,
-        "rate_hz": captured.rate_hz(session, count),
+        "rate_hz": capture_record.rate_hz(session, count),
         "left_out": None,
     }
     return entry, geometry

@@ -11,8 +11,7 @@ import pytest
 
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.polaris.array import Samples, SensorArray, bar
-from locatk.formats.sessions import capture_record as captured
-from locatk.formats.sessions import field_samples
+from locatk.formats.sessions import capture_record, field_samples
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -139,15 +138,15 @@ def large(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*args: object) -> None:
         raise AssertionError("messages are read")
 
-    monkeypatch.setattr(captured, "MAX_DESCRIBED_BYTES", 0)
-    monkeypatch.setattr(captured, "MAX_DESCRIBED_CHUNKS", 0)
+    monkeypatch.setattr(capture_record, "MAX_DESCRIBED_BYTES", 0)
+    monkeypatch.setattr(capture_record, "MAX_DESCRIBED_CHUNKS", 0)
     monkeypatch.setattr(Session, "messages", refuse)
 
 
 def test_a_large_session_of_magnetometers(locatk, tmp_path: Path, monkeypatch) -> None:
     path = live(tmp_path / "run.mcap")
     read = facts(locatk, path)
-    monkeypatch.setattr(captured, "MAX_DESCRIBED_BYTES", 0)
+    monkeypatch.setattr(capture_record, "MAX_DESCRIBED_BYTES", 0)
     monkeypatch.setattr(Session, "messages", None)
     answer = facts(locatk, path)
     assert answer["unread_bytes"] == sum(s.length for s in Session.open(path).index.segments)

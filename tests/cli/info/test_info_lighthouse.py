@@ -19,8 +19,7 @@ from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.solution import Solution
 from locatk.formats.artifacts import receiver as receivers
 from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.sessions import capture_record as captured
-from locatk.formats.sessions import observations
+from locatk.formats.sessions import capture_record, observations
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import write_solution
 from locatk.formats.sessions.writer import SessionWriter
@@ -125,7 +124,7 @@ def test_a_large_session_has_the_sweeps_that_were_counted(
     locatk, write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write(tmp_path / "1.mcap", stations=HEARD)
-    monkeypatch.setattr(captured, "MAX_DESCRIBED_BYTES", 0)
+    monkeypatch.setattr(capture_record, "MAX_DESCRIBED_BYTES", 0)
     assert [station["sweeps"] for station in facts(locatk, path)["stations"]] == [40, 7]
 
 

@@ -121,9 +121,7 @@ def test_reports_contain_detections_and_facts_if_used(system: str) -> None:
     """Tables of tags and landmarks are printed in any case, facts of landmarks only as JSON."""
     detection = SimpleNamespace(tag_id=1, refused="")
     facts = SimpleNamespace(robots={})
-    solution = Solution(
-        system, "bundle", (track("red", 3),), detections=(detection,), facts=facts
-    )
+    solution = Solution(system, "bundle", (track("red", 3),), detections=(detection,), facts=facts)
     full = summarize("in", "out", solution)
     small = summarize("in", "out", solution, with_detections=False)
     assert full.detections == (detection,)

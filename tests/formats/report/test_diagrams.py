@@ -113,6 +113,15 @@ def test_a_reference_line_and_triangles_of_outliers_are_drawn() -> None:
     assert "1 of 200 values lie beyond this scale" in note
 
 
+def test_a_row_without_values_is_empty() -> None:
+    row = ValueRow("x [mm]", {"red": Series(np.arange(0), np.empty(0))}, {})
+    assert len(row.magnitudes()) == 0
+    assert row.limit(None) == 1.0
+    figure, note = draw_values([row], {}, 0)
+    assert not figure.data
+    assert not note
+
+
 def test_thinned_values_contain_the_outliers() -> None:
     value = np.ones(20_000)
     value[12_345] = -7.0

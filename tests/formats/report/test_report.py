@@ -24,7 +24,7 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import GenericRecord, Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots.ground import build_ground, finite_poses
+from locatk.formats.plots.ground import build_ground, with_finite_positions
 from locatk.formats.report.diagrams import MAX_POSES
 from locatk.formats.report.evaluation import covariance_panels, error_panels
 from locatk.formats.report.report import render_report, report_panels, write_report
@@ -250,7 +250,7 @@ def test_poses_that_are_not_finite_are_left_out_and_counted() -> None:
     solved = solution("red")
     solved.trajectories[0].position[5:9] = np.nan
     truth = (track("red"),)
-    pairs = [(finite_poses(t), u) for t, u in zip(solved.trajectories, truth, strict=True)]
+    pairs = [(with_finite_positions(t), u) for t, u in zip(solved.trajectories, truth, strict=True)]
     subject = Subject("a", solved, truth=truth, evaluation=evaluate(pairs))
     said = texts(subject)
     assert "Half of the poses are within 1.00 mm" in said

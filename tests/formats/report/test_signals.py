@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ pytest.importorskip("plotly")
 
 from locatk.core.dots import solver as dots_solver
 from locatk.core.dots.simulation import session as dots_simulate
+from locatk.core.errors import FormatError
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.lighthouse import simulation as lighthouse_simulation
@@ -369,3 +371,16 @@ def test_a_missing_recording_has_a_note(tmp_path: Path, polaris: tuple[Session, 
     (tmp_path / "gone.mcap").unlink()
     (panel,) = signals.signal_panels(gone, solution)
     assert "cannot be drawn: no such file" in panel.note
+    assert panel.title == signals.SIGNALS_TITLE
+
+
+def test_the_hint_on_a_damaged_recording_is_shown(
+    polaris: tuple[Session, Solution], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(session: Session, solution: Solution) -> list[Panel]:
+        raise FormatError("too damaged", hint="Recover it")
+
+    session, solution = polaris
+    monkeypatch.setattr(import_module(signals.MODULES["polaris"]), "signal_panels", fail)
+    (panel,) = signals.signal_panels(session, solution)
+    assert panel.note == "The recording cannot be drawn: too damaged. Recover it."

@@ -61,6 +61,14 @@ def solved(path: Path, solution: Solution = SOLUTION, source: str = "run.mcap") 
     return path
 
 
+def test_devices_are_in_natural_order(tmp_path: Path) -> None:
+    names = ("robot-10", "Robot-2", "robot-1")
+    solution = replace(SOLUTION, trajectories=tuple(track(name) for name in names))
+    subject = load_subject(solved(tmp_path / "solved.mcap", solution))
+    ordered = [t.device for t in subject.solution.trajectories]
+    assert ordered == ["robot-1", "Robot-2", "robot-10"]
+
+
 def test_truth_is_read_from_the_session_in_the_same_folder(session: Path, tmp_path: Path) -> None:
     subject = load_subject(solved(tmp_path / "solved.mcap"))
     assert subject.name == "solved.mcap"
