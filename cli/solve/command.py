@@ -177,10 +177,17 @@ def command(
     if save_scene is not None:
         _check_scene(names)
     input_files = [path for path in (artifact, camera) if path is not None]
+    request = pipeline.SolveRequest(method, scene, artifact, camera, speed, templates)
     try:
         outputs = pipeline.plan_outputs(names, output, is_folder=found.has_folder)
+        if len(names) > 1:
+            pipeline.check_artifacts(request)
         pipeline.check_outputs(
-            outputs, [*names, *map(str, input_files)], overwrite=overwrite, resume=resume
+            outputs,
+            [*names, *map(str, input_files)],
+            overwrite=overwrite,
+            resume=resume,
+            folder=None if outputs == [output] else output,
         )
     except pipeline.OutputConflictError as error:
         raise click.UsageError(error.message) from None
@@ -188,9 +195,6 @@ def command(
         inputs = [*map(Path, names), *input_files]
         options.guard_output(save_scene, overwrite=overwrite, inputs=inputs)
 
-    request = pipeline.SolveRequest(method, scene, artifact, camera, speed, templates)
-    if len(names) > 1:
-        pipeline.check_artifacts(request)
     work = pipeline.plan_jobs(
         names,
         outputs,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
 from collections import Counter
 from collections.abc import Generator, Sequence
@@ -40,8 +41,8 @@ def plan_outputs(
     sessions : sequence of str
         Paths or URLs.
     output : str or None
-        File for one session; folder for several, which is created; None for a file in the folder
-        of each session.
+        File for one session; folder for several, which :func:`check_outputs` creates; None for a
+        file in the folder of each session.
     is_folder : bool
         ``output`` is a folder even for one session, because the user named a folder or pattern.
 
@@ -75,16 +76,29 @@ def plan_outputs(
             raise OutputExistsError(
                 "there are several outputs, but -o is a file", file=folder, hint="Name a folder"
             )
-        folder.mkdir(parents=True, exist_ok=True)
     return [locations.within(output, f"{stem}.mcap") for stem in by_stem]
 
 
 def check_outputs(
-    outputs: Sequence[str], inputs: Sequence[str], *, overwrite: bool, resume: bool
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    *,
+    overwrite: bool,
+    resume: bool,
+    folder: str | None = None,
 ) -> None:
     """Refuse outputs that cannot or must not be written, before the work starts.
 
-    With ``resume``, existing outputs are checked when their session is next.
+    Parameters
+    ----------
+    outputs, inputs : sequence of str
+        Locations.
+    overwrite : bool
+        Existing outputs may be replaced.
+    resume : bool
+        Existing outputs are checked when their session is next.
+    folder : str, optional
+        Folder that contains all outputs. If it is missing, it is created after the checks.
 
     Raises
     ------
@@ -99,18 +113,23 @@ def check_outputs(
     if any(count > 1 for count in counts.values()):
         raise OutputConflictError("several sessions have the same output")
 
+    is_new_folder = folder is not None and not (locations.is_url(folder) or os.path.isdir(folder))
+
     def check(output: str) -> None:
         if locations.file_key(output) in input_keys:
             raise OutputExistsError(
                 "the output is one of the inputs", file=output, hint="Choose another -o"
             )
-        locations.check_writable(output, overwrite=overwrite or resume)
+        if not is_new_folder:
+            locations.check_writable(output, overwrite=overwrite or resume)
 
     with ThreadPoolExecutor(locations.MAX_REQUESTS) as threads:
         list(threads.map(check, outputs))
     stored = [output for output in outputs if locations.is_url(output)]
     for output in {output.rpartition("/")[0]: output for output in stored}.values():
         locations.check_bucket(output)
+    if folder is not None and is_new_folder:
+        os.makedirs(folder, exist_ok=True)
 
 
 def plan_jobs(

@@ -167,7 +167,7 @@ def test_outputs_of_several_sessions(tmp_path: Path) -> None:
     assert plan_outputs(sessions, None) == ["day/a-solved.mcap", "day/b-solved.mcap"]
     folder = tmp_path / "out"
     assert plan_outputs(sessions, str(folder)) == [str(folder / "a.mcap"), str(folder / "b.mcap")]
-    assert folder.is_dir()
+    assert not folder.exists()
     assert plan_outputs(sessions[:1], "x") == ["x"]
     assert plan_outputs(sessions[:1], str(folder), is_folder=True) == [str(folder / "a.mcap")]
     assert plan_outputs(sessions, "s3://b/out/") == ["s3://b/out/a.mcap", "s3://b/out/b.mcap"]
@@ -179,6 +179,22 @@ def test_outputs_of_several_sessions(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputExistsError):
         plan_outputs(sessions, str(tmp_path / "file"))
+
+
+def test_the_folder_of_outputs_is_created_after_the_checks(tmp_path: Path) -> None:
+    folder = tmp_path / "day" / "out"
+    outputs = [str(folder / "a.mcap"), str(folder / "b.mcap")]
+    options = {"overwrite": False, "resume": False}
+    with pytest.raises(OutputConflictError):
+        check_outputs([outputs[0]] * 2, [], **options, folder=str(folder))
+    with pytest.raises(MissingDataError, match="no folder"):
+        check_outputs(outputs, [], **options)
+    assert list(tmp_path.iterdir()) == []
+    check_outputs(outputs, [], **options, folder=str(folder))
+    assert folder.is_dir()
+    (folder / "b.mcap").touch()
+    with pytest.raises(OutputExistsError):
+        check_outputs(outputs, [], **options, folder=str(folder))
 
 
 def test_an_input_is_never_an_output(tmp_path: Path) -> None:
