@@ -44,7 +44,6 @@ from locatk.formats.sessions.recovery.validation import (
     READERS,
     DamagedFile,
     Definition,
-    parse_exactly,
 )
 
 _FOOTER = struct.Struct("<QQI")
@@ -157,9 +156,16 @@ def salvage(stream: IO[bytes]) -> Salvage:
 
     If the file has no chunks, messages outside chunks are searched as well. Channels whose
     definition is lost are restored from the metadata record :data:`CHANNELS_RECORD`.
+
+    NUL in texts is a sign of damage, except in chunks and summaries with the right checksum, and
+    in files in which nothing else is damaged.
     """
     search = _Search(stream, _ANCHORS)
     result = search.run()
+    if search.has_refused_nul and result.ended:
+        lenient = _Search(stream, _ANCHORS, accepts_nul=True).run()
+        if lenient.is_whole:
+            result = lenient
     if result.losses and search.is_mcap and not search.has_chunks:
         result = _Search(stream, _ANCHORS_WITHOUT_CHUNKS).run()
     restore_channels(result.index)
@@ -185,8 +191,10 @@ class _Search:
         Messages are in chunks, even if all of them are damaged.
     """
 
-    def __init__(self, stream: IO[bytes], anchors: Collection[Opcode]) -> None:
-        self._file = DamagedFile(stream)
+    def __init__(
+        self, stream: IO[bytes], anchors: Collection[Opcode], *, accepts_nul: bool = False
+    ) -> None:
+        self._file = DamagedFile(stream, accepts_nul=accepts_nul)
         self._anchors = anchors
         self._result = Salvage(self._file.size)
         ends = (self._file.read(0, 8), self._file.read(max(0, self._file.size - 8), 8))
@@ -204,6 +212,11 @@ class _Search:
         self._in_run = False
         self._run_counts: Counter[int] = Counter()
         self._run_span: tuple[int, int] | None = None
+
+    @property
+    def has_refused_nul(self) -> bool:
+        """A record was refused only because of NUL in its texts."""
+        return self._file.has_refused_nul
 
     def run(self) -> Salvage:
         """Search from the first byte to the last."""
@@ -251,15 +264,15 @@ class _Search:
         elif opcode in (Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX):
             self.has_chunks = True
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            definition = parse_exactly(READERS[opcode], file.read_content(position, end))
+            definition = file.parse_exactly(opcode, file.read_content(position, end))
             self._define(opcode, definition, is_verified=False)
         elif opcode == Opcode.METADATA:
             self._accept_metadata(
-                position, parse_exactly(READERS[opcode], file.read_content(position, end))
+                position, file.parse_exactly(opcode, file.read_content(position, end))
             )
         elif opcode == Opcode.HEADER:
             if not self._recordings:
-                header = parse_exactly(READERS[opcode], file.read_content(position, end))
+                header = file.parse_exactly(opcode, file.read_content(position, end))
                 self._result.index.header = header
             self._recordings += 1
             self._in_data_section, self._result.ended = True, False
@@ -355,7 +368,7 @@ class _Search:
         for opcode, record in summary_records:
             if opcode == Opcode.STATISTICS:
                 result.statistics = record
-            else:
+            elif record is not None:  # The pass through the file has registered it as a loss.
                 self._define(opcode, record, is_verified=is_verified)
         if is_verified:  # Its checksum is right, although it may contain texts with NUL.
             result.index_losses = [
@@ -377,8 +390,8 @@ class _Search:
         Returns
         -------
         (int, list of (Opcode, record), bool) or None
-            Start; schemas, channels and statistics; whether they have a checksum. None if the
-            checksum or a record is wrong.
+            Start; schemas, channels and statistics; whether they have a checksum. A record is
+            None if it is damaged. The result is None if the checksum or a length is wrong.
         """
         file = self._file
         stated_start, _, crc = _FOOTER.unpack(file.read_content(position, end))
@@ -392,7 +405,10 @@ class _Search:
                 continue
             try:
                 found = [
-                    (Opcode(opcode), _parse_summary_record(opcode, data[a:b], start, bool(crc)))
+                    (
+                        Opcode(opcode),
+                        self._parse_summary_record(opcode, data[a:b], start, bool(crc)),
+                    )
                     for opcode, a, b in iter_records(data, start)
                     if opcode in _SUMMARY_KINDS
                 ]
@@ -400,6 +416,20 @@ class _Search:
                 continue
             return start, found, bool(crc)
         return None
+
+    def _parse_summary_record(
+        self, opcode: int, content: bytes, offset: int, is_verified: bool
+    ) -> Any:
+        """Return a record of the summary at ``offset``; None if it is damaged.
+
+        Raises
+        ------
+        DamageError
+            It is damaged although the checksum of the summary is right.
+        """
+        if is_verified:
+            return parse(READERS[opcode], content, offset)
+        return self._file.parse_exactly(Opcode(opcode), content)
 
     def _define(self, opcode: Opcode, record: Definition, *, is_verified: bool) -> None:
         """Register a schema or a channel; one with a checksum replaces one without."""
@@ -455,16 +485,6 @@ class _Search:
             return Loss(position, end, "chunk", "", *span)
         name = "" if attachment is None else attachment.name
         return Loss(position, end, what if attachment is None else "attachment", name)
-
-
-def _parse_summary_record(opcode: int, content: bytes, offset: int, is_verified: bool) -> Any:
-    """Return a record of the summary at ``offset``; raise DamageError if it is damaged."""
-    if is_verified:
-        return parse(READERS[opcode], content, offset)
-    record = parse_exactly(READERS[opcode], content)
-    if record is None:
-        raise DamageError("the summary is damaged", offset)
-    return record
 
 
 # ---- channels without definition

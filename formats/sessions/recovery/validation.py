@@ -3,7 +3,7 @@
 A chunk and an attachment are accepted by their checksum. If the writer left it out, their
 lengths must agree and the content of a chunk must consist of records. Records of other kinds
 must have lengths that agree to the last byte, and texts in UTF-8 without NUL, because a power cut
-leaves zeros. Inside a chunk with the right checksum, NUL is accepted. No length is used before it
+leaves zeros; :func:`.salvage.salvage` lists the exceptions. No length is used before it
 was checked, so that a flipped bit costs neither memory nor time.
 Specification: https://mcap.dev/spec
 """
@@ -91,10 +91,20 @@ class ChunkContent(NamedTuple):
 
 
 class DamagedFile:
-    """Access to the bytes and records of a file that may be damaged; holds one record."""
+    """Access to the bytes and records of a file that may be damaged; holds one record.
 
-    def __init__(self, stream: IO[bytes]) -> None:
+    Attributes
+    ----------
+    size : int
+        Bytes of the file.
+    has_refused_nul : bool
+        A record was refused only because of NUL in its texts. Never true with ``accepts_nul``.
+    """
+
+    def __init__(self, stream: IO[bytes], *, accepts_nul: bool = False) -> None:
         self._stream = stream
+        self._accepts_nul = accepts_nul
+        self.has_refused_nul = False
         self.size = stream.seek(0, os.SEEK_END)
 
     def read(self, offset: int, length: int) -> bytes:
@@ -139,7 +149,26 @@ class DamagedFile:
         if opcode in _CONTENT_BYTES:
             return length == _CONTENT_BYTES[opcode]
         self._stream.seek(position + RECORD_HEAD.size)
-        return _parse_filling(READERS[opcode], self._stream, length) is not None
+        return self._parse_exactly(opcode, self._stream, length) is not None
+
+    def parse_exactly(self, opcode: Opcode, content: bytes) -> Any:
+        """Return the record that fills ``content`` to its last byte, or None."""
+        return self._parse_exactly(opcode, BytesIO(content), len(content))
+
+    def _parse_exactly(self, opcode: Opcode, source: IO[bytes], length: int) -> Any:
+        """Return the record that fills the next ``length`` bytes of ``source``, or None."""
+        stream = _BoundedStream(source, length)
+        try:
+            record = READERS[opcode](stream)
+        except PARSE_ERRORS:
+            return None
+        return record if stream.count == length and self._accepts_texts(stream) else None
+
+    def _accepts_texts(self, stream: _BoundedStream) -> bool:
+        """Return whether the texts that were read from ``stream`` have no NUL, or may have it."""
+        is_refused = stream.has_nul and not self._accepts_nul
+        self.has_refused_nul |= is_refused
+        return not is_refused
 
     def chunk_head(self, position: int) -> tuple[int, int, int] | None:
         """Return the head of a chunk if its lengths agree, even if the file ends inside it.
@@ -178,14 +207,14 @@ class DamagedFile:
         if len(record_head) < RECORD_HEAD.size or record_head[0] != Opcode.ATTACHMENT:
             return None
         _, length = RECORD_HEAD.unpack(record_head)
-        stream = _StrictStream(self._stream, MAX_HEAD_BYTES)  # continues behind the record head
+        stream = _BoundedStream(self._stream, MAX_HEAD_BYTES)  # continues behind the record head
         try:
             log_ns, create_ns = stream.read8(), stream.read8()
             name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
             size = stream.read8()
         except PARSE_ERRORS:
             return None
-        if length != stream.count + size + 4:
+        if length != stream.count + size + 4 or not self._accepts_texts(stream):
             return None
         return records.AttachmentIndex(
             position, RECORD_HEAD.size + length, log_ns, create_ns, size, name, media_type
@@ -275,7 +304,7 @@ class DamagedFile:
         if opcode == Opcode.MESSAGE:
             return self._begins_chain(position)
         # Zeros parse as a record without a name.
-        record = parse_exactly(READERS[opcode], self.read_content(position, end))
+        record = self.parse_exactly(opcode, self.read_content(position, end))
         return bool(record.topic if opcode == Opcode.CHANNEL else record.name)
 
     def _begins_chain(self, position: int) -> bool:
@@ -289,12 +318,16 @@ class DamagedFile:
         return True
 
 
-class _StrictStream(ReadDataStream):
-    """Stream that fails if fewer bytes are left than asked for, or more than ``limit`` are read."""
+class _BoundedStream(ReadDataStream):
+    """Stream that fails if fewer bytes are left than asked for, or more than ``limit`` are read.
+
+    ``has_nul`` is true if a text contained NUL: zeros are valid UTF-8, and a power cut leaves them.
+    """
 
     def __init__(self, stream: IO[bytes], limit: int) -> None:
         super().__init__(stream)
         self._limit = limit
+        self.has_nul = False
 
     def read(self, length: int) -> bytes:
         if length > self._limit - self.count:  # before memory is allocated
@@ -306,24 +339,8 @@ class _StrictStream(ReadDataStream):
 
     def read_prefixed_string(self) -> str:
         text = super().read_prefixed_string()
-        if "\0" in text:  # zeros are valid UTF-8, and a power cut leaves them
-            raise ValueError
+        self.has_nul |= "\0" in text
         return text
-
-
-def parse_exactly(reader: Callable[[ReadDataStream], Any], content: bytes) -> Any:
-    """Return the record that fills ``content`` to its last byte, or None."""
-    return _parse_filling(reader, BytesIO(content), len(content))
-
-
-def _parse_filling(reader: Callable[[ReadDataStream], Any], source: IO[bytes], length: int) -> Any:
-    """Return the record that fills the next ``length`` bytes of ``source``, or None."""
-    stream = _StrictStream(source, length)
-    try:
-        record = reader(stream)
-    except PARSE_ERRORS:
-        return None
-    return record if stream.count == length else None
 
 
 def check_records(data: bytes | memoryview) -> ChunkContent:

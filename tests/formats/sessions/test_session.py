@@ -420,12 +420,21 @@ def test_a_damaged_metadata_record_is_named(file: Path, tmp_path: Path) -> None:
     assert caught.value.where == f"byte {offset}"
 
 
-@pytest.mark.parametrize("index_types", [mcap.writer.IndexType.ALL, mcap.writer.IndexType.NONE])
-def test_nul_in_texts_of_a_chunk(tmp_path: Path, index_types: mcap.writer.IndexType) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"index_types": mcap.writer.IndexType.NONE},
+        {"enable_crcs": False},
+        {"use_chunking": False},
+    ],
+)
+def test_nul_in_texts(tmp_path: Path, options: dict[str, object]) -> None:
     path = tmp_path / "nul.mcap"
     with path.open("wb") as stream:
-        writer = mcap.writer.Writer(stream, index_types=index_types)
+        writer = mcap.writer.Writer(stream, **options)  # type: ignore[arg-type]
         writer.start()
+        writer.add_metadata("who", {"me": "\0"})
         schema = writer.register_schema("Thing\0", "jsonschema", b"{}")
         channel = writer.register_channel("/thing\0", "json", schema, {"key\0": "\0"})
         for number in range(50):
@@ -434,6 +443,7 @@ def test_nul_in_texts_of_a_chunk(tmp_path: Path, index_types: mcap.writer.IndexT
     session = Session.open(path)
     assert session.damage is None
     assert session.channels == (Channel("/thing\0", "Thing\0", "json", 50),)
+    assert session.metadata() == {"who": {"me": "\0"}}
     assert len(list(session.messages())) == 50
 
 
