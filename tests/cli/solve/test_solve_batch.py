@@ -383,6 +383,7 @@ def test_a_broken_artifact_is_one_error(
     for text in ("not toml", 'format = "locatk-lighthouse-scene"\nformat_version = "x"'):
         artifact.write_text(text)
         result = locatk("solve", *sessions, "-o", tmp_path / "out", "--artifact", artifact)
+        assert not (tmp_path / "out").exists()
         assert result.exit_code == 1
         assert result.stderr.count("\n") == 1
         assert "tag.toml" in result.stderr

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType, IndexType, Writer
 
 from locatk.core import lighthouse
-from locatk.core.errors import InputError
+from locatk.core.errors import FormatError, InputError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport, Sweeps
@@ -129,3 +130,19 @@ def test_every_option_is_checked() -> None:
 
     with pytest.raises(InputError, match="--grid-size is not an option of dots"):
         SYSTEMS["dots"](None, Request(grid_size=3))  # type: ignore[arg-type]
+
+
+def test_a_damaged_session_without_index_is_refused(tmp_path: Path) -> None:
+    """Its intact contents could be solved, but the losses would remain unnoticed."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, index_types=IndexType.NONE, compression=CompressionType.NONE)
+        writer.start("locatk")
+        writer.add_metadata("locatk", {"kind": "session", "system": "lighthouse"})
+        channel = writer.register_channel("/log", "json", 0)
+        writer.add_message(channel, 1, b"payload", 1)
+        writer.finish()
+    path.write_bytes(path.read_bytes().replace(b"payload", b"damaged"))
+    with pytest.raises(FormatError, match="a damaged chunk at byte") as caught:
+        solve_session(path, SolveRequest())
+    assert "locatk recover" in (caught.value.hint or "")
