@@ -328,6 +328,7 @@ def test_a_pass_is_right_wrong_refused_or_silent(made: SimulatedSession) -> None
     assert polaris_passes.describe_outcomes(outcomes[3:4]) == "1 refused; 1 tie"
 
 
+@pytest.mark.slow
 def test_nothing_read_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polaris_passes, "REPEATED_PASSES", 1)
     monkeypatch.setattr(polaris_passes, "RANDOM_DESIGNS", 1)

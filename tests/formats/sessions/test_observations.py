@@ -105,6 +105,7 @@ SCENE = Scene(
 # ---- sweeps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [0, 1, 5000])
 @pytest.mark.parametrize("batch_ns", [1, 20_000_000, 10**15])
 def test_sweeps_round_trip(tmp_path: Path, n: int, batch_ns: int) -> None:
