@@ -17,7 +17,8 @@ import pytest
 from locatk.formats.capture import ports, recorder
 from locatk.formats.capture import setup as session
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns
-from locatk.formats.capture.recorder import CaptureStatus, Limits, RecordingResult
+from locatk.formats.capture.recorder import Limits
+from locatk.formats.capture.status import CaptureStatus, RecordingResult
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 
