@@ -18,18 +18,10 @@ from typing import Any
 
 from locatk.formats.artifacts.kinds import NO_UNIT, Boolean
 from locatk.formats.artifacts.ledger import LEDGER
-from locatk.formats.artifacts.maps import HALLS, MAP
-from locatk.formats.artifacts.receiver import RECEIVER
-from locatk.formats.artifacts.scene import SCENE
+from locatk.formats.artifacts.registry import ARTIFACTS
 from locatk.formats.artifacts.schema import HEADER, REQUIRED, Artifact, Key, Table, Tables, Variant
-from locatk.formats.artifacts.sheets import CAMERA, MANIFEST
-from locatk.formats.artifacts.tags import ARRAY, TAGS
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "formats.md"
-
-ARTIFACTS: tuple[Artifact[Any], ...] = (
-    SCENE, RECEIVER, MANIFEST, CAMERA, TAGS, ARRAY, MAP, HALLS, LEDGER,
-)  # fmt: skip
 
 COLUMNS = "| key | value | default | meaning |\n|---|---|---|---|\n"
 
@@ -87,7 +79,7 @@ def updated_table(text: str, artifact: Artifact[Any]) -> str:
 
 def updated(text: str) -> str:
     """Return the page with the tables of all artifacts."""
-    for artifact in ARTIFACTS:
+    for artifact in (*(entry.artifact for entry in ARTIFACTS.values()), LEDGER):
         text = updated_table(text, artifact)
     return text
 
