@@ -43,6 +43,6 @@ def test_identify_by_the_key_format(tmp_path: Path) -> None:
     assert identify_artifact(path).kind == "map"
     path.write_text("format = 'locatk-landmark-mop'\n")
     with pytest.raises(
-        ArtifactError, match="'locatk-landmark-mop' is not one of .*locatk-landmark-map"
+        ArtifactError, match=r"'locatk-landmark-mop' is not one of .*locatk-landmark-map"
     ):
         identify_artifact(path)
