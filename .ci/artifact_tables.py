@@ -16,12 +16,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from locatk.formats.artifacts import registry
 from locatk.formats.artifacts.kinds import NO_UNIT, Boolean
 from locatk.formats.artifacts.ledger import LEDGER
-from locatk.formats.artifacts.registry import ARTIFACTS
 from locatk.formats.artifacts.schema import HEADER, REQUIRED, Artifact, Key, Table, Tables, Variant
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "formats.md"
+
+ARTIFACTS = (*(entry.artifact for entry in registry.ARTIFACTS.values()), LEDGER)
 
 COLUMNS = "| key | value | default | meaning |\n|---|---|---|---|\n"
 
@@ -79,7 +81,7 @@ def updated_table(text: str, artifact: Artifact[Any]) -> str:
 
 def updated(text: str) -> str:
     """Return the page with the tables of all artifacts."""
-    for artifact in (*(entry.artifact for entry in ARTIFACTS.values()), LEDGER):
+    for artifact in ARTIFACTS:
         text = updated_table(text, artifact)
     return text
 
