@@ -48,12 +48,14 @@ def test_each_page_is_in_the_menu(site: Path) -> None:
     assert pages - {"index"} <= linked
 
 
+@pytest.mark.slow
 def test_first_page_is_the_readme(site: Path) -> None:
     start = (site / "index.html").read_text(encoding="utf-8")
     for heading in re.findall(r"^## (.*)$", (ROOT / "README.md").read_text("utf-8"), re.M):
         assert f"<h2>{heading}<" in start
 
 
+@pytest.mark.slow
 def test_nothing_is_fetched(site: Path) -> None:
     """Scripts, styles, fonts and pictures come with the pages: they open offline."""
     fetched = re.compile(
@@ -65,6 +67,7 @@ def test_nothing_is_fetched(site: Path) -> None:
         assert not fetched.search(path.read_text(encoding="utf-8")), path
 
 
+@pytest.mark.slow
 def test_search_works_without_a_network(site: Path, tmp_path: Path) -> None:
     """In a browser that opens the page as a file: results lead to pages that are there."""
     chromium = shutil.which("chromium")

@@ -201,6 +201,7 @@ def test_core_is_pure_computation(root: Path) -> None:
         assert not calls & {"open", "print", "input"}, path
 
 
+@pytest.mark.slow
 def test_commands_import_little_at_import_time(root: Path) -> None:
     """Commands start fast: numpy and the like are imported inside their functions."""
     light_modules = {
@@ -225,6 +226,7 @@ def test_commands_import_little_at_import_time(root: Path) -> None:
             assert is_light, f"{path} imports {name} at its top"
 
 
+@pytest.mark.slow
 def test_imported_names_exist(root: Path) -> None:
     """A name imported from a package is one of its modules, or defined in its ``__init__``.
 
@@ -258,6 +260,7 @@ SOLVER_STAGES = (
 """Modules and packages of a system that estimate; the simulators must not share their code."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_no_system_imports_another(root: Path, system: str) -> None:
     sisters = tuple(f"locatk.core.{other}." for other in SYSTEMS if other != system)

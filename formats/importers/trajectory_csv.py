@@ -33,7 +33,7 @@ COLUMNS = (
 SIGMA_AXES = (0, 1, 2, 5)
 """Rows of a pose's covariance that belong to the four sigmas."""
 
-POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9], COLUMNS[9:]
+POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9], COLUMNS[9:13]
 
 MAX_NORM_ERROR = 1e-2
 """Largest deviation of a quaternion from unit length that passes for rounding by its writer."""

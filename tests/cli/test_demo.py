@@ -42,6 +42,7 @@ def test_every_system_is_better_than_its_published_algorithm(demo) -> None:
         assert row["mae_m"] < (row["paper_mae_m"] or math.inf)
 
 
+@pytest.mark.slow
 def test_keep_leaves_what_it_names(demo) -> None:
     folder, result = demo
     answer = json.loads(result.stdout)
@@ -67,6 +68,7 @@ def test_what_to_try_next_works(demo, locatk, tmp_path: Path, monkeypatch) -> No
         assert done.exit_code == 0, (words, done.stderr)
 
 
+@pytest.mark.slow
 def test_the_report_tells_of_all_systems(demo) -> None:
     folder, _ = demo
     text = (folder / "report.html").read_text(encoding="utf-8")
@@ -74,6 +76,7 @@ def test_the_report_tells_of_all_systems(demo) -> None:
         assert f"{system}-solved.mcap" in text
 
 
+@pytest.mark.slow
 def test_nothing_is_replaced_unasked(demo, locatk) -> None:
     folder, _ = demo
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}

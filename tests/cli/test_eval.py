@@ -298,6 +298,7 @@ def test_one_pose_has_an_error_all_the_same(locatk, tmp_path: Path) -> None:
     assert "drift: -" in full
 
 
+@pytest.mark.slow
 def test_tum_files_need_no_scipy_and_no_session(tmp_path: Path) -> None:
     """They are heavy to import, and evaluating is to be quick."""
     (tmp_path / "a.txt").write_text(TUM)

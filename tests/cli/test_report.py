@@ -94,6 +94,7 @@ def test_names_of_outputs() -> None:
     )
 
 
+@pytest.mark.slow
 def test_nothing_is_replaced_without_overwrite(
     solution: Path, locatk: Locatk, tmp_path: Path
 ) -> None:
@@ -155,6 +156,7 @@ def test_the_session_can_be_in_another_folder(
     assert "Half of the poses" in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_sessions_belong_to_solutions_by_name(
     solution: Path, session: Path, record: Record, locatk: Locatk, tmp_path: Path
 ) -> None:

@@ -119,6 +119,7 @@ def test_the_offset_is_not_estimated_from_a_quarter_at_rest() -> None:
         evaluate_pair(shifted, truth, offset_s="auto", held_out=(0.0, 0.25))
 
 
+@pytest.mark.slow
 def test_long_recordings_are_sampled_at_longer_intervals() -> None:
     time = np.arange(0, 9000, 0.5)
     position = winding_path(time)

@@ -111,6 +111,7 @@ def test_json_is_all_that_is_on_stdout(locatk, tilted: Path, tmp_path: Path) -> 
     assert answer["notes"] == []
 
 
+@pytest.mark.slow
 def test_untilted_frames_leave_the_focal_length_open(locatk, upright: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.toml"
     result = locatk("calibrate", "camera", upright, "-o", out, "--json")

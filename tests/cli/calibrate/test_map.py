@@ -134,6 +134,7 @@ def test_later_sessions_are_solved_with_it(
     assert cells == [[0, 0], [0, 1], [1, 1]]
 
 
+@pytest.mark.slow
 def test_recordings_that_cannot_be_used_are_named(
     locatk, runs: list[Path], other: SimulatedSession, tmp_path: Path
 ) -> None:

@@ -237,6 +237,7 @@ def test_parts(capture: Any, tmp_path: Path, old: Path, raw_bytes: Any) -> None:
     assert not (tmp_path / "run.mcap").exists()
 
 
+@pytest.mark.slow
 def test_the_size_is_a_limit(capture: Any, tmp_path: Path, old: Path, raw_bytes: Any) -> None:
     noise = np.random.default_rng(6).bytes(2_000_000)
     recording(old.with_name("new.mcap"), noise, size=1500).replace(old)
@@ -251,6 +252,7 @@ def test_the_size_is_a_limit(capture: Any, tmp_path: Path, old: Path, raw_bytes:
 # ---- cameras
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packing", ["jpeg", "png"])
 def test_a_video_becomes_pictures(locatk: Any, tmp_path: Path, packing: str) -> None:
     import cv2
@@ -392,6 +394,7 @@ def test_a_port_that_is_not_there_keeps_the_old_file(locatk: Any, tmp_path: Path
     assert path.read_bytes() == b"old"
 
 
+@pytest.mark.slow
 def test_a_port_that_is_waited_for_is_no_warning(locatk: Any, tmp_path: Path) -> None:
     port = tmp_path / "no-port"
     args = ("--device", "raw", "-o", tmp_path / "run.mcap", "--wait", "0.3s")

@@ -69,6 +69,7 @@ def reader(path: Path) -> Iterator[list[bytes]]:
         assert not thread.is_alive()
 
 
+@pytest.mark.slow
 def test_the_path_is_all_that_is_printed(locatk: Callable, run: Path, tmp_path: Path) -> None:
     link = tmp_path / "port"
     with reader(link) as got:
@@ -82,6 +83,7 @@ def test_the_path_is_all_that_is_printed(locatk: Callable, run: Path, tmp_path: 
     assert not os.path.lexists(link)
 
 
+@pytest.mark.slow
 def test_json_tells_the_port_and_then_what_became_of_the_bytes(
     locatk: Callable, run: Path, tmp_path: Path
 ) -> None:
@@ -104,6 +106,7 @@ def test_json_tells_the_port_and_then_what_became_of_the_bytes(
     assert counted["flipped"] == expected.flipped > 0
 
 
+@pytest.mark.slow
 def test_unplugging_is_counted(locatk: Callable, run: Path, tmp_path: Path) -> None:
     link = tmp_path / "port"
     plugs = ("--unplug-every", 0.1, "--away", 0.05)
@@ -117,6 +120,7 @@ def test_unplugging_is_counted(locatk: Callable, run: Path, tmp_path: Path) -> N
     assert "lost while the port was closed, unplugged 1 time\n" in result.stderr
 
 
+@pytest.mark.slow
 def test_as_fast_as_possible(locatk: Callable, run: Path, tmp_path: Path) -> None:
     link = tmp_path / "port"
     with reader(link) as got:

@@ -57,6 +57,7 @@ def bad(made: Path, path: Path) -> Path:
 # ---- design
 
 
+@pytest.mark.slow
 def test_design_writes_and_prints_a_map(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     result = locatk("map", "design", "6x7", "-o", path, "--name", "hall", "--seed", 5)

@@ -107,6 +107,7 @@ def test_same_input_same_bytes(locatk, tmp_path: Path) -> None:
     assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_each_sheet_has_an_area_of_its_own(locatk, tmp_path: Path) -> None:
     held = np.zeros((2000, 6000), int)
     for n, more in enumerate(([], ["--landscape"], ["--count", 3], ["--tiles", "2x2"])):

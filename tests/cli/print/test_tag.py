@@ -83,6 +83,7 @@ def test_json_says_where_each_tag_lies(locatk, tag_file: Path, tmp_path: Path) -
     assert ids == ["page", "tag-7", "tag-7-copy-1"]
 
 
+@pytest.mark.slow
 def test_a_family_is_drawn_whole(locatk, family_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "tags.pdf"
     result = locatk("print", "tag", family_file, "-o", out, "--json")

@@ -224,6 +224,7 @@ def test_each_option_reaches_the_session(locatk, floor: Path) -> None:
     assert json.loads(session.metadata()["facts"]["simulated_errors"])["gain"] == 0.02
 
 
+@pytest.mark.slow
 def test_a_path_from_a_file(locatk, floor: Path) -> None:
     way, out = floor.with_name("way.csv"), floor.with_name("run.mcap")
     way.write_text("name,x_mm,y_mm\na,0,0\n\nb,400,0\nc,400.5,200\n")

@@ -76,6 +76,7 @@ heading_deg = 2
 """Settings that have no option of their own, and three that options override."""
 
 
+@pytest.mark.slow
 def test_a_session_holds_samples_bar_tag_and_truth(locatk, tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
     result = locatk("simulate", "polaris", "-o", out, "--id", 262143, "--seed", 3, "--json")

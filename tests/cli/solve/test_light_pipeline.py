@@ -285,6 +285,7 @@ def second() -> tuple[Array, Places]:
     return light(where, 2.0), where
 
 
+@pytest.mark.slow
 def test_a_table_without_factory_data_is_solved_up_to_scale(
     locatk, second: tuple[Array, Places], tmp_path: Path
 ) -> None:
@@ -505,6 +506,7 @@ def test_published_light(
     assert len(read_sweeps(Session.open(run))) == told["sweeps"]
 
 
+@pytest.mark.slow
 def test_published_capture_of_a_photodiode_at_rest(locatk, data: Path, tmp_path: Path) -> None:
     """It shows two stations from one place: the sweeps are there, a scene is not."""
     run, solved = tmp_path / "run.mcap", tmp_path / "solved.mcap"

@@ -73,6 +73,7 @@ def test_published_runs_teach_how_their_tag_was_built(
     assert np.median(after) > np.median(before) + 0.2
 
 
+@pytest.mark.slow
 def test_a_simulated_tag_is_measured_as_it_was_built(locatk, tmp_path: Path) -> None:
     """From four sides; the simulation knows finite magnets, and where it put them."""
     config = tmp_path / "sim.toml"
@@ -111,6 +112,7 @@ def test_a_simulated_tag_is_measured_as_it_was_built(locatk, tmp_path: Path) -> 
     assert np.ptp(np.degrees(built.angle_rad)) > 3  # there was something to find
 
 
+@pytest.mark.slow
 def test_a_simulated_tour_is_solved_on_its_site(locatk, tmp_path: Path) -> None:
     from locatk.core.polaris.tag import PlanarPose
 

@@ -341,7 +341,8 @@ def test_people_see_a_table_of_tags(locatk, solver: Solver, tmp_path: Path) -> N
     result = locatk("solve", session, "-o", tmp_path / "solved.mcap")
     assert result.exit_code == 0
     (row,) = [line for line in result.stdout.splitlines() if line.lstrip().startswith(str(ID))]
-    assert row.split() == [str(ID), "3.50", "5", "10.00", "-20.00", "28.65", "0.1", "0.2", "0.057"]
+    pose = "10.00 ± 0.1 -20.00 ± 0.2 28.65 ± 0.057"
+    assert row.split() == [str(ID), "3.50", "5", *pose.split()]
     assert "rejected: 2 debris" in result.stdout
     assert "run.mcap: a note" in result.stderr
 

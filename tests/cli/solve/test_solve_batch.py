@@ -285,6 +285,7 @@ def test_a_deadly_session_does_not_stop_the_batch(
     assert set(contents(out)) == {"a.mcap", "b.mcap", "c.mcap"}
 
 
+@pytest.mark.slow
 def test_resume_leaves_out_what_is_done(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, sonar: Path
 ) -> None:

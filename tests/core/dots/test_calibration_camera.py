@@ -186,6 +186,7 @@ def test_a_lens_of_another_model(strength: float) -> None:
     assert report.rms_px < 0.1 < report.rms_before_px
 
 
+@pytest.mark.slow
 def test_frames_of_twice_the_size() -> None:
     """They are halved to find the dots; the centre must not move by half a pixel."""
     lens = division(-8e-7)
@@ -303,6 +304,7 @@ def test_a_scale_that_was_not_measured_is_told_and_does_no_harm() -> None:
     assert measured.camera.focal_px == pytest.approx(report.camera.focal_px, rel=0.002)
 
 
+@pytest.mark.slow
 def test_dots_stand_where_the_manifest_has_them() -> None:
     shifted = replace(MANIFEST, offset_mm=0.060)
     options = SimulationOptions(frames=10, path="random", camera=TRUTH)
@@ -341,6 +343,7 @@ class Some(Sequence[Image]):
         return (self[k] for k in range(len(self)))
 
 
+@pytest.mark.slow
 def test_frames_that_cannot_be_used_are_counted(tilted: simulate.SimulatedSession) -> None:
     good = list(tilted.frames.images)
     blank = np.full((120, 188), 200, np.uint8)

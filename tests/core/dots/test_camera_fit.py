@@ -307,6 +307,7 @@ def test_the_prior_holds_what_frames_do_not_determine() -> None:
     assert abs(fit.centre - [93.5, 59.5]).max() < fit.sigma[0]
 
 
+@pytest.mark.slow
 def test_frames_that_are_no_poses_have_no_focal_length() -> None:
     """Sheared frames are homographies of the sheet, but no images of a pinhole camera."""
     seen = views(25, tilt_deg=15.0)

@@ -378,6 +378,7 @@ def test_noise_is_refused(size: tuple[int, int], n: int) -> None:
         assert not accepted(identify_windows(bits[0], bits[1], codec("anoto"))).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [8, 20])
 def test_half_of_it_noise(side: int) -> None:
     rng = np.random.default_rng(14)

@@ -68,6 +68,7 @@ def test_dots_are_the_same(seed: int) -> None:
     np.testing.assert_allclose(mine.xy, twin.xy, atol=2e-3)
 
 
+@pytest.mark.slow
 @needs_kernels
 def test_dots_in_the_middle_are_kept() -> None:
     images = drawn(3)
@@ -118,6 +119,7 @@ def test_too_few_dots_have_no_lattice_in_either() -> None:
     assert not grid.fit_lattices_numpy(points, valid, lens=False).fitted.any()
 
 
+@pytest.mark.slow
 @needs_kernels
 def test_soft_bits_are_the_same() -> None:
     dots = blobs.detect_dots_numpy(drawn(7))
@@ -184,6 +186,7 @@ def test_readings_are_the_same(name: str, side: int, missing: float, wrong: floa
     np.testing.assert_allclose(mine.log_odds[agree], twin.log_odds[agree], atol=1e-3)
 
 
+@pytest.mark.slow
 @needs_kernels
 def test_poses_are_the_same() -> None:
     dots = blobs.detect_dots_numpy(drawn(8))

@@ -37,6 +37,7 @@ def apart(first: Area, second: Area, gap: int = 0) -> bool:
     return ax + aw + gap <= bx or bx + bw + gap <= ax or ay + ah + gap <= by or by + bh + gap <= ay
 
 
+@pytest.mark.slow
 @given(
     held=st.lists(st.tuples(st.integers(0, 9000), st.integers(0, 9000), SIDES), max_size=8),
     wanted=st.lists(SIDES | LONG, min_size=1, max_size=25),

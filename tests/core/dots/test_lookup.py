@@ -111,6 +111,7 @@ def test_6x6_is_read_as_it_stands(name: str) -> None:
     agrees(decode_exact(windows, codec(name)), slice(None), at, sections, 0)
 
 
+@pytest.mark.slow
 def test_libdots_6x6_with_two_positions_is_not_read() -> None:
     windows, at, sections = draw("libdots", 3000, (6, 6), 4)
     actual = decode_exact(windows, codec("libdots"))

@@ -183,6 +183,7 @@ def test_each_dot_lies_where_its_symbol_and_the_truth_say() -> None:
         assert np.sqrt(np.mean(np.square(away))) < 0.03
 
 
+@pytest.mark.slow
 def test_the_published_frame_looks_like_its_simulation(data: Path) -> None:
     """Codec, conventions and heading against the real picture of cellulo-localization."""
     real = cv2.imread(str(data / "dots" / "frame.bmp"), cv2.IMREAD_GRAYSCALE)
@@ -296,6 +297,7 @@ def darkness(manifest: Manifest | None, **more: float) -> Array:
     return np.array([1 - np.mean(frame) / 210 for frame in frames]) / 0.75
 
 
+@pytest.mark.slow
 def test_dots_are_missing_and_dust_is_there_by_their_share() -> None:
     full = darkness(None)
     assert full.mean() == pytest.approx(math.pi * 0.15**2, rel=0.01)

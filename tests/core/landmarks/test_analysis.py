@@ -227,6 +227,7 @@ def test_neighbours_are_as_bad_as_the_worst_of_all_codes() -> None:
     assert all_eight == pytest.approx(total.max(), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_hall_sensors_tell_the_largest_field() -> None:
     result = analyse_landmark(Geometry())
     rng = np.random.default_rng(0)

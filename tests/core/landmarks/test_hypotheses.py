@@ -121,6 +121,7 @@ def test_probabilities_are_calibrated() -> None:
         )
 
 
+@pytest.mark.slow
 def test_covariances_agree_with_the_errors() -> None:
     squares = [
         one.error @ np.linalg.solve(one.covariance, one.error)

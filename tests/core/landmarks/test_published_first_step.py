@@ -136,6 +136,7 @@ def straight(count: int, aside: float) -> np.ndarray:
     return np.stack([np.arange(count) * 0.01, np.full(count, aside)], -1)[:, None]
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.sampled_from([-9.0, -7.0, -2.0, 0.0, 1.0, 4.0, 6.0, 8.0]), min_size=2, max_size=30)
 )

@@ -196,6 +196,7 @@ def test_errors_of_bars_are_as_large_as_asked() -> None:
 # ---- the robot
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -486,6 +487,7 @@ def test_a_wheel_that_slips_turns_too_far() -> None:
 # ---- sensors and faults
 
 
+@pytest.mark.slow
 def test_sensors_err_as_much_as_asked() -> None:
     still = replace(
         PLAIN, strategy="pass", cell=(2, 3), lateral_m=0.0, approach_rad=0.5, rest_s=10.0
@@ -603,6 +605,7 @@ def test_a_floor_lies_as_it_was_built() -> None:
 # ---- seeds and bad input
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_session(nominal: SimulatedSession) -> None:
     again = simulate(FLOOR, SimulationOptions(rate_hz=100.0, seed=3))
     assert np.array_equal(again.samples[0].field_t, nominal.samples[0].field_t)
@@ -657,6 +660,7 @@ def test_errors_that_cannot_be_are_refused() -> None:
 # ---- passes for studies
 
 
+@pytest.mark.slow
 def test_passes_start_on_the_circle_and_head_for_the_landmark() -> None:
     generated = simulate_passes(150, errors=NONE, seed=5)
     starts = np.array([flat(one.truth)[0] for one in generated])

@@ -174,6 +174,7 @@ def test_three_iterations_correct_to_a_tenth_of_a_microradian(world: Any) -> Non
         assert np.max(np.abs(three - many)) < 1e-7
 
 
+@pytest.mark.slow
 def test_correcting_as_crazyflie_does_gives_its_ray(world: Any) -> None:
     # The firmware's fixed point: corrected angles are those of 30-degree planes.
     calibration = calibration_of(world.planes_of(FACTORY_UNITS[3]), "crazyflie")

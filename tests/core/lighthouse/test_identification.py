@@ -68,6 +68,7 @@ def test_every_clean_window_of_60_bits(light: Any, polynomial: int) -> None:
     assert np.all(found.wrong_bits == 0)
 
 
+@pytest.mark.slow
 def test_shorter_windows(light: Any) -> None:
     # What 17 bits are needed for does not speak; what is left has to do so.
     index = np.arange(0, lfsr.SEQUENCE_LENGTH, 257)
@@ -197,6 +198,7 @@ def test_edges_of_noise(light: Any, runs: tuple[float, ...]) -> None:
     ) * len(found)
 
 
+@pytest.mark.slow
 def test_twins(light: Any) -> None:
     noise = np.random.default_rng(11)
     for length in (24, 25, 26, 63, 64, 65, 127, 128, 129, 200, 300, 1000, 1000, 1000):

@@ -149,6 +149,7 @@ def test_without_any_place_of_three_the_distance_is_unknown_and_that_is_said(wor
     check(found, lamps, points, MEAN_M[False])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 def test_of_two_islands_the_larger_is_solved(world: Any, flat: bool) -> None:
     lamps = (*world.lamps(1, 2, 5), *hall(world, 2, 3.0))
@@ -211,6 +212,7 @@ def test_narrow_fields_of_bodies_are_not_called_floors(world: Any) -> None:
 # ---- whole sessions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planar", [True, False])
 def test_hiding_a_station_moves_poses_by_millimetres(planar: bool) -> None:
     """Users of other tools report jumps of 50 to 100 mm when a station is hidden."""

@@ -194,6 +194,7 @@ def test_light_that_does_not_end(light: Any) -> None:
     assert len(left) - 4 <= len(got.sweeps) <= len(left) + 2
 
 
+@pytest.mark.slow
 def test_two_stations_on_one_channel(light: Any) -> None:
     doubled = [light.Sender(3), light.Sender(3, zero_s=0.011, ppm=5)]
     lines, passed = light.of([*doubled, light.Sender(9, zero_s=0.002)], 5.0)
@@ -340,6 +341,7 @@ def test_published_captures_of_the_deck(
     assert got.rotors[7].period_deviation_ppm(1e9) == pytest.approx(-12, abs=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate_hz", "least"), [(24e6, 0.94), (32e6, 0.97)])
 def test_the_published_capture_at_lower_rates(
     published: Callable[[str], Edges], light: Any, rate_hz: float, least: float

@@ -341,6 +341,7 @@ def test_recordings_that_determine_no_pose_are_refused() -> None:
         solve_devices(lone, {"device": TRACKER})
 
 
+@pytest.mark.slow
 def test_a_pause_of_years_is_handled() -> None:
     sweeps = record(ROOM, TRACKER, standing, 0.5)
     later = sweeps.time_ns + np.where(sweeps.time_ns - START_NS > 250_000_000, 10**17, 0)

@@ -424,6 +424,7 @@ def test_the_first_robot_rests_on_the_markers(planar: bool) -> None:
 # ---- faults
 
 
+@pytest.mark.slow
 def test_occlusion_hides_the_fraction_in_blocks() -> None:
     options = SimulationOptions(robots=8, stations=3, duration_s=60.0)
     free = simulate(options).sweeps
@@ -549,6 +550,7 @@ def test_odd_sessions_are_whole(options: dict[str, float]) -> None:
         assert len(set(zip(s.channel, s.time_ns, strict=True))) == len(s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "largest_mm"),
     [

@@ -141,6 +141,7 @@ def test_twins_on_drawn_light(light: Any, rate_hz: float) -> None:
     agree(split_bursts(line))
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.sampled_from([0, 1, 2, 3, 4, 5, 6, 7, 20, 59, 61, 500, 20_100]), min_size=0, max_size=300

@@ -72,6 +72,7 @@ def test_every_id_has_a_layout_and_comes_back(case: tuple[Tags, int]) -> None:
     assert codec.id_of(tags, layout) == tag_id
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(designs(), st.data())
 def test_every_layout_has_an_id_and_comes_back(tags: Tags, data) -> None:

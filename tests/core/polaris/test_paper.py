@@ -97,6 +97,7 @@ def compared(sighting: DetectedMagnets, samples: Samples, truth: tuple[Array, Ar
 # ---- Eq. 3
 
 
+@pytest.mark.slow
 @given(
     st.floats(0, math.tau),
     st.floats(0, 0.02),

@@ -30,6 +30,7 @@ def driven(magnet: Magnet, clearance: float, lateral: float, angle: float) -> np
     return np.array([source.getB((x, lateral, clearance)) for x in ALONG])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("magnet", [Magnet(), Magnet(3e-3, 1e-3, 1.2, "N35")])
 def test_cylinders_are_magpylibs(magnet: Magnet) -> None:
     laterals, angles = np.array([-0.01, 0.0, 0.004]), np.radians([0, 35, 90, 200])

@@ -137,6 +137,7 @@ def fixed_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing, "SAMPLE_S", 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fixed_figures")
 def test_the_table_fits_80_columns(locatk: Callable[..., Result], tmp_path: Path) -> None:
     result = locatk("bench", "lighthouse", "--data", tmp_path)
@@ -182,6 +183,7 @@ def test_json_has_the_scaled_target_and_the_machine_factor(
     }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_missing_data_are_reported_and_affect_no_other_figure(tmp_path: Path) -> None:
     found = {figure.name: figure for figure in lighthouse.figures(tmp_path)}

@@ -52,6 +52,7 @@ def test_damages() -> None:
     assert found["recover: outputs unreadable or refused"].value == 0
 
 
+@pytest.mark.slow
 def test_info_of_a_large_file() -> None:
     figure = capture.info_figure(2_000_000)
     assert figure.target == 1.0

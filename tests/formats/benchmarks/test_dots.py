@@ -155,6 +155,7 @@ def test_a_frame_counts_as_right_wrong_or_neither() -> None:
     assert Figure("f", empty.rms, "pitch", "how", 0.003).met is False
 
 
+@pytest.mark.slow
 def test_the_study_reports_errors_and_scatter(monkeypatch: pytest.MonkeyPatch) -> None:
     solve = dots.solve
 
@@ -207,6 +208,7 @@ def test_windows_of_the_bench_are_windows_of_the_pattern() -> None:
     assert row.tolist() == [[[-4, -4], [4, 4]]]
 
 
+@pytest.mark.slow
 def test_a_wrong_print_is_noticed() -> None:
     pytest.importorskip("pypdfium2")
     sheet = dots_print.default_sheet("A5")
@@ -219,6 +221,7 @@ def test_a_wrong_print_is_noticed() -> None:
     assert windows_right.value == 0
 
 
+@pytest.mark.slow
 def test_a_failed_measurement_is_explained() -> None:
     declared = Figure("f", None, "s", "how", 1.0, workload="numpy")
     figure = timing.measure_single_threaded(declared, "dots.printing.nothing()")

@@ -89,6 +89,7 @@ def test_differences_from_stored_calibrations_are_counted(data: Path) -> None:
     assert infrared.compare_calibrations(session, path).value == 1
 
 
+@pytest.mark.slow
 def test_wrong_windows_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert infrared.count_wrong_windows(3) == 0
     monkeypatch.setattr(identification, "MIN_PREDICTED_BITS", 50)  # more than 60 bits can show

@@ -171,6 +171,7 @@ def test_files_that_are_no_videos(tmp_path: Path) -> None:
         assert error.file == str(path)
 
 
+@pytest.mark.slow
 def test_the_libraries_say_nothing(tmp_path: Path) -> None:
     # Asked in a program of its own: here another test may have woken FFmpeg before.
     (tmp_path / "some.mp4").write_bytes(os.urandom(4000))

@@ -115,6 +115,7 @@ def some_halls(n: int = 400) -> HallSamples:
     return HallSamples("robot", sensors, time_ns, rng.normal(size=(n, 4)) * 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "recording", "topic", "layout"),
     [

@@ -611,6 +611,7 @@ def test_a_remote_port(opened: Opened) -> None:
     assert port.describe() == {"port": port.name, "resolved": port.name, "baud": "57600"}
 
 
+@pytest.mark.slow
 @old_calls
 def test_a_server_of_another_kind() -> None:
     over = threading.Event()

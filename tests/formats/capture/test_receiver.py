@@ -265,6 +265,7 @@ def test_a_port_that_cannot_be_opened_again_for_an_unforeseen_reason(
 # ---- too much
 
 
+@pytest.mark.slow
 def test_when_nobody_takes_reading_waits(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive(max_waiting_bytes=1000)
     port.send(*[bytes(100)] * 50)

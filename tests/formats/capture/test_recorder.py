@@ -47,6 +47,7 @@ def openings(*paths: Path) -> list[int]:
 # ---- every byte
 
 
+@pytest.mark.slow
 def test_every_byte_is_in_the_file(port: Any, start: Any, raw_bytes: Any) -> None:
     sent = pieces(300)
     running = start(note="second floor", meta={"robot": "7"})
@@ -417,6 +418,7 @@ def test_a_disk_that_was_slow_is_no_silence(
     assert recorded.totals.bytes == 5400
 
 
+@pytest.mark.slow
 def test_bytes_in_which_no_frame_is_found_are_told_of_once(
     port: Any, start: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -433,6 +435,7 @@ def test_bytes_in_which_no_frame_is_found_are_told_of_once(
     assert not recorded.failed
 
 
+@pytest.mark.slow
 def test_a_wall_clock_that_is_set_is_told_and_changes_nothing(
     port: Any, start: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -471,6 +474,7 @@ def test_overruns_are_in_the_totals(port: Any, start: Any) -> None:
     assert Session.open(recorded.paths[0]).metadata()["capture"]["overruns"] == "7"
 
 
+@pytest.mark.slow
 def test_how_it_goes_is_shown(port: Any, start: Any) -> None:
     running = start()
     running.until(lambda: running.shown)
@@ -611,6 +615,7 @@ def test_the_next_part_cannot_be_begun(port: Any, start: Any, raw_bytes: Any) ->
 # ---- the disk
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
     port: Any, start: Any, raw_bytes: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -642,6 +647,7 @@ def test_a_disk_that_nobody_can_ask_is_no_matter(
     assert running.end().ended == "stopped"
 
 
+@pytest.mark.slow
 def test_a_disk_without_room_leaves_a_whole_file(
     port: Any, start: Any, raw_bytes: Any, small_disk: Path
 ) -> None:
@@ -703,6 +709,7 @@ def test_a_disk_that_fails_ends_it_in_words(
     assert b"".join(chunk.data for _, chunk in left) == b"kept"
 
 
+@pytest.mark.slow
 def test_the_folder_is_renamed_meanwhile(port: Any, start: Any, tmp_path: Path) -> None:
     folder = tmp_path / "today"
     folder.mkdir()
@@ -872,6 +879,7 @@ def test_an_interrupt_in_the_middle_finishes_the_file(
     assert all(link.closed for link in port.links)
 
 
+@pytest.mark.slow
 def test_lines_of_the_log_are_in_order(port: Any, start: Any) -> None:
     running = start()
     for number in range(5):

@@ -136,6 +136,7 @@ def test_empty_batches_are_nothing() -> None:
     assert not streams.samples
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(
     steps=st.lists(

@@ -396,6 +396,7 @@ def test_all_values_may_leap() -> None:
     assert len(decoder.remarks) == 1
 
 
+@pytest.mark.slow
 def test_damage_in_the_first_frames() -> None:
     values = bar(120)
     data, true = to_bytes(values), tesla(values)
@@ -565,6 +566,7 @@ def test_any_split_gives_the_same(draw: st.DataObject) -> None:
             assert (np.diff(ends(parts[0])) > 0).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.binary(max_size=400), st.integers(0, 40), st.booleans())
 def test_any_bytes_are_taken(garbage: bytes, repeat: int, silent: bool) -> None:

@@ -150,6 +150,7 @@ def test_the_longest_frame() -> None:
     assert fed(wire, []) == ([(content, len(wire))], Counts(bytes=len(wire)))
 
 
+@pytest.mark.slow
 @given(st.lists(contents, min_size=1, max_size=6), st.lists(st.integers(0, 9999), max_size=5))
 def test_what_was_sealed_is_found(sent: list[bytes], cuts: list[int]) -> None:
     wire = b"".join(map(encode_frame, sent))

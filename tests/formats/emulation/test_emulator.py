@@ -127,6 +127,7 @@ def emulate(emulator: Emulator, *readers: Reader) -> EmulationCounts:
     return emulator.totals
 
 
+@pytest.mark.slow
 def test_every_byte_arrives_in_order(port: PseudoPort) -> None:
     packets = numbered(2000, step_ms=0.1, size=64)
     reader = Reader(port.path)
@@ -144,6 +145,7 @@ def test_more_than_a_terminal_holds_at_once(port: PseudoPort) -> None:
     assert reader.data == data
 
 
+@pytest.mark.slow
 def test_a_constant_rate(port: PseudoPort) -> None:
     data = np.random.default_rng(3).bytes(200_000)
     reader = Reader(port.path)
@@ -176,6 +178,7 @@ def test_the_first_reader_may_throw_away_what_is_there_when_it_opens(port: Pseud
     assert reader.data == joined(packets)
 
 
+@pytest.mark.slow
 def test_a_passer_by_does_not_start_it(port: PseudoPort) -> None:
     """As ``stty -F PORT`` before the reader."""
     packets = numbered(50)
@@ -192,6 +195,7 @@ def test_a_passer_by_does_not_start_it(port: PseudoPort) -> None:
     assert reader.data == joined(packets)
 
 
+@pytest.mark.slow
 def test_without_waiting_the_start_is_lost(port: PseudoPort) -> None:
     packets = numbered(250)
     reader = Reader(port.path, delay_s=0.1)
@@ -210,6 +214,7 @@ def test_without_any_reader_all_is_lost(port: PseudoPort) -> None:
     assert totals == EmulationCounts(made=400, unheard=400)
 
 
+@pytest.mark.slow
 def test_while_the_reader_is_away_bytes_are_lost_and_counted(port: PseudoPort) -> None:
     """Among them what it left unread: the next reader does not get to see it."""
     packets = numbered(350)
@@ -238,6 +243,7 @@ def test_a_reader_that_does_not_read_loses_bytes_in_the_middle(port: PseudoPort)
     assert whole.endswith(reader.data[-200:]), "it catches up"
 
 
+@pytest.mark.slow
 def test_a_busy_reader_loses_nothing(port: PseudoPort) -> None:
     packets = numbered(250, size=200)
     reader = Reader(port.path, first=lambda descriptor: time.sleep(0.2))
@@ -284,6 +290,7 @@ def test_unplugging(port: PseudoPort) -> None:
     assert min(missing) >= 8 * 100
 
 
+@pytest.mark.slow
 def test_a_reader_that_is_cut_off_knows_what_it_missed(port: PseudoPort) -> None:
     """What it had not read when the port went is counted to the byte."""
     packets = numbered(250)
@@ -304,6 +311,7 @@ def test_a_port_that_cannot_come_back(port: PseudoPort) -> None:
     taken.unlink()
 
 
+@pytest.mark.slow
 def test_the_last_bytes_are_waited_for(port: PseudoPort) -> None:
     def slowly(descriptor: int) -> None:
         time.sleep(0.2)
@@ -320,6 +328,7 @@ def test_the_last_bytes_are_waited_for(port: PseudoPort) -> None:
     assert reader.data == joined(packets)
 
 
+@pytest.mark.slow
 def test_the_last_bytes_are_not_waited_for_for_ever(port: PseudoPort) -> None:
     reader = Reader(port.path, first=lambda descriptor: reader.over.wait(9))
     totals = emulate(
@@ -386,6 +395,7 @@ def test_it_can_be_stopped_while_it_sends(port: PseudoPort, speed: float) -> Non
     assert totals.made < 10_000_000
 
 
+@pytest.mark.slow
 def test_it_can_be_stopped_while_it_waits(port: PseudoPort) -> None:
     """For the first reader, and for the last one to read."""
     emulator = Emulator(port, RecordedPace(numbered(10)), plan=EmulationPlan(**QUICK))
@@ -401,6 +411,7 @@ def test_it_can_be_stopped_while_it_waits(port: PseudoPort) -> None:
     assert emulate(emulator, reader) == EmulationCounts(made=80, unheard=80)
 
 
+@pytest.mark.slow
 def test_a_standing_device_costs_little(port: PseudoPort) -> None:
     """It does not spin while nothing is due: a tenth of a core at the very most."""
     reader = Reader(port.path)

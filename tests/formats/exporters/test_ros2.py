@@ -60,6 +60,7 @@ def numbers(part: object, names: str) -> list[float]:
     return [getattr(part, name) for name in names]
 
 
+@pytest.mark.slow
 def test_rosbags_reads_the_export(tmp_path: Path) -> None:
     path, red, blue = tmp_path / "poses.mcap", track("red"), track("lab/blue", "map", seed=4)
     write_ros2(path, [red, blue], covariance=True)

@@ -91,6 +91,7 @@ def test_png_is_1200_by_600(tmp_path: Path) -> None:
     assert struct.unpack(">II", data[16:24]) == (1200, 600)
 
 
+@pytest.mark.slow
 def test_an_existing_file_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_text("mine")
@@ -299,6 +300,7 @@ def test_every_word_is_inside_the_picture(
         assert box.y1 <= frame.y1 + 1, text
 
 
+@pytest.mark.slow
 def test_expected_errors_are_drawn() -> None:
     figure = draw_picture(solution(names=("red",)), TRUTH)
     over_time = next(a for a in figure.axes if a.get_ylabel() == "error [mm]")

@@ -382,6 +382,7 @@ def check_tile(floor: FloorMap, tile: Tile, dark: Places) -> None:
     assert dark[:, -edge_px:].max() == 0
 
 
+@pytest.mark.slow
 def test_floors_have_rulers() -> None:
     tiles = draw_floor(HALL, parse_paper("A3"))
     dark = ink(render_floor(tiles[:1], "t"), dpi=600) > 0.5
@@ -428,6 +429,7 @@ def test_tables_say_what_the_map_says() -> None:
     assert f"{math.hypot(540, 720):.0f} mm each" in checks
 
 
+@pytest.mark.slow
 def test_the_list_of_a_large_floor_is_whole() -> None:
     floor = some_floor(30, 31)
     made = draw_installation_pack(floor, A4, parts=("list",))

@@ -189,6 +189,7 @@ def test_other_pitches_and_printers_are_exact() -> None:
         assert_windows_decode(symbols, at, made, (24, 32), 200)
 
 
+@pytest.mark.slow
 def test_long_rows_are_several_strings(monkeypatch: pytest.MonkeyPatch) -> None:
     assert pattern.MAX_STRING_BYTES <= 32_767  # ISO 32000-1 annex C
     made = sheets("A5")
@@ -253,6 +254,7 @@ def runs(line: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
+@pytest.mark.slow
 def test_rulers_are_100_mm() -> None:
     made = sheets("Letter", dpi=600)
     raster = rasterise(pattern.render(made), 600) < 128
@@ -291,6 +293,7 @@ def test_margin_says_what_it_is() -> None:
     assert "sheet-1" not in words(pattern.render(made, marks=False), 0, made)
 
 
+@pytest.mark.slow
 def test_narrow_margins_stay_empty() -> None:
     for margin, bare in ((0.0, True), (6.5, True), (7.0, False), (20.0, False)):
         made = sheets("A5", margin=margin)
@@ -476,6 +479,7 @@ def test_steps_are_counted() -> None:
     assert len(calls) == rasters.bands(two) == 6
 
 
+@pytest.mark.slow
 def test_nothing_in_the_margin_comes_near_the_dots() -> None:
     """At 1200 dpi: 1 mm around the pattern is white whatever the margin holds."""
     layout = lay_out((148, 210), 10, snap(0.508, None, 300))

@@ -159,6 +159,7 @@ def test_magnets_lie_and_point_where_the_id_says(
         assert abs(off) < 0.5, f"magnet {which} points {off:.1f} degrees wrong"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("paper", [A4, LETTER])
 def test_rulers_are_100_mm(paper: tuple[float, float]) -> None:
     made = draw_tag_cards(MINI, some(MINI, 1), paper)
@@ -251,6 +252,7 @@ def test_words_are_not_drawn_over(tags: Tags, mirror: bool) -> None:
     assert both.max() < 0.3
 
 
+@pytest.mark.slow
 def test_svg_is_what_the_pdf_shows_in_mm() -> None:
     made = draw_tag_cards(FULL, some(FULL, 2), A4)
     data = render_svg(made.pages[0], "two tags")

@@ -90,6 +90,7 @@ def values(array: Any) -> np.ndarray:
 # ---- the file
 
 
+@pytest.mark.slow
 def test_one_copy_of_the_script_and_no_address(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     write_report(path, [evaluated(solution("red")), evaluated(solution("blue"))])
@@ -142,6 +143,7 @@ def test_neither_matplotlib_nor_scipy_is_imported() -> None:
 # ---- foreign text
 
 
+@pytest.mark.slow
 def test_names_of_devices_do_no_harm() -> None:
     facts = {"command": f"locatk solve {EVIL}", "source": EVIL, "other": EVIL}
     warnings = (SolverWarning("test", EVIL),)
@@ -243,6 +245,7 @@ def test_poses_without_covariance_have_a_report() -> None:
     assert "reports no covariance" in texts(replace(subject, evaluation=None, truth=()))
 
 
+@pytest.mark.slow
 def test_poses_that_are_not_finite_are_left_out_and_counted() -> None:
     solved = solution("red")
     solved.trajectories[0].position[5:9] = np.nan
@@ -258,6 +261,7 @@ def test_poses_that_are_not_finite_are_left_out_and_counted() -> None:
     assert "60 poses are not finite" in said
 
 
+@pytest.mark.slow
 def test_devices_without_truth_are_named() -> None:
     subject = evaluated(solution("red", "blue"))
     only = evaluate([(subject.solution.trajectories[0], subject.truth[0])])
@@ -427,6 +431,7 @@ def test_errors_and_bands_are_those_of_the_solution() -> None:
 # ---- large solutions
 
 
+@pytest.mark.slow
 def test_ten_thousand_poses_are_thinned_and_small() -> None:
     names = [f"robot-{k}" for k in range(12)]
     rng = np.random.default_rng(1)
@@ -444,6 +449,7 @@ def test_ten_thousand_poses_are_thinned_and_small() -> None:
     assert max(np.nanmax(values(t["x"])) for t in paths) > 4
 
 
+@pytest.mark.slow
 def test_few_devices_are_named_and_the_rest_counted() -> None:
     solved = solution(*[f"robot-{k}" for k in range(20)], n=5)
     panel = figure(evaluated(solved), "Trajectory")

@@ -125,6 +125,7 @@ def test_every_panel_has_words_and_draws_without_webgl(
             assert "[s]" in titles
 
 
+@pytest.mark.slow
 def test_sweeps_are_classified_as_by_the_solver(lighthouse: tuple[Session, Solution]) -> None:
     session, solution = lighthouse
     found = signals.signal_panels(session, solution)

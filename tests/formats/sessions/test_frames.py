@@ -258,6 +258,7 @@ def test_a_damaged_chunk_affects_only_its_frames(tmp_path: Path) -> None:
     assert str(path) in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("message", "words"),
     [

@@ -42,6 +42,7 @@ def test_text_that_is_not_a_time(text: str) -> None:
         ts.parse_decimal_times(["1.5", text])
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(
     st.lists(st.integers(0, 2**63 - 1), min_size=1, max_size=5), st.integers(0, 12), st.booleans()
