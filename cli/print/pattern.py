@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,17 @@ FORMATS = ("pdf", "png", "txt")
 MAX_FILES = 200
 """Largest number of files of a run, all of which are open until the last one is complete."""
 
+MAX_SECTION = 62
+"""Largest number of a section: the main sequence of the pattern has 63 of them."""
+
 MAX_TABLE_ROWS = 10
 
 
 class PairType(click.ParamType):
     """Two whole numbers with a separator, as in ``3x2`` or ``1330,7200``."""
 
-    def __init__(self, separator: str, minimum: int) -> None:
-        self.separator, self.minimum = separator, minimum
+    def __init__(self, separator: str, minimum: int, maximum: float = math.inf) -> None:
+        self.separator, self.minimum, self.maximum = separator, minimum, maximum
         self.name = f"a pair of numbers as in 3{separator}2"
 
     def convert(
@@ -38,6 +42,8 @@ class PairType(click.ParamType):
         first, second = (int(part) for part in parts)
         if min(first, second) < self.minimum:
             self.fail(f"{value!r} has a number below {self.minimum}.", param, ctx)
+        if max(first, second) > self.maximum:
+            self.fail(f"{value!r} has a number above {self.maximum}.", param, ctx)
         return first, second
 
 
@@ -163,7 +169,7 @@ class PairType(click.ParamType):
     ),
     click.option(
         "--section",
-        type=PairType(",", 0),
+        type=PairType(",", 0, MAX_SECTION),
         default="0,0",
         show_default=True,
         metavar="U,V",

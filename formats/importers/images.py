@@ -122,7 +122,9 @@ class ImageFiles:
             reason = self.warnings[0] if self.warnings else "there are none"
             raise FormatError(
                 f"none of {len(self._files)} files is usable: {reason}",
-                hint="Compare the --camera with the frames" if self._camera is not None else None,
+                hint="Compare the --camera with the frames"
+                if self._camera is not None
+                else "Give image files; `locatk import video` reads videos",
             )
 
 
