@@ -41,6 +41,14 @@ TABLE_WIDTH = 80
 def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
     """Measure the figures of SYSTEM and print them beside their targets.
 
+    \b
+    SYSTEM is one of
+      lighthouse, dots, polaris, landmarks
+                  accuracy and speed of a system
+      infrared    sweeps and factory data from raw infrared light
+      capture     recording from ports, recovery of damaged files, decoding speed
+      look        eval compared with evo, reports, demo and batches
+
     Targets of durations are scaled by the machine factor: the duration of a fixed workload on this
     machine, measured with each figure, over that on the reference machine. A figure whose data
     are missing is listed without a value; --full gives the reason.

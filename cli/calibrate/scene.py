@@ -15,7 +15,11 @@ from locatk.core.errors import InputError
 @click.command("scene", cls=Command, short_help="Estimate the poses of Lighthouse stations.")
 @options.input_argument("session")
 @options.output("Scene to write (.toml).")
-@options.method
+@click.option(
+    "--method",
+    type=click.Choice(("bundle", "paper")),
+    help="Algorithm: `paper` is the published one, `bundle` is more accurate.  [default: bundle]",
+)
 @scene_option
 @options.overwrite
 @options.as_json
