@@ -75,11 +75,11 @@ def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
         console.emit_json(
             {"system": system, "commit": _commit(), "figures": [_entry(f) for f in figures]}
         )
-    elif full:
-        header = ("figure", "value", "target", "unit", "met", "machine", "peer", "peer's", "how")
-        console.result(console.table(header, [_full_row(figure) for figure in figures]))
-    else:
-        console.result(_narrow_table([_row(figure) for figure in figures]))
+        return
+    console.result(_narrow_table([_row(figure) for figure in figures]))
+    if full:
+        for figure in figures:
+            console.result(f"\n{console.wrapped(figure.name)}\n{_details(figure)}")
 
 
 def _entry(figure: Any) -> dict[str, Any]:
@@ -112,15 +112,15 @@ def _row(figure: Any) -> tuple[str, ...]:
     )
 
 
-def _full_row(figure: Any) -> tuple[str, ...]:
-    factor = figure.machine_factor
-    return (
-        *_row(figure),
-        "-" if factor is None else f"{figure.workload} {factor:.2f}",
-        figure.peer or "-",
-        _number(figure.peer_value),
-        figure.how,
-    )
+def _details(figure: Any) -> str:
+    """Format machine factor, peer and method of a figure."""
+    rows = []
+    if figure.machine_factor is not None:
+        rows.append(("machine factor:", f"{figure.workload} {figure.machine_factor:.2f}"))
+    if figure.peer:
+        rows.append(("peer:", f"{_number(figure.peer_value)} {figure.unit} ({figure.peer})"))
+    rows.append(("method:", figure.how))
+    return console.labelled(rows, indent=2)
 
 
 def _narrow_table(rows: list[tuple[str, ...]]) -> str:

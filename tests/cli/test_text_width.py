@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
@@ -21,6 +24,12 @@ def run(*args: object) -> Result:
 
 def too_wide(text: str) -> list[str]:
     return [line for line in text.splitlines() if len(line) > console.TEXT_COLUMNS]
+
+
+DRIVE = "t_s,x_mm,y_mm,heading_deg,front_mt,left_mt,rear_mt,right_mt\n" + "".join(
+    f"{0.01 * row:.2f},{row},0,0,0.1,0.2,0.1,0.3\n" for row in range(20)
+)
+"""Recording of a robot over landmarks."""
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +50,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             assert made.exit_code == 0, made.stderr
             solved = run("solve", f"{system}.mcap", "-o", f"{system}-solved.mcap")
             assert solved.exit_code in (0, 3), solved.stderr
+        design = Path("map.toml").read_text()
+        row = re.search(r'\n +("[0-9a-f]{4}"),', design)
+        assert row is not None
+        Path("double.toml").write_text(re.sub(r'"[0-9a-f]{4}"', row[1], design))
+        Path("drive.csv").write_text(DRIVE)
+        for name in ("frame1.png", "frame2.png"):
+            cv2.imwrite(name, np.full((60, 80), 200, np.uint8))
+        Path("broken.png").write_bytes(Path("frame1.png").read_bytes()[:40])
+        Path("x").mkdir()
         yield path
     finally:
         os.chdir(before)
@@ -77,7 +95,23 @@ SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
         "print pattern -o sheet.pdf --overwrite",
         "print testsheet -o test.pdf --overwrite",
         "print landmarks map.toml -o pack.pdf --overwrite",
+        "print landmarks map.toml -o floor.pdf --floor --paper A1 --overwrite",
         "capture --list",
+        "tag design -o tags.toml --count 20 --min-distance 2 --bom parts.csv --overwrite",
+        "tag design -o mini.toml --order 2 --magnets 3 --clearance 4 --overwrite",
+        "tag check tag.toml",
+        "tag check tag.toml --sensors 3 --speed 3",
+        "tag decode 0,0:0 1,1:45 0,2:0 1,2:90 2,2:0",
+        "map design 5x5 --alphabet compass -o compass.toml --overwrite",
+        "map design --landmark",
+        "map check map.toml double.toml",
+        "map import map.csv -o imported.toml --overwrite",
+        *(f"simulate {system} -o new.mcap --overwrite" for system in ("polaris", "lighthouse")),
+        "simulate landmarks map.toml --landmarks 14 -o new.mcap --overwrite",
+        "import landmark-csv drive.csv --map map.toml -o imported.mcap --overwrite",
+        "import images frame1.png frame2.png broken.png -o imported.mcap --overwrite",
+        "bench infrared --data x",
+        "bench infrared --data x --full",
     ],
 )
 def test_results_fit_80_columns(folder: Path, command: str) -> None:
