@@ -31,7 +31,7 @@ OVERLAP_TOLERANCE_M = 1e-9
 @click.command(cls=Command)
 @click.argument("size", metavar="[ROWSxCOLS]", type=Size(), required=False)
 @options.output("Map to write (.toml).", required=False)
-@click.option("--name", default="", metavar="TEXT", help="Name of the map, for people.")
+@click.option("--name", default="", metavar="TEXT", help="Descriptive name of the map.")
 @click.option(
     "--landmark",
     is_flag=True,
