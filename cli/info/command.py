@@ -26,13 +26,13 @@ def command(file: Path, as_json: bool) -> None:
     Artifacts are Lighthouse scenes and receivers; manifests of dot sheets and cameras; tags and
     sensor arrays; maps of landmarks and hall sensors.
 
-    The table of Lighthouse stations has their channel and serial number, the period of a rotation
-    (in ticks of 48 MHz, and its difference from the nominal one in ppm if it was measured), the
-    number of sweeps, the fraction of them that was decoded, and the origin of the calibration.
+    For each Lighthouse station, the output lists channel, serial number, period of a rotation (in
+    ticks of 48 MHz and, if it was measured, its difference from the nominal one in ppm), number of
+    sweeps, fraction of decoded sweeps, and origin of the calibration.
 
-    A damaged or truncated recording is described as far as it can be read. The exit status is
-    then 3, and `locatk recover` saves the rest. Of a recording with more than 16 MB of samples
-    only the index is read.
+    A damaged or truncated recording is described as far as it can be read. The exit status is then
+    3, and `locatk recover` saves the rest. For recordings with more than 16 MB of samples, only the
+    index is read.
 
     \b
     Examples:

@@ -299,6 +299,7 @@ class Text:
 
     choices: tuple[str, ...] = ()
     is_blank_allowed: bool = True
+    hint: str | None = None
 
     @property
     def expected(self) -> str:
@@ -318,7 +319,9 @@ class Text:
             raise InvalidValueError(
                 f"{value!r} is not one of {choices}"
                 if len(self.choices) > 1
-                else f"expected {choices!r}, not {value!r}"
+                else f"expected {choices!r}, not {value!r}",
+                "",
+                self.hint,
             )
         if not (self.is_blank_allowed or value.strip()):
             raise InvalidValueError(f"expected {self.expected}")

@@ -273,7 +273,7 @@ def _plain(value: float) -> float | int:
 def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
     """Open a document; errors while it is processed are reported as damage, too."""
     if b"%PDF-" not in read_bytes(path, 1024):
-        raise FormatError("not a PDF", file=path)
+        raise FormatError("not a PDF", file=path, hint="Save the document as PDF")
     try:
         # A repair may lose pages without a message.
         with Pdf.open(os.fspath(path), attempt_recovery=False) as pdf:
