@@ -355,7 +355,7 @@ def _opened(place: str, is_file: bool) -> Any:
 
 
 def _grab(capture: Any, clock: Callable[[], int]) -> tuple[int, Any] | None:
-    """Return (time in ns, pixels) of the next frame; None if is_ok is none."""
+    """Return (time in ns, pixels) of the next frame; None if there is none."""
     is_ok = capture.grab()
     time_ns = clock()
     if is_ok:

@@ -57,10 +57,10 @@ class Intake(Protocol):
         """Return the messages that are due at ``now_ns``, whether or not data were received."""
 
     def restart(self) -> Iterator[StampedMessage]:
-        """Return the messages that were pending back, after a reconnect."""
+        """Return the messages that were held back, after a reconnect."""
 
     def finish(self) -> Iterator[StampedMessage]:
-        """Return the messages that were pending back, at the end."""
+        """Return the messages that were held back, at the end."""
 
     def count(self, totals: CaptureStatistics) -> None:
         """Write the counts into ``totals``."""
@@ -209,7 +209,8 @@ class SerialIntake:
         """
         self._opened = opened
         yield from self._records(self._restart_decoder)
-        self._streams.restart()  # after what was pending back, which is of the time before
+        # After what was held back, which was received before the reconnect.
+        self._streams.restart()
 
     def _restart_decoder(self) -> list[Batch]:
         if self._decoder is not None:
@@ -226,7 +227,7 @@ class SerialIntake:
         self._offset = offset
 
     def finish(self) -> Iterator[StampedMessage]:
-        """Return the records that the decoder pending back."""
+        """Return the records that the decoder held back."""
         yield from self._records(self._settle)
         if self._decoder is not None:
             yield from self._records(self._decoder.finish)

@@ -79,7 +79,7 @@ MAX_SAMPLE = 1 << 60
 """Largest number of a sample."""
 
 EXPORT_BATCH_EDGES = 1 << 17
-"""EdgeSegment of an export that are read at once."""
+"""Edges of an export that are read at once."""
 
 MAX_EXPORT_S = 1e6
 """Largest time of an export, at which float64 still resolves 0.1 ns."""

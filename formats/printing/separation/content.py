@@ -206,7 +206,7 @@ class BlackRemover:
         Parameters
         ----------
         stream : Stream
-        outer : Scope, optional
+        outer : ResourceScope, optional
             Resources of the content that paints it, for forms without resources.
         starts : bool
             True if no colour was set before, so that it starts with black.
