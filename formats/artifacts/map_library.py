@@ -80,9 +80,8 @@ def crop_map(options: DesignOptions) -> FloorMap | None:
         The options are invalid.
     """
     blank = empty_floor(options)
-    random = np.random.RandomState(
-        options.seed % 2**32
-    )  # its sequence is the same in all versions of numpy
+    # The sequence of a RandomState is the same in all versions of numpy.
+    random = np.random.RandomState(options.seed % 2**32)
     size = (options.rows, options.columns)
     for entry in entries():
         if (entry.alphabet, entry.window) != (options.alphabet, options.window):

@@ -146,10 +146,8 @@ class Recorder:
             if not self._receiver.stop():
                 self._report("the driver of the port hangs: bytes in its buffer are not recorded")
             self._write_remaining()
-        except (
-            LocatkError,
-            OSError,
-        ) as error:  # Errors of the disk; those of the port are events of the reader.
+        # Errors of the disk; those of the port are events of the reader.
+        except (LocatkError, OSError) as error:
             self._receiver.stop()
             ended, failed = self._disk_error(error), True
         except BaseException as error:
@@ -319,9 +317,8 @@ class Recorder:
         return "" if free is None else self._check_disk(free)
 
     def _check_silence(self) -> None:
-        last_data_ns = max(
-            self._last_data_ns, self._receiver.last_data_ns
-        )  # Newer data may wait to be written.
+        # Newer data may wait to be written.
+        last_data_ns = max(self._last_data_ns, self._receiver.last_data_ns)
         silent_s = (self._clock.now() - last_data_ns) * 1e-9
         if (
             self._disconnected_ns is None

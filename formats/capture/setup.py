@@ -130,9 +130,8 @@ def _artifacts(request: CaptureRequest) -> dict[str, str]:
     """Return the attachments: those of a replayed session, and those given."""
     replayed: dict[str, str] = {}
     for path in _replayed_paths(request.port):
-        with contextlib.suppress(
-            LocatkError
-        ):  # Not a session, or without artifacts: opening the port reports it.
+        # Not a session, or one without artifacts: opening the port reports it.
+        with contextlib.suppress(LocatkError):
             replayed |= artifacts.attachments([path])
     return {**replayed, **artifacts.attachments(request.artifacts)}
 
@@ -210,11 +209,10 @@ def _intake(request: CaptureRequest, content: Mapping[str, str]) -> Intake:
 
 def _port(request: CaptureRequest, clock: HostClock) -> Port:
     if request.is_camera:
-        from locatk.formats.capture import (
-            camera,
-        )  # OpenCV is slow to import, and not needed for bytes.
+        # OpenCV is slow to import, and not needed for bytes.
+        from locatk.formats.capture.camera import camera_port
 
-        return camera.port_of(
+        return camera_port(
             request.port.removeprefix(CAMERA),
             clock=clock.now,
             speed=request.speed,
