@@ -63,7 +63,9 @@ class EmulationPlan:
 
 @dataclass
 class EmulationCounts:
-    """Counts of bytes; ``made`` is the sum of ``sent``, ``dropped``, ``unheard`` and ``overrun``.
+    """Counts of the bytes that an emulated device sent, and of those that were lost.
+
+    Each byte is counted once: ``made`` = ``sent`` + ``dropped`` + ``unheard`` + ``overrun``.
 
     Attributes
     ----------
