@@ -100,7 +100,7 @@ class PortReader:
         self.high_water = 0
         self.pauses = 0
         """How often reading stopped because too much was waiting."""
-        self._thread = threading.Thread(target=self._run, name="locatk-receiver", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="locatk-reader", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
