@@ -100,7 +100,7 @@ def command(
     from locatk.core.dots.calibration.printer import calibrate
     from locatk.formats.artifacts import printer as files
     from locatk.formats.artifacts.sheets import read_manifest, write_manifest
-    from locatk.formats.printing.scans import read_scan
+    from locatk.formats.scans import read_scan
 
     if (measured_x is None) != (measured_y is None):
         raise click.UsageError("Give both --measured-x and --measured-y.")

@@ -61,7 +61,7 @@ FORMATS = {
     ),
     "dotbot-log": Format(IMPORTERS + "dotbot.log:read_dotbot_log", lighthouse.import_sweeps),
     "crazyflie-config": Format(
-        "locatk.formats.exporters.crazyflie:read_config",
+        IMPORTERS + "crazyflie:read_config",
         lighthouse.import_scene,
         takes_one_path=True,
     ),

@@ -58,56 +58,23 @@ def command(file: Path, as_json: bool) -> None:
 
 def _artifact(file: Path) -> dict[str, Any]:
     """Read and describe an artifact."""
-    from locatk.formats.artifacts import maps, sheets, tags
-    from locatk.formats.artifacts import receiver as receivers
-    from locatk.formats.artifacts import scene as artifacts
-    from locatk.formats.artifacts.schema import read_format
+    from locatk.formats.artifacts.registry import identify_artifact
     from locatk.formats.sessions import description as describe
     from locatk.formats.sessions import lighthouse_description
 
-    kinds: dict[str, Callable[[], dict[str, Any]]] = {
-        artifacts.SCENE_FORMAT: lambda: {
-            "kind": "scene",
-            "system": "lighthouse",
-            **lighthouse_description.scene(artifacts.read_scene(file)),
-        },
-        sheets.MANIFEST_FORMAT: lambda: {
-            "kind": "manifest",
-            "system": "dots",
-            **describe.manifest(sheets.read_manifest(file)),
-        },
-        sheets.CAMERA_FORMAT: lambda: {
-            "kind": "camera",
-            "system": "dots",
-            "camera": describe.camera(sheets.read_camera(file)),
-        },
-        tags.TAG_FORMAT: lambda: {
-            "kind": "tag",
-            "system": "polaris",
-            **describe.tags(tags.read_tags(file)),
-        },
-        tags.ARRAY_FORMAT: lambda: {
-            "kind": "array",
-            "system": "polaris",
-            "arrays": [describe.array(tags.read_array(file))],
-        },
-        maps.MAP_FORMAT: lambda: {
-            "kind": "map",
-            "system": "landmarks",
-            **describe.floor(maps.read_map(file)),
-        },
-        maps.HALLS_FORMAT: lambda: {
-            "kind": "halls",
-            "system": "landmarks",
-            "halls": [describe.hall_sensors(maps.read_halls(file))],
-        },
-        receivers.RECEIVER_FORMAT: lambda: {
-            "kind": "receiver",
-            "system": "lighthouse",
-            "receivers": [lighthouse_description.receiver(receivers.read_receiver(file))],
-        },
+    descriptions: dict[str, Callable[[Any], dict[str, Any]]] = {
+        "scene": lighthouse_description.scene,
+        "receiver": lambda receiver: {"receivers": [lighthouse_description.receiver(receiver)]},
+        "manifest": describe.manifest,
+        "camera": lambda camera: {"camera": describe.camera(camera)},
+        "tag": describe.tags,
+        "array": lambda array: {"arrays": [describe.array(array)]},
+        "map": describe.floor,
+        "halls": lambda halls: {"halls": [describe.hall_sensors(halls)]},
     }
-    return kinds[read_format(file, tuple(kinds))]()
+    entry = identify_artifact(file)
+    facts = descriptions[entry.kind](entry.artifact.read(file))
+    return {"kind": entry.kind, "system": entry.system, **facts}
 
 
 def _recording(file: Path) -> dict[str, Any]:

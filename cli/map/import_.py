@@ -95,9 +95,9 @@ def command(
     text = read_text(source)
     pitch = None if pitch_mm is None else metres(pitch_mm)
     if format_name == "csv":
-        from locatk.formats.exporters.map_csv import loads_csv as loads
+        from locatk.formats.importers.map_csv import loads_csv as loads
     else:
-        from locatk.formats.exporters.map_lif import loads_lif as loads
+        from locatk.formats.importers.map_lif import loads_lif as loads
     floor = loads(text, file=source, pitch_m=pitch, tolerance_m=metres(tolerance_mm))
     if like is not None:
         design = read_map(like)

@@ -25,7 +25,8 @@ from locatk.formats.capture.reader_thread import (
     SourceEnded,
 )
 from locatk.formats.capture.recording_files import CHUNK_BYTES, RecordingFiles
-from locatk.formats.capture.statistics import CaptureStatistics, CaptureStatus, RecordingResult
+from locatk.formats.capture.status import CaptureStatus, RecordingResult
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
 
 WRITE_INTERVAL_S = 0.02
 """Interval between batches of received data; a message of a stream covers about so much time."""

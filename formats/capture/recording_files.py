@@ -23,9 +23,8 @@ from google.protobuf.message import Message
 
 from locatk.core.errors import LocatkError, OutputExistsError
 from locatk.formats.capture.ingestion import StampedMessage
-from locatk.formats.capture.statistics import RECORD
 from locatk.formats.output import check_output
-from locatk.formats.sessions.mcap_file import SESSION_RECORD
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, SESSION_RECORD
 from locatk.formats.sessions.messages import timestamp
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -119,7 +118,7 @@ class RecordingFiles:
             facts["part"] = str(number)
         if number > 1:
             facts["started_ns"] = str(self._last_ns)
-        self._writer.metadata(RECORD, facts)
+        self._writer.metadata(CAPTURE_RECORD, facts)
         for name, text in self._artifacts.items():
             self._writer.attach_toml(name, text)
         for topic, message_class in self._content.declared:
@@ -203,7 +202,7 @@ class RecordingFiles:
             return
         self._is_open = False
         try:
-            self._writer.metadata(RECORD, facts)
+            self._writer.metadata(CAPTURE_RECORD, facts)
             self._writer.__exit__(None, None, None)
         finally:
             self._finished_bytes += self.file.tell()

@@ -26,7 +26,7 @@ from locatk.formats.capture.recording_files import (
     RecordingFiles,
     check_outputs,
 )
-from locatk.formats.capture.statistics import CaptureStatus, RecordingResult
+from locatk.formats.capture.status import CaptureStatus, RecordingResult
 from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Options
 

@@ -11,11 +11,11 @@ from math import radians
 from google.protobuf.message import DecodeError
 
 from locatk.core.errors import FormatError, InputError, error_context
-from locatk.formats.capture.statistics import RECORD
 from locatk.formats.devices import Device, find_device
 from locatk.formats.devices.decoder import Recording
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import field_samples, observations
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.observations import (
     read_halls,
     read_magnetometers,
@@ -63,7 +63,7 @@ def select_source(session: Session, name: str | None = None) -> ByteSource:
     FormatError
         A stream of the session is damaged.
     """
-    recorded_by = session.metadata().get(RECORD, {}).get("device") or None
+    recorded_by = session.metadata().get(CAPTURE_RECORD, {}).get("device") or None
     wanted = name or recorded_by or _default_device(session)
     device = find_device(wanted)
     topics = session.topics("/", SerialChunk.DESCRIPTOR.full_name)
