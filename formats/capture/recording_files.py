@@ -95,7 +95,7 @@ class RecordingFiles:
         self._last_ns = 0
         self.paths: list[Path] = []
         self._is_open = False
-        # Remaining parts of an older recording would look like parts of this one.
+        # Parts of an older, longer recording would look like parts of this one.
         if numbered and overwrite:
             old_parts = parts_of(path)
             for old in old_parts:
