@@ -39,7 +39,7 @@ MISREAD_FRACTION = 0.05
 WALK_LANDMARKS = 8
 
 START_STRIDE = 1
-"""Every how many starts one is measured."""
+"""Step between measured starts, in the list of all starts of a floor."""
 
 MAX_LISTED_WALKS = 10
 
