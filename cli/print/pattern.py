@@ -275,7 +275,7 @@ def pattern(
         files = _files(output, format_name, manifest)
         for path in files:
             options.guard_output(path, overwrite=overwrite, inputs=inputs)
-        with console.steps(job.steps(manifest, overlay), "Drawing") as done:
+        with console.steps(job.count_steps(manifest, overlay), "Drawing") as done:
             drawn = job.draw(
                 manifest,
                 format_name,

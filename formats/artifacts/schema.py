@@ -69,7 +69,7 @@ REQUIRED: Any = object()
 MAX_FORMAT_VERSION = 10**6
 
 
-# ---- kinds
+# ---- kinds that need numpy or the TOML writer, which the module ``kinds`` must not import
 
 
 @dataclass(frozen=True)

@@ -95,9 +95,8 @@ class RecordingFiles:
         self._last_ns = 0
         self.paths: list[Path] = []
         self._is_open = False
-        if (
-            numbered and overwrite
-        ):  # Remaining parts of an older recording would look like parts of this one.
+        # Parts of an older, longer recording would look like parts of this one.
+        if numbered and overwrite:
             old_parts = parts_of(path)
             for old in old_parts:
                 check_idle(old)
@@ -164,9 +163,8 @@ class RecordingFiles:
             self._writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
             self._last_ns = max(self._last_ns, each.time_ns)
             self._pending += each.message.ByteSize()
-            if (
-                self._pending >= CHUNK_BYTES
-            ):  # Before the MCAP writer does, which allocates no space.
+            # Flush before the MCAP writer does, which allocates no space.
+            if self._pending >= CHUNK_BYTES:
                 self.flush()
 
     def log(self, text: str, time_ns: int, *, level: int = Log.WARNING) -> None:

@@ -169,7 +169,8 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
     for topic, time_ns, payload in session.messages([*intakes, "/log"]):
         if topic == "/log":
             line = Log.FromString(payload)
-            if line.name.startswith("locatk"):  # not of a device: those are decoded is_reconnect
+            # Log messages of a device are decoded again; only those of the recorder are copied.
+            if line.name.startswith("locatk"):
                 yield from _decode_waiting(intakes, waiting)
                 yield StampedMessage("/log", line, time_ns, time_ns)
             continue

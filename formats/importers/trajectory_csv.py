@@ -49,7 +49,7 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     ----------
     path : path
         Columns ``qx`` to ``qw`` and the sigmas may be missing (all four of a kind); further
-        columns are ignored.
+        columns are ignored. A sigma that is empty or ``nan`` is unknown.
     frame : str
         Name of the frame, which is not part of the file.
 

@@ -479,7 +479,7 @@ def test_steps_are_counted() -> None:
     )
     calls: list[None] = []
     pattern.render(two, done=lambda: calls.append(None))
-    assert len(calls) == rasters.bands(two) == 6
+    assert len(calls) == rasters.count_bands(two) == 6
 
 
 @pytest.mark.slow
