@@ -72,8 +72,8 @@ def report(error: BaseException) -> int:
         _print_error(str(error), error.hint or system_hint(error))
         return error.exit_status
     if isinstance(error, OSError) and error.errno is not None:
-        file = f" in {os.fsdecode(error.filename)}" if error.filename else ""
-        _print_error(os.strerror(error.errno) + file, system_hint(error))
+        file = f"{os.fsdecode(error.filename)}: " if error.filename else ""
+        _print_error(file + os.strerror(error.errno), system_hint(error))
         return 1
     if isinstance(error, MemoryError):
         _print_error("not enough memory", "Solve shorter sessions, or fewer at a time")

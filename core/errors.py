@@ -55,12 +55,11 @@ class LocatkError(Exception):
         super().__init__(message)
 
     def __str__(self) -> str:
-        text = self.message
-        if self.file is not None:
-            text += f" in {self.file}"
-            if self.where is not None:
-                text += f":{self.where}"
-        return text
+        """Return file, position and message, as in ``run.csv:17: column 'x' is missing``."""
+        if self.file is None:
+            return self.message
+        position = "" if self.where is None else f":{self.where}"
+        return f"{self.file}{position}: {self.message}"
 
 
 class InputError(LocatkError, ValueError):
