@@ -16,20 +16,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from locatk.formats.artifacts import registry
 from locatk.formats.artifacts.kinds import NO_UNIT, Boolean
 from locatk.formats.artifacts.ledger import LEDGER
-from locatk.formats.artifacts.maps import HALLS, MAP
-from locatk.formats.artifacts.receiver import RECEIVER
-from locatk.formats.artifacts.scene import SCENE
 from locatk.formats.artifacts.schema import HEADER, REQUIRED, Artifact, Key, Table, Tables, Variant
-from locatk.formats.artifacts.sheets import CAMERA, MANIFEST
-from locatk.formats.artifacts.tags import ARRAY, TAGS
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "formats.md"
 
-ARTIFACTS: tuple[Artifact[Any], ...] = (
-    SCENE, RECEIVER, MANIFEST, CAMERA, TAGS, ARRAY, MAP, HALLS, LEDGER,
-)  # fmt: skip
+ARTIFACTS = (*(entry.artifact for entry in registry.ARTIFACTS.values()), LEDGER)
 
 COLUMNS = "| key | value | default | meaning |\n|---|---|---|---|\n"
 

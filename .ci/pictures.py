@@ -1,16 +1,16 @@
-"""Remake the pictures of the first-hour guides from the commands that stand on their pages.
+"""Remake the pictures of the documentation from the outputs of commands.
 
-The ``sh`` blocks of a page run in order in a temporary folder, as a reader would run them; what
-they wrote is brought to the size of a page. ``locatk`` must be on the PATH, with ``locatk[test]``
-(for pypdfium2); pages of HTML need Chromium.
+The ``sh`` blocks of a first-hour guide run in order in a temporary folder; other pictures are made
+by :data:`COMMANDS`. The outputs are cropped and scaled. ``locatk`` must be on the PATH, with
+``locatk[test]`` (for pypdfium2); HTML needs Chromium.
 
 Examples
 --------
 ::
 
-    python .ci/pictures.py                # every guide
+    python .ci/pictures.py                # all pictures
     python .ci/pictures.py polaris dots
-    python .ci/pictures.py dots --keep /tmp/here   # and leave what the commands wrote
+    python .ci/pictures.py dots --keep /tmp/here   # keep the outputs of the commands
 """
 
 from __future__ import annotations
@@ -31,30 +31,33 @@ from PIL import Image
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
-LARGEST_BYTES = 150_000
+MAX_PICTURE_BYTES = 150_000
+"""Largest file that is accepted into the repository."""
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+"""Names of the browser; the first one on the PATH is used."""
 
-LIMIT_S = 60.0
+TIMEOUT_S = 60.0
+"""Time limit of the browser, and of `locatk emulate` until its port exists."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of a guide.
+    """Picture of the documentation.
 
     Attributes
     ----------
     name : str
-        ``docs/images/first-hour-<name>.png``.
+        Name in ``docs/images``, without ``.png``.
     source : str
-        What the commands wrote: PNG, PDF or HTML.
+        Output of the commands: PNG, PDF or HTML.
     width : int
-        In pixels; smaller sources are not made larger.
+        Width in pixels; smaller sources are not enlarged.
     page : int
-        Of a PDF, from 0.
+        Page of a PDF, from 0.
     box : tuple of float
-        The part to show, from the upper left corner: left, top, right, bottom as shares of the
-        source. Of HTML, of a window of 1100 x 1600 px.
+        Visible part: left, top, right, bottom as fractions of the source, from the upper left
+        corner. The source of HTML is a window of 1100 x 1600 px.
     """
 
     name: str
@@ -66,33 +69,54 @@ class Picture:
 
 PICTURES = {
     "lighthouse": (
-        Picture("lighthouse", "report.png"),
-        Picture("lighthouse-report", "report.html", 800),
+        Picture("first-hour-lighthouse", "report.png"),
+        Picture("first-hour-lighthouse-report", "report.html", 800),
     ),
     "polaris": (
-        Picture("polaris", "report.png"),
-        Picture("polaris-tag", "tags.pdf", 480, box=(0.2, 0.06, 0.82, 0.475)),
-        Picture("polaris-report", "report.html", 800),
+        Picture("first-hour-polaris", "report.png"),
+        Picture("first-hour-polaris-tag", "tags.pdf", 480, box=(0.2, 0.06, 0.82, 0.475)),
+        Picture("first-hour-polaris-report", "report.html", 800),
     ),
     "dots": (
-        Picture("dots", "report.png"),
-        Picture("dots-sheet", "floor.pdf", 640, box=(0.0, 0.935, 0.14, 0.99)),
-        Picture("dots-report", "report.html", 800),
+        Picture("first-hour-dots", "report.png"),
+        Picture("first-hour-dots-sheet", "floor.pdf", 640, box=(0.0, 0.935, 0.14, 0.99)),
+        Picture("first-hour-dots-report", "report.html", 800),
     ),
     "landmarks": (
-        Picture("landmarks", "report.png"),
-        Picture("landmarks-plan", "pack.pdf", 560, box=(0.03, 0.02, 1.0, 0.59)),
-        Picture("landmarks-template", "pack.pdf", 480, page=2, box=(0.04, 0.02, 1.0, 0.74)),
-        Picture("landmarks-report", "report.html", 800),
+        Picture("first-hour-landmarks", "report.png"),
+        Picture("first-hour-landmarks-plan", "pack.pdf", 560, box=(0.03, 0.02, 1.0, 0.59)),
+        Picture(
+            "first-hour-landmarks-template", "pack.pdf", 480, page=2, box=(0.04, 0.02, 1.0, 0.74)
+        ),
+        Picture("first-hour-landmarks-report", "report.html", 800),
+    ),
+    "demo": (Picture("demo", "demo/lighthouse.png", 1200),),
+    "floor": (
+        Picture("landmarks", "report.png", 1200),
+        Picture("landmarks-plan", "pack.pdf", 655, box=(0.0, 0.0, 1.0, 0.53)),
+        Picture("landmarks-template", "pack.pdf", 655, page=7, box=(0.04, 0.02, 1.0, 0.77)),
     ),
 }
+"""Pictures of each guide, and of each entry of :data:`COMMANDS`."""
+
+COMMANDS = {
+    "demo": ("locatk demo lighthouse --keep demo",),
+    "floor": (
+        "locatk map design 8x12 --name lab -o map.toml",
+        "locatk print landmarks map.toml -o pack.pdf",
+        "locatk simulate landmarks map.toml -o run.mcap",
+        "locatk solve run.mcap -o solved.mcap",
+        "locatk report solved.mcap -o report.html --png",
+    ),
+}
+"""Commands of pictures that are not from a guide."""
 
 
-# ---- the commands of a page
+# ---- commands
 
 
-def run(page: Path, folder: Path) -> None:
-    """All ``sh`` blocks of ``page`` in ``folder``; ``locatk emulate`` runs beside the others.
+def run_guide(page: Path, folder: Path) -> None:
+    """Run all ``sh`` blocks of ``page`` in ``folder``, with ``locatk emulate`` in the background.
 
     Raises
     ------
@@ -109,26 +133,37 @@ def run(page: Path, folder: Path) -> None:
             if language != "sh":
                 continue
             if body.startswith("locatk emulate "):
-                stack.enter_context(beside(body, folder))
+                stack.enter_context(running(body, folder))
                 continue
             for line in body.replace("\\\n", " ").splitlines():
-                print(f"  {line}")
-                done = subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True)
-                if done.returncode not in (0, 3):
-                    raise SystemExit(f"{page.name}: {line}\n{done.stderr.decode()}")
+                run(line, folder)
+
+
+def run(line: str, folder: Path) -> None:
+    """Run a command in ``folder``.
+
+    Raises
+    ------
+    SystemExit
+        It ended with another status than 0 and 3.
+    """
+    print(f"  {line}")
+    process = subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True)
+    if process.returncode not in (0, 3):
+        raise SystemExit(f"{line}\n{process.stderr.decode()}")
 
 
 @contextmanager
-def beside(line: str, folder: Path) -> Iterator[None]:
-    """The other terminal: ``line`` runs until the page is over."""
-    print(f"  {line.strip()}  # beside the others")
+def running(line: str, folder: Path) -> Iterator[None]:
+    """Run ``locatk emulate`` in the background until the context ends."""
+    print(f"  {line.strip()} &")
     process = subprocess.Popen(
         line.split(), cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     link = folder / re.search(r"--link (\S+)", line)[1]  # type: ignore[index]
     try:
-        give_up = time.monotonic() + LIMIT_S
-        while not link.is_symlink() and process.poll() is None and time.monotonic() < give_up:
+        deadline = time.monotonic() + TIMEOUT_S
+        while not link.is_symlink() and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.05)
         yield
     finally:
@@ -140,12 +175,12 @@ def beside(line: str, folder: Path) -> Iterator[None]:
 
 
 def read(picture: Picture, folder: Path) -> Image.Image:
-    """What the commands wrote, as pixels at least as wide as the picture."""
+    """Read the visible part of an output, at least as wide as the picture."""
     source = folder / picture.source
     left, top, right, bottom = picture.box
     if source.suffix == ".pdf":
         page = pypdfium2.PdfDocument(source)[picture.page]
-        # Twice as fine as needed: hair lines stay visible when it is made smaller.
+        # Twice the final resolution, so that thin lines remain visible after the reduction.
         scale = 2 * picture.width / (page.get_width() * (right - left))
         image = page.render(scale=scale).to_pil()
     else:
@@ -157,7 +192,7 @@ def read(picture: Picture, folder: Path) -> Image.Image:
 
 
 def screenshot(source: Path, target: Path) -> Path:
-    """A page of HTML as a browser shows it."""
+    """Write the picture of an HTML page in a browser."""
     browser = next(filter(None, map(shutil.which, CHROMIUM)), None)
     if browser is None:
         raise SystemExit(f"No browser for {source.name}. Hint: apt-get install chromium.")
@@ -167,45 +202,49 @@ def screenshot(source: Path, target: Path) -> Path:
         + [f"--screenshot={target}", source.resolve().as_uri()],
         check=True,
         capture_output=True,
-        timeout=LIMIT_S,
+        timeout=TIMEOUT_S,
     )
     return target
 
 
 def write(image: Image.Image, path: Path, width: int) -> None:
-    """As PNG of ``width`` and few colours.
+    """Write a PNG of at most ``width`` pixels with 128 colours.
 
     Raises
     ------
     SystemExit
-        It has more than 150 kB.
+        The file is larger than :data:`MAX_PICTURE_BYTES`.
     """
     if image.width > width:
         high = round(image.height * width / image.width)
         image = image.resize((width, high), Image.Resampling.LANCZOS)
-    few = image.quantize(128, dither=Image.Dither.NONE)
-    few.save(path, optimize=True)
+    reduced = image.quantize(128, dither=Image.Dither.NONE)
+    reduced.save(path, optimize=True)
     size = path.stat().st_size
     print(f"  {path.name}: {image.width} x {image.height} px, {size / 1e3:.0f} kB")
-    if size > LARGEST_BYTES:
-        raise SystemExit(f"{path} has more than {LARGEST_BYTES} bytes")
+    if size > MAX_PICTURE_BYTES:
+        raise SystemExit(f"{path} has more than {MAX_PICTURE_BYTES} bytes")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("system", nargs="*", help=f"{', '.join(PICTURES)}; all, unless told")
-    parser.add_argument("--keep", type=Path, help="a new folder for what the commands write")
+    parser.add_argument("source", nargs="*", help=f"{', '.join(PICTURES)}  [default: all]")
+    parser.add_argument("--keep", type=Path, help="new folder for the outputs of the commands")
     options = parser.parse_args()
-    if unknown := set(options.system) - set(PICTURES):
-        parser.error(f"no guide of {', '.join(sorted(unknown))}")
-    for system in options.system or PICTURES:
-        print(system)
+    if unknown := set(options.source) - set(PICTURES):
+        parser.error(f"no pictures of {', '.join(sorted(unknown))}")
+    for source in options.source or PICTURES:
+        print(source)
         with tempfile.TemporaryDirectory() as temporary:
-            folder = (options.keep or Path(temporary)) / system
+            folder = (options.keep or Path(temporary)) / source
             folder.mkdir(parents=True)
-            run(DOCS / f"first-hour-{system}.md", folder)
-            for picture in PICTURES[system]:
-                path = DOCS / "images" / f"first-hour-{picture.name}.png"
+            if source in COMMANDS:
+                for line in COMMANDS[source]:
+                    run(line, folder)
+            else:
+                run_guide(DOCS / f"first-hour-{source}.md", folder)
+            for picture in PICTURES[source]:
+                path = DOCS / "images" / f"{picture.name}.png"
                 write(read(picture, folder), path, picture.width)
 
 

@@ -21,21 +21,21 @@ from locatk.cli.lazy import LazyGroup
 COMMANDS = {
     "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),
     "map": ("locatk.cli.map", "Design floors of landmarks, check and exchange them."),
-    "print": ("locatk.cli.print", "Draw sheets at true size."),
+    "print": ("locatk.cli.print", "Draw dot sheets and templates at true size."),
     "capture": (
         "locatk.cli.capture.command",
-        "Record a device from a port, or a camera, into a session.",
+        "Record a serial device or a camera into a session.",
     ),
-    "emulate": ("locatk.cli.emulate", "Simulate a device on a pseudo-terminal, without hardware."),
-    "import": ("locatk.cli.import_.command", "Turn recordings of other tools into a session."),
-    "simulate": ("locatk.cli.simulate", "Simulate a session with known truth."),
+    "emulate": ("locatk.cli.emulate", "Emulate a serial device on a pseudo-terminal."),
+    "import": ("locatk.cli.import_.command", "Import recordings of other tools as a session."),
+    "simulate": ("locatk.cli.simulate", "Simulate a session with ground truth."),
     "decode": ("locatk.cli.decode", "Decode the raw bytes of a recording again."),
     "recover": ("locatk.cli.recover", "Salvage a damaged recording."),
     "info": ("locatk.cli.info.command", "Describe a session, a solution or an artifact."),
     "calibrate": ("locatk.cli.calibrate", "Calibrate an artifact from recordings."),
-    "solve": ("locatk.cli.solve.command", "Solve recorded sessions into poses."),
-    "eval": ("locatk.cli.eval.command", "Compare poses with the truth."),
-    "report": ("locatk.cli.report", "Show solutions on one HTML page."),
+    "solve": ("locatk.cli.solve.command", "Estimate poses from recorded sessions."),
+    "eval": ("locatk.cli.eval.command", "Compare poses with ground truth."),
+    "report": ("locatk.cli.report", "Write an HTML page about solutions."),
     "export": ("locatk.cli.export", "Write poses for other tools."),
     "demo": ("locatk.cli.demo.command", "Simulate, solve and evaluate, without hardware."),
     "bench": ("locatk.cli.bench", "Measure accuracy and speed against targets."),
@@ -92,7 +92,7 @@ def _show_version(ctx: click.Context, param: click.Parameter, value: bool) -> No
 def app() -> None:
     """Localization without satellites, motion capture or expensive sensors.
 
-    Record or simulate a session, solve it into poses, and compare them with the truth.
+    Record or simulate a session, estimate poses from it, and compare them with ground truth.
 
     \b
     Examples:

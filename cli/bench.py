@@ -41,6 +41,14 @@ TABLE_WIDTH = 80
 def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
     """Measure the figures of SYSTEM and print them beside their targets.
 
+    \b
+    SYSTEM is one of
+      lighthouse, dots, polaris, landmarks
+                  accuracy and speed of a system
+      infrared    sweeps and factory data from raw infrared light
+      capture     recording from ports, recovery of damaged files, decoding speed
+      look        eval compared with evo, reports, demo and batches
+
     Targets of durations are scaled by the machine factor: the duration of a fixed workload on this
     machine, measured with each figure, over that on the reference machine. A figure whose data
     are missing is listed without a value; --full gives the reason.
@@ -67,11 +75,11 @@ def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
         console.emit_json(
             {"system": system, "commit": _commit(), "figures": [_entry(f) for f in figures]}
         )
-    elif full:
-        header = ("figure", "value", "target", "unit", "met", "machine", "peer", "peer's", "how")
-        console.result(console.table(header, [_full_row(figure) for figure in figures]))
-    else:
-        console.result(_narrow_table([_row(figure) for figure in figures]))
+        return
+    console.result(_narrow_table([_row(figure) for figure in figures]))
+    if full:
+        for figure in figures:
+            console.result(f"\n{console.wrapped(figure.name)}\n{_details(figure)}")
 
 
 def _entry(figure: Any) -> dict[str, Any]:
@@ -104,15 +112,15 @@ def _row(figure: Any) -> tuple[str, ...]:
     )
 
 
-def _full_row(figure: Any) -> tuple[str, ...]:
-    factor = figure.machine_factor
-    return (
-        *_row(figure),
-        "-" if factor is None else f"{figure.workload} {factor:.2f}",
-        figure.peer or "-",
-        _number(figure.peer_value),
-        figure.how,
-    )
+def _details(figure: Any) -> str:
+    """Format machine factor, peer and method of a figure."""
+    rows = []
+    if figure.machine_factor is not None:
+        rows.append(("machine factor:", f"{figure.workload} {figure.machine_factor:.2f}"))
+    if figure.peer:
+        rows.append(("peer:", f"{_number(figure.peer_value)} {figure.unit} ({figure.peer})"))
+    rows.append(("method:", figure.how))
+    return console.labelled(rows, indent=2)
 
 
 def _narrow_table(rows: list[tuple[str, ...]]) -> str:

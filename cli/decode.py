@@ -9,23 +9,23 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.capture.options import columns_option
+from locatk.cli.command import Command
 
 
-@click.command(short_help="Decode the raw bytes of a recording again.")
+@click.command(cls=Command, short_help="Decode the raw bytes of a recording again.")
 @options.input_argument("recording")
 @click.option(
     "--device",
     metavar="NAME",
-    help="Device that sent the bytes, as in `locatk capture`; auto identifies it.  [default: that "
-    "of the recording]",
+    help="Device that sent the bytes, as in `locatk capture`; auto identifies it.  "
+    "[default: that of the recording]",
 )
 @options.output("Session to write (.mcap).")
 @options.input_option(
     "--artifact",
     many=True,
-    metavar="FILE",
-    help="Artifact (.toml), or session that contains some (.mcap), to attach; replaces attached "
-    "ones. Repeatable.",
+    help="Artifact to attach instead of those of the recording: a .toml file, or a session that "
+    "contains artifacts (.mcap). Repeatable.",
 )
 @columns_option
 @options.overwrite
@@ -40,10 +40,10 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write a session with the raw bytes of RECORDING, decoded again.
+    """Decode the raw bytes of RECORDING again, and write them as a session.
 
-    Use it if the recording was made with the wrong --device, if the decoder has improved,
-    or to attach an artifact. Times stay as recorded.
+    Use it if the recording was made with the wrong --device, if the decoder has improved, or to
+    attach an artifact. The recorded times are kept.
 
     The exit status is 3 if frames are bad or missing.
 
@@ -51,7 +51,7 @@ def command(
     Examples:
       locatk decode run.mcap -o again.mcap
       locatk decode run.mcap --device lines --columns t_ms,x_m,y_m -o again.mcap
-      locatk decode run.mcap --artifact array.toml --artifact tag.toml -o again.mcap
+      locatk decode run.mcap --artifact tag.toml -o again.mcap
     """
     from locatk.formats.capture.attachments import attachments
     from locatk.formats.capture.redecoding import decode, losses

@@ -17,10 +17,9 @@ from locatk.core.errors import InputError, LocatkError, MissingDataError
 SYSTEMS = ("polaris", "landmarks", "lighthouse", "dots")
 
 FRACTION = click.FloatRange(0, 1)
-POSITIVE = click.FloatRange(0, min_open=True)
 
 
-@click.command(cls=Command, short_help="Simulate a device on a pseudo-terminal, without hardware.")
+@click.command(cls=Command, short_help="Emulate a serial device on a pseudo-terminal.")
 @click.argument("source", metavar="SESSION|SYSTEM")
 @section(
     "Basic",
@@ -28,7 +27,7 @@ POSITIVE = click.FloatRange(0, min_open=True)
         "--device",
         metavar="NAME",
         help="Device to emulate, as in `locatk capture`.  [default: the one that recorded the "
-        "session, or polaris-array, locatk, dotbot-gateway by its content]",
+        "session, otherwise by its content: polaris-array, locatk or dotbot-gateway]",
     ),
     click.option(
         "--link", type=options.PATH, metavar="PATH", help="Path of the port.  [default: a new path]"
@@ -37,12 +36,11 @@ POSITIVE = click.FloatRange(0, min_open=True)
         "--save",
         type=options.PATH,
         metavar="FILE",
-        help="Of a SYSTEM: write the simulated session to this file (.mcap), with artifacts and "
-        "truth.",
+        help="Also write the simulated session of SYSTEM (.mcap), with artifacts and truth.",
     ),
     options.overwrite,
     options.number(
-        "--seed", default=0, type=click.IntRange(0), help="Seed of faults and simulation."
+        "--seed", default=0, type=click.IntRange(0), metavar="N", help="Seed of all random numbers."
     ),
 )
 @section(
@@ -52,21 +50,21 @@ POSITIVE = click.FloatRange(0, min_open=True)
         default=1.0,
         type=click.FloatRange(0),
         metavar="N",
-        help="Factor on the recorded speed; 0 waits for the reader and loses nothing.",
+        help="Speed factor of the recorded timing; 0 waits for the reader and loses nothing.",
     ),
     click.option(
         "--rate",
-        type=POSITIVE,
+        type=options.POSITIVE,
         metavar="BYTES/S",
-        help="Constant rate instead of the recorded pace.",
+        help="Constant rate instead of the recorded timing.",
     ),
     options.number(
         "--loop",
         default=1,
         type=click.IntRange(0),
         metavar="N",
-        help="Number of repetitions; 0 endlessly. Times continue; counters and ticks in the "
-        "bytes restart.",
+        help="Number of repetitions; 0 repeats endlessly. Times continue; counters and ticks "
+        "in the bytes restart.",
     ),
     click.option("--no-wait", is_flag=True, help="Start before the port is opened."),
 )
@@ -81,19 +79,19 @@ POSITIVE = click.FloatRange(0, min_open=True)
     click.option(
         "--unplug-every",
         "unplug_every_s",
-        type=POSITIVE,
+        type=options.POSITIVE,
         metavar="SECONDS",
-        help="Unplug the device repeatedly, each time after this time.",
+        help="Unplug the device at this interval.",
     ),
     click.option(
         "--away",
         "away_s",
-        type=POSITIVE,
+        type=options.POSITIVE,
         metavar="SECONDS",
-        help="Time for which it is unplugged.  [default: 1]",
+        help="Duration for which the device is unplugged.  [default: 1]",
     ),
 )
-@options.json_flag("Two lines of JSON")
+@options.json_flag("two lines of JSON")
 @options.verbosity
 def command(
     source: str,
@@ -104,7 +102,7 @@ def command(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Send the bytes of a device on a new port.
+    """Emulate a serial device: send its bytes on a new pseudo-terminal.
 
     The bytes are those of SESSION, or of a simulated session of SYSTEM: polaris,
     landmarks or lighthouse. The path of the port is printed; sending starts when a

@@ -45,7 +45,7 @@ STDOUT = Path("-")
         "devices",
         multiple=True,
         metavar="NAME",
-        help="Device to export; repeatable.  [default: all]",
+        help="Device to export. Repeatable.  [default: all]",
     ),
     click.option("--covariance", is_flag=True, help="ros2: also write poses with covariance."),
 )
@@ -60,9 +60,9 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write the poses of SOLUTION, or its Lighthouse stations, in the format of other tools.
+    """Write the poses of SOLUTION, or its Lighthouse stations, in a format of other tools.
 
-    SOLUTION is a solution of `locatk solve`, or a session with truth, which is then exported.
+    SOLUTION is a solution of `locatk solve`, or a session with truth, whose truth is then exported.
     For crazyflie-config it may also be a scene (scene.toml).
 
     \b

@@ -12,7 +12,6 @@ An interrupt gives 130, as in shells.
 
 from __future__ import annotations
 
-import errno
 import os
 import traceback
 from collections.abc import Sequence
@@ -20,25 +19,13 @@ from collections.abc import Sequence
 import click
 
 from locatk.cli import console
-from locatk.core.errors import LocatkError
+from locatk.core.errors import LocatkError, system_hint
 
 INTERRUPTED_STATUS = 130
 """Exit status of a command that Ctrl-C ended: 128 and the number of SIGINT (POSIX shells)."""
 
 REPORT_HINT = "Please report it, with the traceback from -v"
 """Hint of errors of the program."""
-
-_OS_HINTS = {
-    errno.EACCES: "Check the permissions of the file and of its folder",
-    errno.EPERM: "Check the permissions of the file and of its folder",
-    errno.EROFS: "Choose another -o: that file system is read-only",
-    errno.EISDIR: "Name a file, not a folder",
-    errno.ENOTDIR: "One part of the path is a file, not a folder",
-    errno.ENOENT: "Check the spelling of the path",
-    errno.ENOSPC: "Free some space or write to another disk",
-    errno.EDQUOT: "Free some space or write to another disk",
-    errno.ENAMETOOLONG: "Choose a shorter name",
-}
 
 
 class Incomplete(click.ClickException):
@@ -85,11 +72,11 @@ def report(error: BaseException) -> int:
     if console.verbose():
         click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
     if isinstance(error, LocatkError):
-        _print_error(str(error), error.hint)
+        _print_error(str(error), error.hint or system_hint(error))
         return error.exit_status
     if isinstance(error, OSError) and error.errno is not None:
-        file = f" in {os.fsdecode(error.filename)}" if error.filename else ""
-        _print_error(os.strerror(error.errno) + file, _OS_HINTS.get(error.errno))
+        file = f"{os.fsdecode(error.filename)}: " if error.filename else ""
+        _print_error(file + os.strerror(error.errno), system_hint(error))
         return 1
     if isinstance(error, MemoryError):
         _print_error("not enough memory", "Solve shorter sessions, or fewer at a time")
@@ -103,7 +90,7 @@ def report(error: BaseException) -> int:
 
 def describe(error: LocatkError) -> str:
     """Return an error with its hint, as one line without the leading ``Error:``."""
-    return _sentences(str(error), error.hint)
+    return _sentences(str(error), error.hint or system_hint(error))
 
 
 def _print_error(problem: str, hint: str | None) -> None:

@@ -16,6 +16,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
 
+POSITIVE = click.FloatRange(0, min_open=True)
+
 
 def _existing(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
     """Check that every given path exists."""
@@ -41,6 +43,7 @@ def input_argument(name: str, *, many: bool = False) -> Callable[[F], F]:
 
 def input_option(*names: str, help: str, many: bool = False, **more: Any) -> Callable[[F], F]:
     """Return an option that names an existing file; repeatable with ``many``."""
+    more.setdefault("metavar", "FILE")
     return click.option(*names, type=PATH, multiple=many, callback=_existing, help=help, **more)
 
 
@@ -62,23 +65,22 @@ def _json(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
 
 def json_flag(content: str) -> Callable[[F], F]:
     """Return the option ``--json`` of a command that prints ``content``."""
-    help = f"{content} on stdout instead of text."
+    help = f"Print {content} to stdout instead of text."
     return click.option("--json", "as_json", is_flag=True, help=help, callback=_json)
 
 
-as_json = json_flag("One JSON object")
+as_json = json_flag("one JSON object")
 
 method = click.option(
     "--method",
     type=click.Choice(("bundle", "field", "joint", "lattice", "paper")),
     default=None,
-    help="Algorithm: `paper` is the published one; the default is more accurate (`bundle` of "
-    "lighthouse, `joint` of polaris, `lattice` of dots, `field` of landmarks).",
+    help="Algorithm: `paper` is the published one; the default is more accurate (`bundle` for "
+    "lighthouse, `joint` for polaris, `lattice` for dots, `field` for landmarks).",
 )
 
 artifact = input_option(
     "--artifact",
-    metavar="FILE",
     help="Scene, tags, manifest or map (.toml) to use instead of the session's.",
 )
 
@@ -135,7 +137,7 @@ def guard_output(path: Path, *, overwrite: bool, inputs: Sequence[Path] = ()) ->
     check_output(path, overwrite=overwrite)
 
 
-def make_folder(path: Path) -> None:
+def make_folder(path: Path, option: str = "-o") -> None:
     """Create the folder for several outputs if it does not exist.
 
     Raises
@@ -145,7 +147,9 @@ def make_folder(path: Path) -> None:
     """
     if path.exists() and not path.is_dir():
         raise OutputExistsError(
-            "there are several outputs, but -o is a file", file=path, hint="Name a folder with -o"
+            f"there are several outputs, but {option} is a file",
+            file=path,
+            hint=f"Name a folder with {option}",
         )
     path.mkdir(parents=True, exist_ok=True)
 

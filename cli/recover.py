@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures, options
+from locatk.cli.command import Command
 from locatk.cli.info.capture import size
 from locatk.cli.info.text import when
 
@@ -15,7 +16,7 @@ MAX_LISTED_LOSSES = 20
 """Losses listed in the text output; ``--json`` contains all of them."""
 
 
-@click.command(short_help="Salvage a damaged recording.")
+@click.command(cls=Command, short_help="Salvage a damaged recording.")
 @options.input_argument("file")
 @options.output("Recording to write (.mcap).")
 @options.overwrite
@@ -24,13 +25,12 @@ MAX_LISTED_LOSSES = 20
 def command(file: Path, output: Path, overwrite: bool, as_json: bool) -> None:
     """Write the intact parts of FILE to OUTPUT, as a complete recording.
 
-    FILE (.mcap, of any tool) may be truncated (killed program), zeroed (power failure),
-    overwritten in parts or have flipped bits. Every intact chunk of messages is saved, with
-    the attachments and metadata that are left. Data with a wrong checksum are never used.
-    FILE itself is not changed.
+    FILE (.mcap, of any tool) may be truncated (killed program), zeroed (power failure), overwritten
+    in parts, or have flipped bits. Every intact chunk of messages is saved, with the remaining
+    attachments and metadata. Data with a wrong checksum are never used. FILE itself is not changed.
 
-    The exit status is 3 if data were lost, or may have been: a recording without an end does
-    not show what came last. It is 0 if only an index was damaged.
+    The exit status is 3 if data were lost, or may have been: if the end of a recording is missing,
+    the amount of lost data is unknown. It is 0 if only an index was damaged.
 
     \b
     Examples:

@@ -16,7 +16,7 @@ PAGE_SUFFIXES = (".html", ".htm")
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
-@click.command(cls=Command, short_help="Show solutions on one HTML page.")
+@click.command(cls=Command, short_help="Write an HTML page about solutions.")
 @options.input_argument("solutions", many=True)
 @options.output("Page (.html), or a picture only (.png, .pdf, .svg).")
 @options.overwrite
@@ -26,13 +26,11 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
         "--session",
         "sessions",
         many=True,
-        metavar="FILE",
-        help="Recording that was solved. Repeatable.  "
-        "[default: the session that the solution names, in its folder]",
+        help="Session that was solved. Repeatable.  "
+        "[default: the one that the solution names, in the same folder]",
     ),
     options.input_option(
         "--truth",
-        metavar="FILE",
         help="Reference poses: a session, a solution, TUM, KITTI or CSV.  "
         "[default: those of the session]",
     ),
@@ -44,9 +42,9 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
     click.option("--png", is_flag=True, help="Also write a picture of each solution: report.png."),
     click.option("--pdf", is_flag=True, help="Also write a picture as PDF."),
     click.option("--svg", is_flag=True, help="Also write a picture as SVG."),
-    options.as_json,
-    options.verbosity,
 )
+@options.as_json
+@options.verbosity
 def command(
     solutions: tuple[Path, ...],
     output: Path,
@@ -62,9 +60,9 @@ def command(
 ) -> None:
     """Show the quality of SOLUTIONS on one HTML page.
 
-    The page is one file that opens in any browser without a network. It contains a map of
-    the trajectories over the artifact, errors if there is truth, rejected observations with
-    reasons, covariances, the recorded signals, and facts of the run.
+    The page is one file that opens in any browser without a network connection. It contains a map
+    of the trajectories over the artifact, errors if there is truth, rejected observations with
+    reasons, covariances, the recorded signals, and properties of the run.
 
     \b
     Examples:

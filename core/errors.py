@@ -17,6 +17,7 @@ from which it also derives.
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -54,12 +55,11 @@ class LocatkError(Exception):
         super().__init__(message)
 
     def __str__(self) -> str:
-        text = self.message
-        if self.file is not None:
-            text += f" in {self.file}"
-            if self.where is not None:
-                text += f":{self.where}"
-        return text
+        """Return file, position and message, as in ``run.csv:17: column 'x' is missing``."""
+        if self.file is None:
+            return self.message
+        position = "" if self.where is None else f":{self.where}"
+        return f"{self.file}{position}: {self.message}"
 
 
 class InputError(LocatkError, ValueError):
@@ -84,6 +84,33 @@ class OutputExistsError(LocatkError, FileExistsError):
 
 class MissingDataError(LocatkError, FileNotFoundError):
     """Missing file or folder."""
+
+
+_SYSTEM_HINTS = {
+    errno.EACCES: "Check the permissions of the file and of its folder",
+    errno.EPERM: "Check the permissions of the file and of its folder",
+    errno.EROFS: "Choose another -o: that file system is read-only",
+    errno.EISDIR: "Name a file, not a folder",
+    errno.ENOTDIR: "One part of the path is a file, not a folder",
+    errno.ENOENT: "Check the spelling of the path",
+    errno.ENOSPC: "Free some space or write to another disk",
+    errno.EDQUOT: "Free some space or write to another disk",
+    errno.ENAMETOOLONG: "Choose a shorter name",
+}
+
+
+def system_hint(error: BaseException | None) -> str | None:
+    """Return the remedy of the error of the system or of the decoding that ``error`` is or follows.
+
+    It is None if there is no such error, or no remedy is known.
+    """
+    while error is not None:
+        if isinstance(error, UnicodeDecodeError):
+            return "Check that it is the right file: text is expected"
+        if isinstance(error, OSError) and error.errno is not None:
+            return _SYSTEM_HINTS.get(error.errno)
+        error = error.__cause__ or error.__context__
+    return None
 
 
 @contextmanager

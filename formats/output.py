@@ -41,7 +41,10 @@ def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> No
         )
     # A device or a folder cannot be replaced by a file, not even with --overwrite.
     if os.path.exists(target) and not os.path.isfile(target):
-        raise OutputExistsError(f"output {str(target)!r} is not a regular file")
+        raise OutputExistsError(
+            f"output {str(target)!r} is not a regular file",
+            hint="Name a file, not a folder",
+        )
     if os.path.lexists(target) and not overwrite:
         raise _output_exists(target)
 

@@ -25,7 +25,9 @@ def data_folder(explicit: Path | None = None) -> Path | None:
     """
     if explicit is not None:
         if not Path(explicit).is_dir():
-            raise MissingDataError(f"no data folder {str(explicit)!r}")
+            raise MissingDataError(
+                f"no data folder {str(explicit)!r}", hint="Name the folder with --data"
+            )
         return Path(explicit)
     named = os.environ.get(VARIABLE)
     if named:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -45,3 +46,42 @@ def locatk() -> Callable[..., Result]:
         return CliRunner().invoke(app, [str(arg) for arg in args], prog_name="locatk")
 
     return run
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """Mount a file system of 9 MiB; skip the test if that is not possible."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=9m", "locatk-test", str(folder)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, text=True)
+    except OSError as error:
+        pytest.skip(f"no disk can be mounted: {error}")
+    if mounted.returncode:
+        pytest.skip(f"no disk can be mounted: {mounted.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture
+def raw_bytes() -> Callable[..., bytes]:
+    """Return ``raw_bytes(path, ...)``, which returns the received bytes in recordings.
+
+    Their offsets must follow on from file to file. ``damaged_ok`` reads the rest of damaged files.
+    """
+    from locatk.formats.schemas.serial_pb2 import SerialChunk
+    from locatk.formats.sessions.reader import Session
+
+    def join(*paths: Path, topic: str = "/serial/robot", damaged_ok: bool = False) -> bytes:
+        content = bytearray()
+        for path in paths:
+            session = Session.open(path, damaged_ok=damaged_ok)
+            for _, chunk in session.decoded(topic, SerialChunk):
+                assert chunk.byte_offset == len(content)
+                content += chunk.data
+        return bytes(content)
+
+    return join

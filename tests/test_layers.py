@@ -160,6 +160,19 @@ def test_no_import_cycles(root: Path) -> None:
     assert cycle is None, "import cycle: " + " -> ".join(cycle or [])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("layer", LAYERS)
+def test_no_import_cycles_between_packages(root: Path, layer: str) -> None:
+    """A package is a folder of a layer, such as ``formats.sessions``."""
+    packages: dict[str, set[str]] = {}
+    for module, imports in import_graph(root, [layer]).items():
+        package, *_ = module.split(".")[1:] or [layer]
+        used = {name.split(".")[1] for name in imports if "." in name}
+        packages.setdefault(package, set()).update(used - {package})
+    cycle = find_cycle({name: used & packages.keys() for name, used in packages.items()})
+    assert cycle is None, f"import cycle in {layer}: " + " -> ".join(cycle or [])
+
+
 # ---- layers
 
 

@@ -8,8 +8,11 @@ from locatk.cli.lazy import LazyGroup
 
 COMMANDS = {
     "scene": ("locatk.cli.calibrate.scene", "Estimate the poses of Lighthouse stations."),
-    "camera": ("locatk.cli.calibrate.camera", "Fit focal length, centre and lens of a camera."),
-    "map": ("locatk.cli.calibrate.map", "Fit the landmarks of a floor as built."),
+    "camera": (
+        "locatk.cli.calibrate.camera",
+        "Fit focal length, centre and distortion of a camera.",
+    ),
+    "map": ("locatk.cli.calibrate.map", "Fit the landmarks of a map as built."),
     "printer": ("locatk.cli.calibrate.printer", "Find the best dots and the scale of a printer."),
     "tag": ("locatk.cli.calibrate.tag", "Fit the magnets of tags as built."),
 }

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from locatk.formats.sessions.reader import Session
 
 
-@click.command("camera", cls=Command, short_help="Fit focal length, centre and lens of a camera.")
+@click.command(
+    "camera", cls=Command, short_help="Fit focal length, centre and distortion of a camera."
+)
 @options.input_argument("session")
 @options.output("Camera to write (.toml).")
 @options.overwrite
@@ -53,8 +55,8 @@ def command(
     cannot be estimated, a typical one is written, and the exit status is 3 unless --focal-px
     was given.
 
-    Use the camera with `locatk solve --camera`, or in later sessions with
-    `locatk import --camera`.
+    Use the camera with `locatk solve --camera`, or import later sessions with `locatk import
+    --camera`.
 
     \b
     Examples:

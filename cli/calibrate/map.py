@@ -22,7 +22,7 @@ MAX_LANDMARKS = 40
 """Number of landmarks listed as text; of more, only those with a flag are listed."""
 
 
-@click.command("map", cls=Command, short_help="Fit the landmarks of a floor as built.")
+@click.command("map", cls=Command, short_help="Fit the landmarks of a map as built.")
 @options.sessions
 @options.output("Map to write (.toml), with the landmarks as built.")
 @options.overwrite
@@ -36,7 +36,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Fit centre, heading and bar strengths of the landmarks that robots in SESSIONS visited.
+    """Fit position, heading and bar strengths of the landmarks that robots visited in SESSIONS.
 
     All recordings are solved together. Visit each landmark several times in different
     directions, and visit some landmarks in several recordings. Bars are flagged if they are
@@ -44,9 +44,9 @@ def command(
     degrees). `locatk solve --artifact` uses the landmarks as built. The map is that of
     --artifact, or of the first session.
 
-    Recordings determine landmarks relative to each other. The position of the floor follows
-    from the majority of the landmarks, which are assumed to be as designed; the typical bar
-    has strength 1.
+    Recordings determine the positions of landmarks relative to each other only. The position of the
+    map follows from the majority of the landmarks, which are assumed to be as designed. The typical
+    bar has strength 1.
 
     Flags are results, not failures. The exit status is 3 if a recording or a visit was not
     used, because it was not localised on the map or contradicts the others.

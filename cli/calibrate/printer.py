@@ -38,13 +38,13 @@ MEASURED_LENGTH = click.FloatRange(50.0, 150.0)
         "--measured-x",
         type=MEASURED_LENGTH,
         metavar="MM",
-        help="Measured length of the lower ruler on the paper, instead of the scale of a scan.",
+        help="Length of the lower ruler, measured on the paper; replaces the scale of the scan.",
     ),
     click.option(
         "--measured-y",
         type=MEASURED_LENGTH,
         metavar="MM",
-        help="Measured length of the left ruler on the paper.",
+        help="Length of the left ruler, measured on the paper.",
     ),
 )
 @section(
@@ -54,15 +54,14 @@ MEASURED_LENGTH = click.FloatRange(50.0, 150.0)
         "pitch_mm",
         type=click.FloatRange(min=0.0, min_open=True),
         metavar="MM",
-        help="Recommend a dot for this pitch.  [default: also recommend a pitch]",
+        help="Recommend a dot for this pitch.  [default: recommend a pitch, too]",
     ),
     options.input_option(
         "--manifest",
         "manifests",
         many=True,
-        metavar="SHEET.toml",
-        help="Manifest of sheets from this printer to update with the scale; repeatable. Needs "
-        "--overwrite.",
+        help="Manifest of sheets from this printer (sheet.toml) in which to set the scale; "
+        "needs --overwrite. Repeatable.",
     ),
 )
 @options.as_json
@@ -78,17 +77,18 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Score the fields of a printed test sheet in SCAN, and measure the scale of the printer.
+    """Rate the dots on a scanned test sheet, and measure the scale of the printer.
 
-    The candidates for recommendation are the fields with the fewest wrong or missing dots and
-    at least 70 % of the best margin. Of these, the field with the pitch nearest to 0.508 mm is
-    recommended, then the one with the best margin. The margin of a dot is the difference in
-    darkness between its position and the darkest of the other three possible positions, as a
-    fraction of full black; 99 % of the dots have the margin of the field or more.
+    Each field of the sheet has dots of one size and pitch. Candidates are the fields with the
+    fewest wrong or missing dots that have at least 70 % of the best margin. Of these, the field
+    with the pitch nearest to 0.508 mm is recommended and, at equal pitch, the one with the best
+    margin. The margin of a dot is the difference in darkness between its position and the darkest
+    of the other three possible positions, as a fraction of full black; the margin of a field is the
+    one that 99 % of its dots reach.
 
-    The scale (printed over nominal length) is determined from a flat scan of known resolution,
-    with the accuracy of the scanner, or from the two rulers, measured by hand. A photo shows
-    the best dot, but not the scale.
+    The scale (printed over nominal length) is measured in a flat scan of known resolution, with the
+    accuracy of the scanner, or computed from the two rulers, measured by hand. From a photo, only
+    the best dot can be determined.
 
     \b
     Examples:
@@ -100,7 +100,7 @@ def command(
     from locatk.core.dots.calibration.printer import calibrate
     from locatk.formats.artifacts import printer as files
     from locatk.formats.artifacts.sheets import read_manifest, write_manifest
-    from locatk.formats.printing.scans import read_scan
+    from locatk.formats.scans import read_scan
 
     if (measured_x is None) != (measured_y is None):
         raise click.UsageError("Give both --measured-x and --measured-y.")

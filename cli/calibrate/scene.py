@@ -9,12 +9,17 @@ import click
 from locatk.cli import console, options
 from locatk.cli.command import Command
 from locatk.cli.solve.command import scene_option
+from locatk.core.errors import InputError
 
 
 @click.command("scene", cls=Command, short_help="Estimate the poses of Lighthouse stations.")
 @options.input_argument("session")
 @options.output("Scene to write (.toml).")
-@options.method
+@click.option(
+    "--method",
+    type=click.Choice(("bundle", "paper")),
+    help="Algorithm: `paper` is the published one, `bundle` is more accurate.  [default: bundle]",
+)
 @scene_option
 @options.overwrite
 @options.as_json
@@ -44,6 +49,12 @@ def command(
     options.guard_output(output, overwrite=overwrite, inputs=[session])
     with console.working("Solving"):
         solved = solve_session(session, SolveRequest(method=method, scene=scene))
+    if solved.solution.system != "lighthouse":
+        raise InputError(
+            f"a session of {solved.solution.system}, not of lighthouse",
+            file=session,
+            hint="Give a session with sweeps of Lighthouse stations",
+        )
     write_scene(output, solved.solution.artifact, overwrite=overwrite)
     report = summarize(str(session), str(output), solved.solution, solved.solve_s)
     console.result(text(report))

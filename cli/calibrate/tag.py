@@ -36,10 +36,10 @@ def command(
 ) -> None:
     """Fit positions and angles of the magnets to the passes in SESSIONS.
 
-    A tag needs at least two passes in which it was read; ten passes in different directions
-    are better. Magnets that were placed by hand are rotated by some degrees, which is the same
-    in every pass: `locatk solve --artifact` uses the magnets as built. The tags are those of
-    --artifact, or of the first session.
+    A tag needs at least two passes in which it was read; ten passes in different directions are
+    better. Magnets that were placed by hand deviate by a few degrees, equally in every pass:
+    `locatk solve --artifact` uses the magnets as built. The tags are those of --artifact, or of the
+    first session.
 
     The exit status is 3 if a pass was not used, because the tag was not read, because it is the
     only pass over its tag, or because it contradicts the others.
@@ -47,7 +47,7 @@ def command(
     \b
     Examples:
       locatk calibrate tag run1.mcap run2.mcap run3.mcap -o built.toml
-      locatk calibrate tag runs/*.mcap --artifact tag.toml -o built.toml --speed 0.105
+      locatk calibrate tag *.mcap --artifact tag.toml -o built.toml --speed 0.105
       locatk solve later.mcap -o solved.mcap --artifact built.toml
     """
     from locatk.core.polaris.calibration import calibrate

@@ -35,7 +35,7 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
     return pairs
 
 
-@click.command(cls=Command, short_help="Record a device from a port, or a camera, into a session.")
+@click.command(cls=Command, short_help="Record a serial device or a camera into a session.")
 @click.argument("port", required=False)
 @section(
     "Basic",
@@ -57,7 +57,7 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
     click.option(
         "--name",
         metavar="NAME",
-        help="Name of the device in the session.  [default: robot; of a camera: camera]",
+        help="Name of the device in the session.  [default: robot; camera for cameras]",
     ),
 )
 @section(
@@ -65,17 +65,16 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
     options.input_option(
         "--artifact",
         many=True,
-        metavar="FILE",
         help="Artifact to attach: tag, array, map, hall sensors, scene, manifest, camera "
-        "(.toml), or a session that contains some (.mcap). Repeatable.",
+        "(.toml), or a session that contains artifacts (.mcap). Repeatable.",
     ),
-    click.option("--note", help="Description of this recording."),
+    click.option("--note", help="Description of the recording."),
     click.option(
         "--meta",
         multiple=True,
         metavar="KEY=VALUE",
         callback=_pairs,
-        help="Entry of the metadata. Repeatable.",
+        help="Entry of the metadata, as in robot=7. Repeatable.",
     ),
 )
 @section(
@@ -86,23 +85,23 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
         type=DURATION,
         default=0.0,
         metavar="TIME",
-        help="Longest wait for the port to become available.",
+        help="Maximum time to wait for the port to become available.  [default: 0s]",
     ),
     click.option(
-        "--duration", type=DURATION, metavar="TIME", help="End after this time: 90s, 5min, 2h."
+        "--duration", type=DURATION, metavar="TIME", help="Stop after this time: 90s, 5min, 2h."
     ),
     click.option(
         "--max-size",
         type=SIZE,
         metavar="SIZE",
-        help="End at this total size (up to 0.5 MB more): 500MB, 2GB.",
+        help="Stop at this total size (up to 0.5 MB more): 500MB, 2GB.",
     ),
     click.option(
         "--rotate",
         type=ROTATION,
         metavar="TIME|SIZE",
-        help="Start a new file at this interval: OUTPUT-001.mcap, OUTPUT-002.mcap, each a "
-        "complete session.",
+        help="Start a new file after this time or size: OUTPUT-001.mcap, OUTPUT-002.mcap, "
+        "each a complete session.",
     ),
     options.number(
         "--silence",
@@ -124,7 +123,8 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
     click.option(
         "--speed",
         type=click.FloatRange(min=0),
-        help="Factor on the speed of replay: and camera:FILE; 0 as fast as possible.",
+        metavar="N",
+        help="Speed factor of replay: and camera:FILE; 0 for as fast as possible.  [default: 1]",
     ),
     click.option(
         "--image",
@@ -158,23 +158,22 @@ def command(
       /dev/ttyACM0, COM3      a serial port (--list shows them)
       socket://HOST:PORT      raw bytes over TCP
       rfc2217://HOST:PORT     a serial port of another computer
-      replay:FILE.mcap        the raw bytes of a session, as they came
+      replay:FILE.mcap        the raw bytes of a session, with their timing
       camera:0, camera:URL, camera:FILE
-                              a camera by its number, a stream, a video
+                              a camera by number, a stream, a video file
 
-    Every byte is stored as received, together with the decoded records; `locatk solve`
-    reads the session directly. A port that was unplugged is opened again when it is
-    back. If the program is killed, at most half a second is lost: `locatk recover`
-    completes the file.
+    Every byte is stored as received, together with the decoded records; `locatk solve` reads the
+    session directly. If a port is unplugged, it is opened again when it is back. If the program is
+    killed, at most half a second is lost: `locatk recover` completes the file.
 
-    The exit status is 3 if data were lost; the file is complete in that case too.
+    The exit status is 3 if data were lost; the file is complete nevertheless.
 
     \b
     Examples:
       locatk capture --list
       locatk capture /dev/ttyACM0 --device locatk -o run.mcap
-      locatk capture /dev/ttyUSB0 --device polaris-array --artifact tag.toml -o run.mcap
-      locatk capture /dev/ttyACM0 -o run.mcap --duration 5min --note "second floor"
+      locatk capture COM3 --device polaris-array --artifact tag.toml -o run.mcap
+      locatk capture /dev/ttyACM0 -o run.mcap --duration 5min --note "floor 2"
       locatk capture /dev/ttyACM0 -o day.mcap --rotate 10min --meta robot=7
       locatk capture camera:0 --artifact sheet.toml -o run.mcap
       locatk capture replay:run.mcap --device lines -o again.mcap

@@ -80,5 +80,5 @@ columns_option = click.option(
     "--columns",
     metavar="A,B,...",
     callback=_names,
-    help="Names of the values of a line, in their order; of --device lines.",
+    help="--device lines: names of the values in a line, in order.",
 )

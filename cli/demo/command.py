@@ -31,8 +31,8 @@ REPORT = "report.html"
     click.option(
         "--keep",
         type=options.PATH,
-        metavar="DIR",
-        help="Keep sessions, solutions, pictures and the sheets to print in DIR.",
+        metavar="FOLDER",
+        help="Keep sessions, solutions, pictures and the sheets to print in this folder.",
     ),
 )
 @section(
@@ -40,6 +40,7 @@ REPORT = "report.html"
     click.option(
         "--seed",
         type=click.IntRange(0),
+        metavar="N",
         default=1,
         show_default=True,
         help="Seed of all random numbers.",
@@ -55,13 +56,13 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Simulate a session of each SYSTEM, solve it, compare it with the truth, and report.
+    """Simulate a session of each SYSTEM, solve it, compare it with the truth, and write a report.
 
     \b
     lighthouse  two robots under two stations at unknown positions
     dots        a camera over a printed A4 sheet with missing dots and dust
-    polaris     a bar of magnetometers over three hand-made tags, among iron debris
-    landmarks   a robot with four hall sensors on a floor, on which a bar is missing
+    polaris     magnetometers over three hand-made tags, among iron debris
+    landmarks   a robot with four hall sensors over landmarks, one bar missing
 
     No hardware and no network are needed.
 
@@ -77,7 +78,7 @@ def command(
     chosen = [name for name in SYSTEMS if name in systems or not systems]
     report = output or (keep or Path()) / REPORT
     if keep is not None:
-        options.make_folder(keep)
+        options.make_folder(keep, "--keep")
         for path in (path for name in chosen for path, _ in kept(keep, name)):
             options.guard_output(path, overwrite=overwrite)
     options.guard_output(report, overwrite=overwrite)

@@ -45,9 +45,9 @@ align_option = click.option(
     type=click.Choice(ALIGNMENTS),
     default="none",
     show_default=True,
-    help="Transformation of the estimate that is fitted to the truth, one for all devices: in the "
-    "plane (se2), in space (se3), with scale (sim2, sim3), about z (yaw), or by the first pose "
-    "(origin).",
+    help="Transformation of the estimate onto the truth, fitted to all devices together: "
+    "in the plane (se2), in space (se3), with scale (sim2, sim3), about z (yaw), or "
+    "from the first pose (origin).",
 )
 
 offset_option = click.option(
@@ -56,17 +56,17 @@ offset_option = click.option(
     default=0.0,
     show_default=True,
     metavar="SECONDS|auto",
-    help="Time to add to the stamps of the estimate; `auto` estimates it on a part that is then "
-    "not scored, even if the clocks are years apart.",
+    help="Time to add to the stamps of the estimate. `auto` estimates it from a part of "
+    "the poses that is then excluded from the statistics; the clocks may be years "
+    "apart.",
 )
 
 
-@click.command(cls=Command, short_help="Compare poses with the truth.")
+@click.command(cls=Command, short_help="Compare poses with ground truth.")
 @options.input_argument("estimate")
 @options.input_option(
     "--truth",
     required=True,
-    metavar="FILE",
     help="Session with truth, another solution, or a TUM, KITTI or CSV file.",
 )
 @click.option(
@@ -74,7 +74,7 @@ offset_option = click.option(
     "names",
     multiple=True,
     metavar="NAME=NAME",
-    help="Name of a device in the estimate, and its name in the truth; repeatable.",
+    help="Name of a device in the estimate, and its name in the truth. Repeatable.",
 )
 @section("Alignment", align_option, offset_option)
 @section(
@@ -84,8 +84,8 @@ offset_option = click.option(
         type=click.Choice(("auto", "interpolate", "nearest")),
         default="auto",
         show_default=True,
-        help="Interpolate the truth, or take the pose nearest in time as evo does; `auto` is "
-        "`nearest` for two TUM or KITTI files.",
+        help="`interpolate` the truth, or take the `nearest` pose in time as evo does; `auto` "
+        "is `nearest` for two TUM or KITTI files, otherwise `interpolate`.",
     ),
     click.option(
         "--max-diff",
@@ -93,7 +93,7 @@ offset_option = click.option(
         default=0.01,
         show_default=True,
         metavar="SECONDS",
-        help="Largest time difference of `nearest`.",
+        help="--match nearest: maximum time difference.",
     ),
     click.option(
         "--max-gap",
@@ -101,8 +101,8 @@ offset_option = click.option(
         default=0.5,
         show_default=True,
         metavar="SECONDS",
-        help="Longest gap in the truth that is interpolated and counted as covered. The unit of "
-        "KITTI files is rows.",
+        help="Longest gap in the truth that is interpolated and counted as covered; in rows "
+        "for KITTI files.",
     ),
 )
 @section(
@@ -112,16 +112,20 @@ offset_option = click.option(
         default="1f",
         show_default=True,
         metavar="N(f|m|deg|s)",
-        help="Distance between the poses of a relative error: poses (f), metres, degrees or "
-        "seconds.",
+        help="Distance between the two poses of a relative error: poses (f), metres, degrees "
+        "or seconds.",
     ),
-    click.option("--all-pairs", is_flag=True, help="Start a relative error at each pose."),
+    click.option(
+        "--all-pairs",
+        is_flag=True,
+        help="Start a relative error at every pose, instead of at the end of the previous one.",
+    ),
 )
 @section(
     "Output",
     click.option("--full", is_flag=True, help="Print all statistics and assumptions."),
-    options.as_json,
 )
+@options.as_json
 @options.verbosity
 def command(
     estimate: Path,

@@ -61,7 +61,7 @@ FORMATS = {
     ),
     "dotbot-log": Format(IMPORTERS + "dotbot.log:read_dotbot_log", lighthouse.import_sweeps),
     "crazyflie-config": Format(
-        "locatk.formats.exporters.crazyflie:read_config",
+        IMPORTERS + "crazyflie:read_config",
         lighthouse.import_scene,
         takes_one_path=True,
     ),
@@ -82,7 +82,7 @@ FORMATS = {
 }
 
 
-@click.command("import", cls=Command, short_help="Turn recordings of other tools into a session.")
+@click.command("import", cls=Command, short_help="Import recordings of other tools as a session.")
 @click.argument("format_name", metavar="FORMAT", type=click.Choice(list(FORMATS)))
 @click.argument("paths", type=options.PATH, nargs=-1, required=True)
 @options.output("Session to write (.mcap), or for crazyflie-config the scene (.toml).")
@@ -133,20 +133,20 @@ def command(
     Examples:
       locatk import dotbot-lh2 data_all.csv -o grid.mcap
       locatk import dotbot-lh2 1_lh2.csv --truth 1_blender.csv -o run.mcap
-      locatk import dotbot-lh2 data.csv --truth 1_blender.csv --truth 2_blender.csv -o two.mcap
+      locatk import dotbot-lh2 data.csv --truth a.csv --truth b.csv -o run.mcap
       locatk import saleae capture.sal -o light.mcap
       locatk import saleae take1.csv --channel 2 --device wand -o light.mcap
       locatk import libsurvive run.rec.gz --stations -o run.mcap
       locatk import dotbot-log pydotbot.log -o drive.mcap
       locatk import crazyflie-config lighthouse.yaml -o scene.toml
       locatk import images frames/ --sheet sheet.toml --rate 46.6 -o run.mcap
-      locatk import images 'run/*.png' --sheet sheet.toml --camera camera.toml -o run.mcap
+      locatk import images '*.png' --sheet a4.toml --camera cam.toml -o run.mcap
       locatk import video run.mp4 --sheet sheet.toml -o run.mcap
       locatk import polaris-csv RawData_1.csv --rate 40 --spacing 20 -o run.mcap
-      locatk import landmark-csv drive.csv --units s,mm,deg,mt --map map.toml -o drive.mcap
-      locatk import landmark-csv log.csv -o drive.mcap --circle 25 --units ms,m,rad,v \\
-          --columns t=time,x=odom_x,y=odom_y,heading=yaw,front=h1,left=h2,rear=h3,right=h4 \\
-          --volts-per-tesla 13 --zero-volts median
+      locatk import landmark-csv run.csv --map map.toml -o run.mcap
+      locatk import landmark-csv log.csv -o run.mcap --circle 25 \\
+          --columns t=time,x=x,y=y,heading=yaw,front=h1,left=h2,rear=h3,right=h4 \\
+          --units ms,m,rad,v --volts-per-tesla 13 --zero-volts median
     """
     chosen = FORMATS[format_name]
     given = {name: value for name, value in format_options.items() if value not in (None, ())}

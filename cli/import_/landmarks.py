@@ -93,7 +93,6 @@ landmark_options = section(
     ),
     options.input_option(
         "--halls",
-        metavar="FILE",
         help="Names and positions of the sensors (halls.toml), if they are not four on a circle.",
     ),
     options.input_option("--map", metavar="FILE", help="Map of the floor (map.toml)."),

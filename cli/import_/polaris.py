@@ -25,7 +25,6 @@ polaris_options = section(
     ),
     options.input_option(
         "--tag",
-        metavar="FILE",
         help="Tags in the recording (tag.toml).  [default: the published design]",
     ),
 )

@@ -26,13 +26,13 @@ def command(file: Path, as_json: bool) -> None:
     Artifacts are Lighthouse scenes and receivers; manifests of dot sheets and cameras; tags and
     sensor arrays; maps of landmarks and hall sensors.
 
-    The table of Lighthouse stations has their channel and serial number, the period of a rotation
-    (in ticks of 48 MHz, and its difference from the nominal one in ppm if it was measured), the
-    number of sweeps, the fraction of them that was decoded, and the origin of the calibration.
+    For each Lighthouse station, the output lists channel, serial number, period of a rotation (in
+    ticks of 48 MHz and, if it was measured, its difference from the nominal one in ppm), number of
+    sweeps, fraction of decoded sweeps, and origin of the calibration.
 
-    A damaged or truncated recording is described as far as it can be read. The exit status is
-    then 3, and `locatk recover` saves the rest. Of a recording with more than 16 MB of samples
-    only the index is read.
+    A damaged or truncated recording is described as far as it can be read. The exit status is then
+    3, and `locatk recover` saves the rest. For recordings with more than 16 MB of samples, only the
+    index is read.
 
     \b
     Examples:
@@ -58,55 +58,22 @@ def command(file: Path, as_json: bool) -> None:
 
 def _artifact(file: Path) -> dict[str, Any]:
     """Read and describe an artifact."""
-    from locatk.formats.artifacts import maps, sheets, tags
-    from locatk.formats.artifacts import receiver as receivers
-    from locatk.formats.artifacts import scene as artifacts
-    from locatk.formats.artifacts.schema import read_format
+    from locatk.formats.artifacts.registry import identify_artifact
     from locatk.formats.sessions import description, lighthouse_description
 
-    kinds: dict[str, Callable[[], dict[str, Any]]] = {
-        artifacts.SCENE_FORMAT: lambda: {
-            "kind": "scene",
-            "system": "lighthouse",
-            **lighthouse_description.scene(artifacts.read_scene(file)),
-        },
-        sheets.MANIFEST_FORMAT: lambda: {
-            "kind": "manifest",
-            "system": "dots",
-            **description.manifest(sheets.read_manifest(file)),
-        },
-        sheets.CAMERA_FORMAT: lambda: {
-            "kind": "camera",
-            "system": "dots",
-            "camera": description.camera(sheets.read_camera(file)),
-        },
-        tags.TAG_FORMAT: lambda: {
-            "kind": "tag",
-            "system": "polaris",
-            **description.tags(tags.read_tags(file)),
-        },
-        tags.ARRAY_FORMAT: lambda: {
-            "kind": "array",
-            "system": "polaris",
-            "arrays": [description.array(tags.read_array(file))],
-        },
-        maps.MAP_FORMAT: lambda: {
-            "kind": "map",
-            "system": "landmarks",
-            **description.floor(maps.read_map(file)),
-        },
-        maps.HALLS_FORMAT: lambda: {
-            "kind": "halls",
-            "system": "landmarks",
-            "halls": [description.hall_sensors(maps.read_halls(file))],
-        },
-        receivers.RECEIVER_FORMAT: lambda: {
-            "kind": "receiver",
-            "system": "lighthouse",
-            "receivers": [lighthouse_description.receiver(receivers.read_receiver(file))],
-        },
+    descriptions: dict[str, Callable[[Any], dict[str, Any]]] = {
+        "scene": lighthouse_description.scene,
+        "receiver": lambda receiver: {"receivers": [lighthouse_description.receiver(receiver)]},
+        "manifest": description.manifest,
+        "camera": lambda camera: {"camera": description.camera(camera)},
+        "tag": description.tags,
+        "array": lambda array: {"arrays": [description.array(array)]},
+        "map": description.floor,
+        "halls": lambda halls: {"halls": [description.hall_sensors(halls)]},
     }
-    return kinds[read_format(file, tuple(kinds))]()
+    entry = identify_artifact(file)
+    facts = descriptions[entry.kind](entry.artifact.read(file))
+    return {"kind": entry.kind, "system": entry.system, **facts}
 
 
 def _recording(file: Path) -> dict[str, Any]:

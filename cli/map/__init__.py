@@ -10,7 +10,7 @@ import click
 from locatk.cli.lazy import LazyGroup
 
 COMMANDS = {
-    "design": ("locatk.cli.map.design", "Find a map in which every window is unique."),
+    "design": ("locatk.cli.map.design", "Design a map on which every window is unique."),
     "check": ("locatk.cli.map.check", "Prove that a map is unique, or list duplicates."),
     "export": ("locatk.cli.map.export", "Write a map for other tools."),
     "import": ("locatk.cli.map.import_", "Read a map from a table or a LIF layout."),

@@ -27,15 +27,15 @@ MAX_NAMED_CELLS = 5
 @options.as_json
 @options.verbosity
 def command(maps: tuple[Path, ...], as_json: bool) -> None:
-    """Prove that each reading of MAPS determines the position of a robot, or list duplicates.
+    """Prove that every window of MAPS is unique, or list the duplicates.
 
-    The readings of every window under every heading are compared. The output lists duplicates with
-    both positions, the number of landmarks in which any two readings differ, the number of
-    landmarks that a robot visits until it is localised, and the effect of one fault. Of a map as
-    built (`locatk calibrate map`) the bars count as they were installed.
+    The readings of all windows under all headings are compared. The output lists duplicates with
+    both positions, the minimum number of landmarks in which two readings differ, the number of
+    landmarks that a robot visits until it is localised, and the effect of one fault. For a map as
+    built (`locatk calibrate map`), the bars are compared as they were installed.
 
-    The exit status is 0 if each map is unique and detects as many misread landmarks as its file
-    states (`detect`), otherwise 1.
+    The exit status is 0 if every map is unique and detects as many misread landmarks as its file
+    specifies (`detect`), otherwise 1.
 
     \b
     Examples:

@@ -31,11 +31,11 @@ OVERLAP_TOLERANCE_M = 1e-9
 @click.command(cls=Command)
 @click.argument("size", metavar="[ROWSxCOLS]", type=Size(), required=False)
 @options.output("Map to write (.toml).", required=False)
-@click.option("--name", default="", metavar="TEXT", help="Name of the map, for people.")
+@click.option("--name", default="", metavar="TEXT", help="Descriptive name of the map.")
 @click.option(
     "--landmark",
     is_flag=True,
-    help="Print the analysis of a landmark of these bars instead of writing a map.",
+    help="Print the analysis of one landmark instead of designing a map.",
 )
 @section(
     "Map",
@@ -44,16 +44,17 @@ OVERLAP_TOLERANCE_M = 1e-9
         type=click.Choice(("L", "I2", "I3", "2x2", "3x3")),
         default="L",
         show_default=True,
-        help="Landmarks that determine the position of a robot: one ahead and one to the left, two "
-        "or three in a row, or a square of four or nine.",
+        help="Landmarks that determine the position of a robot: one ahead and one to the left "
+        "(L), two or three in a row (I2, I3), or a square of four or nine (2x2, 3x3).",
     ),
     click.option(
         "--alphabet",
         type=click.Choice(("6", "16", "compass")),
         default="16",
         show_default=True,
-        help="Part of a landmark that is read: `6` the pattern, `16` pattern and orientation, "
-        "`compass` the same of the three patterns that determine the heading.",
+        help="Properties that a robot reads of a landmark: `6` its pattern, `16` pattern and "
+        "orientation, `compass` both, with only the three patterns that determine the "
+        "heading.",
     ),
     click.option(
         "--detect",
@@ -61,9 +62,9 @@ OVERLAP_TOLERANCE_M = 1e-9
         default=0,
         show_default=True,
         metavar="N",
-        help="Number of misread landmarks of a window that are always detected.",
+        help="Number of misread landmarks in a window that are always detected.",
     ),
-    number("--pitch", default=200.0, metavar="MM", help="Distance of neighbouring landmarks."),
+    number("--pitch", default=200.0, metavar="MM", help="Distance between neighbouring landmarks."),
     number(
         "--seed",
         default=0,
@@ -84,7 +85,7 @@ OVERLAP_TOLERANCE_M = 1e-9
         type=Walls(),
         multiple=True,
         metavar="CELLS:CELLS",
-        help="Neighbours between which a robot cannot drive, as in '2,3:2,4' or "
+        help="Neighbouring cells between which a robot cannot drive, as in '2,3:2,4' or "
         "'0-5,3:0-5,4'. Repeatable.",
     ),
 )
@@ -108,16 +109,17 @@ def command(
     as_json: bool,
     **bars: Any,
 ) -> None:
-    """Find a floor on which a few landmarks determine the position of a robot.
+    """Design a map on which a few neighbouring landmarks determine the position of a robot.
 
-    Each window of the floor, read under any of four headings, is unique. The map is proved before
-    it is written. Row 0 has the least y, column 0 the least x. A size that no map can have is
-    refused with the bound. The search takes some seconds for small floors close to the bound.
+    Every window of landmarks is unique under all four headings; this is verified before the map is
+    written. Row 0 has the smallest y, column 0 the smallest x. If no map of the size can exist, the
+    error gives the bound. For small maps close to the bound, the search takes some seconds.
 
-    --landmark makes no map. It prints, for the bars of the options: the valleys of the six
-    patterns, r1 and r2, the heights at which patterns are distinguishable, the least pitch, the
-    range of the hall sensors and tolerances. A requirement that is not met gives a warning; the map
-    is written nevertheless, and the exit status is 3.
+    With --landmark, no map is designed. The output is an analysis of one landmark with the given
+    bars: the valleys of the six patterns, the radii r1 and r2, the heights at which patterns are
+    distinguishable, the minimum pitch, the range of the hall sensors, and tolerances. If a
+    requirement is not met, a warning gives a remedy; a map is written nevertheless, and the exit
+    status is 3.
 
     \b
     Examples:

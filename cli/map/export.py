@@ -35,8 +35,8 @@ def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="Format of the output.  [default: by its ending: .csv, .json (LIF), .yaml (ROS), .svg, "
-    ".dxf]",
+    help="Format of the output.  [default: by the ending of the output: .csv, .json "
+    "(LIF), .yaml (ROS), .svg, .dxf]",
 )
 @options.output("File to write; `ros` also writes an image with the ending .pgm.")
 @click.option(
@@ -46,7 +46,7 @@ def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
     default=10.0,
     show_default=True,
     metavar="MM",
-    help="Side of a pixel of the format `ros`.",
+    help="--format ros: side of a pixel.",
 )
 @options.overwrite
 @options.as_json
@@ -61,10 +61,10 @@ def command(
 ) -> None:
     """Write the landmarks of MAP_FILE for other tools.
 
-    `csv` is the table No;Code;X mm;Y mm;Attr1;..;Attr4 of vehicle controllers (Goetting), `lif`
-    the Layout Interchange Format 1.0.0 of VDMA for master controls, `ros` the YAML and PGM of
-    map_server, `svg` and `dxf` the floor at true size in layers. Landmarks are at their positions
-    as built if the map contains these.
+    `csv` is the table No;Code;X mm;Y mm;Attr1;..;Attr4 of vehicle controllers (Goetting), `lif` the
+    Layout Interchange Format 1.0.0 of VDMA for master controls, `ros` the YAML and PGM of
+    map_server, `svg` and `dxf` a drawing of the floor at true size, in layers. If the map contains
+    positions as built, these are written.
 
     \b
     Examples:

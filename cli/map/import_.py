@@ -22,7 +22,7 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="Format of SOURCE.  [default: by its ending: .csv, .json (LIF)]",
+    help="Format of SOURCE.  [default: by the ending of SOURCE: .csv, .json (LIF)]",
 )
 @options.output("Map to write (.toml).")
 @section(
@@ -32,7 +32,7 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
         "pitch_mm",
         type=click.FloatRange(0, min_open=True),
         metavar="MM",
-        help="Distance of neighbouring cells.  [default: the largest that fits the positions]",
+        help="Distance between neighbouring cells.  [default: the largest that fits the positions]",
     ),
     click.option(
         "--tolerance",
@@ -41,7 +41,7 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
         default=10.0,
         show_default=True,
         metavar="MM",
-        help="Largest deviation of a landmark from its cell, along x or y.",
+        help="Maximum deviation of a landmark from its cell along x or y.",
     ),
 )
 @section(
@@ -50,12 +50,12 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
     click.option(
         "--alphabet",
         type=click.Choice(ALPHABETS),
-        help="Alphabet.  [default: that of --like, otherwise 16]",
+        help="Alphabet, as in `locatk map design`.  [default: that of --like, otherwise 16]",
     ),
     click.option(
         "--window",
         type=click.Choice(WINDOWS),
-        help="Window.  [default: that of --like, otherwise L]",
+        help="Window, as in `locatk map design`.  [default: that of --like, otherwise L]",
     ),
 )
 @options.overwrite
@@ -73,11 +73,12 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Make a map of the landmarks in SOURCE, a table as of `locatk map export` or a LIF layout.
+    """Write a map of the landmarks in SOURCE, a table as of `locatk map export` or a LIF layout.
 
-    Pitch, rows and columns are estimated from the positions. A landmark that deviates from its cell
-    is imported as built; a deviation beyond the tolerance is refused. Alphabet, window and bars are
-    not in such files and come from the options. Check the map afterwards with `locatk map check`.
+    Pitch, rows and columns are estimated from the positions. If a landmark deviates from its cell,
+    its position is imported as built; a deviation beyond the tolerance is an error. Such files do
+    not contain alphabet, window and bars: give them as options. Check the map afterwards with
+    `locatk map check`.
 
     \b
     Examples:
@@ -95,9 +96,9 @@ def command(
     text = read_text(source)
     pitch = None if pitch_mm is None else metres(pitch_mm)
     if format_name == "csv":
-        from locatk.formats.exporters.map_csv import loads_csv as loads
+        from locatk.formats.importers.map_csv import loads_csv as loads
     else:
-        from locatk.formats.exporters.map_lif import loads_lif as loads
+        from locatk.formats.importers.map_lif import loads_lif as loads
     floor = loads(text, file=source, pitch_m=pitch, tolerance_m=metres(tolerance_mm))
     if like is not None:
         design = read_map(like)

@@ -139,7 +139,11 @@ def check_cells(size: tuple[int, int], cells: list[Cell], option: str) -> None:
 geometry_options = section(
     "Landmarks and sensors",
     number(
-        "--bar", default="30x10x5", type=Bar(), metavar="LxWxH", help="Size of a bar magnet in mm."
+        "--bar",
+        default="30x10x5",
+        type=Bar(),
+        metavar="LxWxH",
+        help="Length, width and height of a bar magnet in mm.",
     ),
     number(
         "--remanence",
@@ -151,20 +155,20 @@ geometry_options = section(
         "--radius",
         default=25.0,
         metavar="MM",
-        help="From the centre of a landmark to the middles of its bars.",
+        help="Distance from the centre of a landmark to the centres of its bars.",
     ),
     number(
         "--sensor-height",
         default=12.0,
         metavar="MM",
-        help="From the tops of the bars to the hall sensors.",
+        help="Height of the hall sensors above the tops of the bars.",
     ),
     number("--circle", default=25.0, metavar="MM", help="Radius of the circle of hall sensors."),
     click.option(
         "--threshold",
         type=float,
         metavar="MT",
-        help="Field at which a sensor enters the territory of a landmark.  [default: 2.75 per "
+        help="Field from which on a sensor counts as above a landmark.  [default: 2.75 per "
         "tesla of remanence]",
     ),
 )

@@ -11,9 +11,9 @@ from locatk.cli.print.tag import tag
 from locatk.cli.print.test_sheet import testsheet
 
 
-@click.group(cls=Group, short_help="Draw sheets at true size.")
+@click.group(cls=Group, short_help="Draw dot sheets and templates at true size.")
 def command() -> None:
-    """Draw sheets at true size.
+    """Draw dot sheets, and templates for placing magnets, at true size.
 
     \b
     Examples:

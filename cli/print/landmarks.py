@@ -8,69 +8,78 @@ from typing import Any
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command, section
 
 DEFAULT_OVERLAP_MM = 10.0
 
 
-@click.command(short_help="Installation pack of a landmark floor.")
+@click.command(cls=Command, short_help="Draw the installation pack of a landmark map.")
 @options.input_argument("map_file")
 @options.output("PDF to write.")
-@click.option(
-    "--templates", "templates_only", is_flag=True, help="Only the placement templates, 1 : 1."
-)
-@click.option(
-    "--floor",
-    "whole_floor",
-    is_flag=True,
-    help="The whole floor at true size instead, divided into papers or strips that share "
-    "--overlap.",
-)
-@click.option(
-    "--paper",
-    "--size",
-    "paper_name",
-    default="A4",
-    show_default=True,
-    metavar="PAPER",
-    help="A0 to A5, Letter, Tabloid, WxHmm as in 600x900mm; for --floor also a roll by its "
-    "width, roll:914mm.",
-)
-@click.option(
-    "--margin",
-    "margin_mm",
-    type=click.FloatRange(0),
-    default=10.0,
-    show_default=True,
-    metavar="MM",
-    help="Empty margin, for printers that cannot print to the edge; with --floor it contains "
-    "rulers and joining marks.",
-)
-@click.option(
-    "--overlap",
-    "overlap_mm",
-    type=click.FloatRange(0),
-    metavar="MM",
-    help="Overlap of neighbouring papers of --floor; joining marks show where to cut.  "
-    f"[default: {DEFAULT_OVERLAP_MM:g}]",
-)
-@click.option(
-    "--spares",
-    "spares_percent",
-    type=click.FloatRange(0, 1000),
-    default=5.0,
-    show_default=True,
-    metavar="PERCENT",
-    help="Spare bars, in addition to four for each landmark.",
-)
-@click.option(
-    "--bom",
-    type=options.PATH,
-    metavar="FILE.csv",
-    help="Also write the bill of materials for a spreadsheet.",
-)
 @options.overwrite
 @options.as_json
 @options.verbosity
+@section(
+    "Content",
+    click.option(
+        "--templates",
+        "templates_only",
+        is_flag=True,
+        help="Draw only the placement templates, at true size.",
+    ),
+    click.option(
+        "--floor",
+        "whole_floor",
+        is_flag=True,
+        help="Draw the whole floor at true size instead, divided into sheets or strips.",
+    ),
+    click.option(
+        "--spares",
+        "spares_percent",
+        type=click.FloatRange(0, 1000),
+        default=5.0,
+        show_default=True,
+        metavar="PERCENT",
+        help="Spare bars, in addition to four for each landmark.",
+    ),
+    click.option(
+        "--bom",
+        type=options.PATH,
+        metavar="FILE",
+        help="Also write the bill of materials (.csv).",
+    ),
+)
+@section(
+    "Paper",
+    click.option(
+        "--paper",
+        "--size",
+        "paper_name",
+        default="A4",
+        show_default=True,
+        metavar="PAPER",
+        help="A0 to A5, Letter, Tabloid, or WxHmm as in 600x900mm; with --floor also the "
+        "width of a roll as in roll:914mm.",
+    ),
+    click.option(
+        "--margin",
+        "margin_mm",
+        type=click.FloatRange(0),
+        default=10.0,
+        show_default=True,
+        metavar="MM",
+        help="Empty margin, for printers that cannot print to the edge; with --floor it "
+        "contains rulers and registration marks.",
+    ),
+    click.option(
+        "--overlap",
+        "overlap_mm",
+        type=click.FloatRange(0),
+        metavar="MM",
+        help="Overlap of neighbouring sheets of --floor; registration marks show where to cut.  "
+        f"[default: {DEFAULT_OVERLAP_MM:g}]",
+    ),
+)
 def landmarks(
     map_file: Path,
     output: Path,
@@ -84,12 +93,12 @@ def landmarks(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Draw an installation pack for the magnets of the map MAP_FILE.
+    """Draw the installation pack of the map MAP_FILE (map.toml).
 
-    The pack contains the plan of the floor, a placement template at true size for each kind of
-    landmark (outlines, an arrow to the north pole of each bar, +y of the map), the bill of
-    materials, a checklist, and a marking list of all landmarks. Print at 100 % and measure the
-    rulers. Landmarks are drawn as designed, even if the file contains calibrated ones.
+    The pack contains a plan of the floor, a placement template at true size for each kind of
+    landmark (outlines, an arrow to the north pole of each bar, the y axis of the map), the bill of
+    materials, a checklist, and a list of all landmarks. Print at 100 % and measure the rulers.
+    Landmarks are drawn as designed, even if the file contains calibrated ones.
 
     \b
     Examples:

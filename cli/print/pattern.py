@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,17 @@ FORMATS = ("pdf", "png", "txt")
 MAX_FILES = 200
 """Largest number of files of a run, all of which are open until the last one is complete."""
 
+MAX_SECTION = 62
+"""Largest number of a section: the main sequence of the pattern has 63 of them."""
+
 MAX_TABLE_ROWS = 10
 
 
 class PairType(click.ParamType):
     """Two whole numbers with a separator, as in ``3x2`` or ``1330,7200``."""
 
-    def __init__(self, separator: str, minimum: int) -> None:
-        self.separator, self.minimum = separator, minimum
+    def __init__(self, separator: str, minimum: int, maximum: float = math.inf) -> None:
+        self.separator, self.minimum, self.maximum = separator, minimum, maximum
         self.name = f"a pair of numbers as in 3{separator}2"
 
     def convert(
@@ -38,18 +42,20 @@ class PairType(click.ParamType):
         first, second = (int(part) for part in parts)
         if min(first, second) < self.minimum:
             self.fail(f"{value!r} has a number below {self.minimum}.", param, ctx)
+        if max(first, second) > self.maximum:
+            self.fail(f"{value!r} has a number above {self.maximum}.", param, ctx)
         return first, second
 
 
-@click.command(cls=Command, short_help="Sheets of dots for localization by camera.")
+@click.command(cls=Command, short_help="Draw sheets of dots for localization by camera.")
 @options.output("File to write; the manifest is written next to it as .toml.")
 @click.option(
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="`png`: 1 bit a pixel at the printer's resolution. `txt`: a letter u, d, l or r for each "
-    "dot. Both write one file a sheet, named by its id.  [default: by the ending of the output, "
-    "else pdf]",
+    help="`png`: image of 1 bit per pixel at the printer's resolution. `txt`: a letter u, "
+    "d, l or r for each dot. Both write one file per sheet, named by its id.  "
+    "[default: by the ending of the output, else pdf]",
 )
 @options.overwrite
 @options.as_json
@@ -76,9 +82,9 @@ class PairType(click.ParamType):
         "--marks/--no-marks",
         default=True,
         show_default=True,
-        help="Rulers and captions in the margin.",
+        help="Print rulers and captions in the margin.",
     ),
-    click.option("--crop-marks", is_flag=True, help="Add marks for cutting the margin off."),
+    click.option("--crop-marks", is_flag=True, help="Print marks for cutting the margin off."),
 )
 @section(
     "Dots",
@@ -118,6 +124,7 @@ class PairType(click.ParamType):
     click.option(
         "--count",
         type=click.IntRange(1, 1000),
+        metavar="N",
         default=1,
         show_default=True,
         help="Number of sheets, each with its own area of the pattern.",
@@ -126,8 +133,8 @@ class PairType(click.ParamType):
         "--tiles",
         type=PairType("x", 1),
         metavar="CxR",
-        help="Divide one floor into C papers across and R down, which share --overlap. Poses refer "
-        "to the lower left paper.",
+        help="Divide one large sheet into C pages across and R down, which overlap. Poses "
+        "refer to the lower left page.",
     ),
     click.option(
         "--overlap",
@@ -136,15 +143,14 @@ class PairType(click.ParamType):
         default=10.0,
         show_default=True,
         metavar="MM",
-        help="Overlap of neighbouring tiles; registration marks show where to cut.",
+        help="Overlap of neighbouring pages of --tiles; registration marks show where to cut.",
     ),
 )
 @section(
     "Document below the dots",
     options.input_option(
         "--overlay",
-        metavar="FILE.pdf",
-        help="Print over each page of this document, whose pages determine the size.",
+        help="Print over each page of this PDF document, whose pages determine the size.",
     ),
     click.option(
         "--strip-black",
@@ -163,13 +169,15 @@ class PairType(click.ParamType):
     ),
     click.option(
         "--section",
-        type=PairType(",", 0),
+        type=PairType(",", 0, MAX_SECTION),
         default="0,0",
         show_default=True,
         metavar="U,V",
-        help="Section of the pattern, each number 0 to 62.",
+        help="Section of the pattern; two numbers from 0 to 62.",
     ),
-    click.option("--id", "name", help="Name of the sheet.  [default: its paper and a number]"),
+    click.option(
+        "--id", "name", metavar="NAME", help="Name of the sheet.  [default: its paper and a number]"
+    ),
     click.option(
         "--ledger",
         type=options.PATH,
@@ -179,7 +187,9 @@ class PairType(click.ParamType):
         help="File with the areas in use.  [default: locatk-ledger.toml in the folder of the "
         "output]",
     ),
-    click.option("--force", is_flag=True, help="Use an area that another sheet already has."),
+    click.option(
+        "--force", is_flag=True, help="Use an area even if the ledger lists it for another sheet."
+    ),
 )
 def pattern(
     output: Path,
@@ -265,7 +275,7 @@ def pattern(
         files = _files(output, format_name, manifest)
         for path in files:
             options.guard_output(path, overwrite=overwrite, inputs=inputs)
-        with console.steps(job.steps(manifest, overlay), "Drawing") as done:
+        with console.steps(job.count_steps(manifest, overlay), "Drawing") as done:
             drawn = job.draw(
                 manifest,
                 format_name,

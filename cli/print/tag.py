@@ -10,25 +10,28 @@ from typing import Any
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command
 
 FORMATS = ("pdf", "svg")
 
 
-@click.command(short_help="Templates for placing a tag's magnets.")
+@click.command(cls=Command, short_help="Draw templates for placing a tag's magnets.")
 @options.input_argument("tag_file")
 @options.output("File to write.")
 @click.option(
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="`svg` writes one numbered file a page.  [default: by the ending of the output, else pdf]",
+    help="`svg` writes one numbered file per page.  [default: by the ending of the "
+    "output, else pdf]",
 )
 @click.option(
     "--id",
     "ids",
     type=click.IntRange(0),
     multiple=True,
-    help="Tag to draw; repeatable.  [default: all members of the family]",
+    metavar="N",
+    help="Id of a tag to draw. Repeatable.  [default: all members of the family]",
 )
 @click.option(
     "--size",
@@ -40,7 +43,7 @@ FORMATS = ("pdf", "svg")
 @click.option(
     "--landscape/--portrait",
     default=None,
-    help="Orientation of the paper.  [default: that with fewer pages]",
+    help="Orientation of the paper.  [default: the one that needs fewer pages]",
 )
 @click.option(
     "--margin",
@@ -73,10 +76,10 @@ def tag(
 ) -> None:
     """Draw the tags of TAG_FILE at true size, as templates for placing their magnets.
 
-    Each magnet has an outline and an arrow to its north pole, with the angle clockwise from
-    forward: mark north on the rim of the disc, and rotate the mark to the arrow. A page contains
-    as many tags as fit, each with cut marks. Print at 100 % and measure the rulers. Tags are drawn
-    as designed, even if the file contains calibrated magnets.
+    Each magnet has an outline and an arrow to its north pole, with the angle clockwise from the
+    forward direction: mark the north pole on the rim of the disc, and align the mark with the
+    arrow. A page contains as many tags as fit, each with cut marks. Print at 100 % and measure the
+    rulers. Tags are drawn as designed, even if the file contains calibrated magnets.
 
     \b
     Examples:

@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 
 from locatk.cli import console, options
+from locatk.cli.command import Command
 
 
-@click.command(short_help="Test sheet for the choice of dots.")
+@click.command(cls=Command, short_help="Draw a test sheet for choosing dots.")
 @options.output("PDF to write.")
 @click.option(
     "--size", type=click.Choice(("A4", "Letter"), case_sensitive=False), default="A4",
@@ -35,10 +36,11 @@ from locatk.cli import console, options
 def testsheet(
     output: Path, size: str, dpi: str, codec: str, overwrite: bool, as_json: bool
 ) -> None:
-    """Draw a sheet with a field of dots of each size at each pitch.
+    """Draw a test sheet, with a field of dots for each combination of size and pitch.
 
-    Print it and scan it; `locatk calibrate printer` then determines which dots are printed best,
-    and the scale of the printer. The markers identify the sheet, so that it needs no manifest.
+    Print and scan the sheet; `locatk calibrate printer` then determines which dots are printed
+    best, and the scale of the printer. The sheet contains markers that identify it and needs no
+    manifest.
 
     \b
     Examples:

@@ -10,23 +10,23 @@ import click
 from locatk.cli.lazy import LazyGroup
 
 COMMANDS = {
-    "dots": ("locatk.cli.simulate.dots", "Frames of a camera over a printed sheet."),
+    "dots": ("locatk.cli.simulate.dots", "Simulate a camera over a printed dot sheet."),
     "landmarks": (
         "locatk.cli.simulate.landmarks",
-        "A robot with four hall sensors on a floor of landmarks.",
+        "Simulate a robot with hall sensors over landmarks.",
     ),
     "lighthouse": (
         "locatk.cli.simulate.lighthouse",
-        "Robots driving under Lighthouse stations.",
+        "Simulate robots under Lighthouse stations.",
     ),
-    "polaris": ("locatk.cli.simulate.polaris", "Passes of a magnetometer bar over tags."),
+    "polaris": ("locatk.cli.simulate.polaris", "Simulate a magnetometer array over magnetic tags."),
 }
 """Name of a command to its module and short help. The module holds it as ``command``."""
 
 
-@click.group(cls=LazyGroup, table=COMMANDS, short_help="Simulate a session with known truth.")
+@click.group(cls=LazyGroup, table=COMMANDS, short_help="Simulate a session with ground truth.")
 def command() -> None:
-    """Simulate a session with known truth, without hardware.
+    """Simulate a session with ground truth, without hardware.
 
     All settings of a simulation are in a TOML file with comments (--print-config, --config); the
     most common ones are options as well.

@@ -51,10 +51,11 @@ def command(
         )
     for line in warnings:
         console.warn(line)
-    console.result(
+    text = (
         f"Wrote {output}: {summary['samples']} samples of {summary['device']}, over "
         f"{_visited(summary['visits'])}, {summary['truth_poses']} truth poses"
     )
+    console.result(console.wrapped(text))
     if as_json:
         console.emit_json({"version": 1, "output": output, **summary})
 

@@ -27,7 +27,7 @@ scene_option = click.option(
     "--scene",
     type=click.Choice(SCENES),
     default=None,
-    help="Lighthouse: assumed number and geometry of stations. [default: auto, from the data]",
+    help="Lighthouse: assumed number and geometry of stations.  [default: auto, from the data]",
 )
 
 
@@ -55,9 +55,10 @@ templates_option = click.option(
     "--templates",
     type=TemplateResolution(),
     metavar="ORIENTATIONS,OFFSETS,POINTS",
-    help="Polaris, --method paper: resolution of the templates. Orientations per 360 deg, lateral "
-    "offsets within half a sensor spacing to either side, and points per template, which extends "
-    "one tag spacing before and behind the magnet. [default: 36,5,80]",
+    help="Polaris with --method paper: resolution of the templates. Number of "
+    "orientations in 360 deg, of lateral offsets within half a sensor spacing to "
+    "either side, and of points per template, which extends one tag spacing before "
+    "and behind the magnet.  [default: 36,5,80]",
 )
 
 
@@ -68,14 +69,14 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     return 0 if value == "auto" else int(value)
 
 
-@click.command(cls=Command, short_help="Solve recorded sessions into poses.")
+@click.command(cls=Command, short_help="Estimate poses from recorded sessions.")
 @click.argument("sessions", nargs=-1, required=True)
 @click.option(
     "-o",
     "--output",
     metavar="PATH",
-    help="Solution to write (.mcap), or folder for the solutions of several sessions; also a URL. "
-    "[default: <session>-solved.mcap in the folder of each session]",
+    help="Solution to write (.mcap), or folder for the solutions of several sessions; "
+    "also a URL.  [default: <session>-solved.mcap in the folder of each session]",
 )
 @options.method
 @options.overwrite
@@ -84,7 +85,6 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     options.artifact,
     options.input_option(
         "--camera",
-        metavar="FILE",
         help="Dots: camera (.toml) to use instead of the session's.",
     ),
     scene_option,
@@ -97,7 +97,7 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
         "--save-scene",
         type=options.PATH,
         metavar="FILE",
-        help="Lighthouse: also write the solved scene (.toml), for --artifact.",
+        help="Lighthouse: also write the estimated scene (.toml), for --artifact.",
     ),
 )
 @section(
@@ -107,12 +107,12 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
         metavar="N",
         default="1",
         callback=_jobs,
-        help="Sessions to solve at a time; 0 or auto for one per core.  [default: 1]",
+        help="Number of sessions to solve in parallel; 0 or auto for one per core.  [default: 1]",
     ),
     click.option(
         "--scheduler",
         metavar="ADDRESS",
-        help="Solve on the Dask cluster of this scheduler, as tcp://host:8786 (extra "
+        help="Solve on the Dask cluster of this scheduler, as in tcp://host:8786 (needs "
         "locatk[dask]).",
     ),
     click.option(
@@ -122,7 +122,7 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
         "solutions.",
     ),
 )
-@options.json_flag("One JSON object per session, each on a line,")
+@options.json_flag("one JSON object per session, each on a line,")
 @options.verbosity
 def command(
     sessions: tuple[str, ...],
@@ -140,7 +140,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Solve SESSIONS and write the poses to OUTPUT.
+    """Estimate the poses of the devices in SESSIONS, and write them to OUTPUT.
 
     SESSIONS are files, folders (all *.mcap in them except solutions), patterns in quotes,
     and URLs such as s3://bucket/day/*.mcap (extra locatk[s3]). A session that fails does not
@@ -158,7 +158,7 @@ def command(
       locatk solve first.mcap -o solved.mcap --save-scene scene.toml
       locatk solve day/*.mcap -o solved/ --artifact scene.toml
       locatk solve day/ -o solved/ --jobs auto --resume --json
-      locatk solve "s3://lab/day/*.mcap" -o s3://lab/out --scheduler tcp://host:8786
+      locatk solve "s3://lab/*.mcap" -o s3://lab/out --scheduler tcp://host:8786
       locatk solve frames.mcap -o solved.mcap --camera camera.toml
       locatk solve pass.mcap -o solved.mcap --artifact tag.toml --speed 0.105
       locatk solve pass.mcap --speed 0.105 --method paper --templates 72,9,80

@@ -10,9 +10,9 @@ import click
 from locatk.cli.lazy import LazyGroup
 
 COMMANDS = {
-    "design": ("locatk.cli.tag.design", "Plan a tag or a family of tags and write tag.toml."),
+    "design": ("locatk.cli.tag.design", "Design a tag or a family of tags."),
     "check": ("locatk.cli.tag.check", "Check the design of existing tags."),
-    "encode": ("locatk.cli.tag.encode", "Show the magnets of an id."),
+    "encode": ("locatk.cli.tag.encode", "Encode an id as magnets."),
     "decode": ("locatk.cli.tag.decode", "Decode the id of a tag from its magnets."),
 }
 """Name of a command to its module and short help. The module holds it as ``command``."""

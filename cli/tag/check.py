@@ -19,9 +19,9 @@ from locatk.cli.tag.options import reading_conditions, reading_options
 @options.as_json
 @options.verbosity
 def command(tag: Path, as_json: bool, **conditions: Any) -> None:
-    """Evaluate the tags of TAG as `locatk tag design` does, and the distances of their ids.
+    """Evaluate the design of the tags in TAG (tag.toml), and the distances between their ids.
 
-    The exit status is 3 if a requirement is not met.
+    The output is that of `locatk tag design`. The exit status is 3 if a requirement is not met.
 
     \b
     Examples:

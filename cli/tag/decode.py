@@ -39,7 +39,9 @@ class OrientedCell(click.ParamType):
 @click.command(cls=Command)
 @click.argument("cells", metavar="C,R:DEG...", type=OrientedCell(), nargs=-1, required=True)
 @tag_option
-@click.option("--symbols", is_flag=True, help="Orientations are symbols instead of degrees.")
+@click.option(
+    "--symbols", is_flag=True, help="Read orientations as symbols (0, 1, ...) instead of degrees."
+)
 @code_options
 @options.as_json
 @options.verbosity
@@ -55,8 +57,9 @@ def command(
 ) -> None:
     """Decode the id of a tag from its magnets, each as COLUMN,ROW:ORIENTATION.
 
-    Orientations are in degrees clockwise from the tag's x, as measured. The margin is the lead of
-    the id over the next one, in steps of orientation. The exit status is 3 if no id is certain.
+    Orientations are measured in degrees clockwise from the tag's x axis. The margin in the output
+    is the distance to the second-best id minus the distance to the best one, in orientation steps.
+    The exit status is 3 if no id is certain.
 
     \b
     Examples:

@@ -24,7 +24,9 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
 
 @click.command(cls=Command)
 @options.output("Tags to write (.toml).")
-@click.option("--bom", type=options.PATH, metavar="FILE", help="Bill of materials to write (.csv).")
+@click.option(
+    "--bom", type=options.PATH, metavar="FILE", help="Also write the bill of materials (.csv)."
+)
 @code_options
 @section(
     "Family",
@@ -37,36 +39,57 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
         help="Id of a tag of the family. Repeatable.",
     ),
     click.option(
-        "--count", type=click.IntRange(min=1), help="Number of tags of a generated family."
+        "--count",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Generate a family of this many tags.",
     ),
     number(
         "--min-distance",
         default=1,
         type=click.IntRange(min=1),
         metavar="D",
-        help="Least distance of two tags of the family, in steps of orientation.",
+        help="Minimum distance between two tags of the family, in orientation steps.",
     ),
 )
 @section(
     "Magnets",
     click.option(
         "--spacing",
-        type=float,
+        type=options.POSITIVE,
         metavar="MM",
-        help="Distance of neighbouring cells.  [default: the smallest by the paper's rule, in "
-        "whole mm]",
+        help="Distance between neighbouring cells.  [default: the smallest that the paper's rule "
+        "allows, in whole mm]",
     ),
-    number("--diameter", default=2.0, metavar="MM", help="Diameter of a disc magnet."),
-    number("--height", default=0.5, metavar="MM", help="Height of a disc magnet."),
-    click.option("--grade", type=click.Choice(GRADES), help="Grade.  [default: N52]"),
+    number(
+        "--diameter",
+        default=2.0,
+        type=options.POSITIVE,
+        metavar="MM",
+        help="Diameter of a disc magnet.",
+    ),
+    number(
+        "--height",
+        default=0.5,
+        type=options.POSITIVE,
+        metavar="MM",
+        help="Height of a disc magnet.",
+    ),
     click.option(
-        "--remanence", type=float, metavar="T", help="Remanence, instead of that of the grade."
+        "--grade", type=click.Choice(GRADES), help="Grade of the neodymium magnets.  [default: N52]"
+    ),
+    click.option(
+        "--remanence",
+        type=options.POSITIVE,
+        metavar="T",
+        help="Remanence of the magnets, instead of that of the grade.",
     ),
     number(
         "--clearance",
         default=10.0,
+        type=options.POSITIVE,
         metavar="MM",
-        help="Height of the sensors over the middle of the magnets.",
+        help="Height of the sensors above the centres of the magnets.",
     ),
 )
 @reading_options
@@ -93,11 +116,11 @@ def command(
     as_json: bool,
     **conditions: Any,
 ) -> None:
-    """Plan a tag or a family of tags, and write it to OUTPUT.
+    """Design a tag or a family of tags, and write it to OUTPUT.
 
-    Computes field, noise, accuracy (Cramer-Rao bound) and limits. A requirement that is not met
-    gives a warning with a remedy; the tag is written nevertheless, and the exit status is 3.
-    Without --id and --count, every id of the codec may occur.
+    The output lists field, noise, accuracy (Cramer-Rao bound) and limits. If a requirement is not
+    met, a warning gives a remedy; the tag is written nevertheless, and the exit status is 3.
+    Without --id and --count, a tag may have any id of the codec.
 
     \b
     Examples:

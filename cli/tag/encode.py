@@ -32,8 +32,8 @@ def command(
 ) -> None:
     """Show the positions and orientations of the magnets of tag ID.
 
-    Orientations are clockwise from the tag's x, which is up in the drawing. `.` is a cell without
-    a magnet, `-` the corner that is always empty.
+    Orientations are clockwise from the tag's x axis, which points up in the drawing. In the
+    drawing, `.` is a cell without a magnet and `-` the corner that is always empty.
 
     \b
     Examples:

@@ -27,79 +27,87 @@ code_options = section(
         default=3,
         type=click.IntRange(2, 100),
         metavar="K",
-        help="Cells along a side of the grid.",
+        help="Number of cells along each side of the grid.",
     ),
     number(
         "--magnets",
         default=5,
         type=click.IntRange(3),
         metavar="M",
-        help="Magnets of a tag; three of them are on corners.",
+        help="Number of magnets of a tag; three of them are on corners.",
     ),
     number(
         "--orientations",
         default=8,
         type=click.IntRange(2, 360),
         metavar="P",
-        help="Orientations of a magnet.",
+        help="Number of orientations that a magnet can have.",
     ),
     click.option(
         "--codec",
         type=click.Choice(CODECS),
         default=CODECS[0],
         show_default=True,
-        help="Code of the ids.",
+        help="Code of the ids: `mosk` has the most ids, `redundant` corrects errors, "
+        "`polaris-released` is the table published with Polaris.",
     ),
 )
 
-tag_option = options.input_option("--tag", help="Tags (tag.toml) instead of the options of Code.")
+tag_option = options.input_option(
+    "--tag", help="Tags (tag.toml) to use instead of the options under Code."
+)
 
 reading_options = combine(
     section(
         "Sensors",
-        number("--sensors", default=9, metavar="N", help="Magnetometers of the array."),
+        number("--sensors", default=9, metavar="N", help="Number of magnetometers in the array."),
         number(
             "--sensor-spacing",
             default=20.0,
+            type=options.POSITIVE,
             metavar="MM",
-            help="Distance of neighbouring magnetometers.",
+            help="Distance between neighbouring magnetometers.",
         ),
-        number("--osr", default=3, metavar="0-3", help="Oversampling of the MLX90393."),
-        number("--filt", default=3, metavar="0-7", help="Digital filter of the MLX90393."),
+        number("--osr", default=3, metavar="0-3", help="Oversampling (OSR) of the MLX90393."),
+        number(
+            "--filt", default=3, metavar="0-7", help="Digital filter (DIG_FILT) of the MLX90393."
+        ),
         number(
             "--gain",
             default=7,
             metavar="0-7",
-            help="GAIN_SEL of the MLX90393; 7 is the most sensitive.",
+            help="Analogue gain (GAIN_SEL) of the MLX90393; 7 is the most sensitive.",
         ),
         number(
             "--resolution",
             default=0,
             metavar="0-3",
-            help="RES_XYZ of the MLX90393; 0 is the finest.",
+            help="Resolution (RES_XYZ) of the MLX90393; 0 is the finest.",
         ),
         click.option(
             "--noise",
-            type=float,
+            type=options.POSITIVE,
             metavar="UT",
-            help="Standard deviation of a sample.  [default: as measured]",
+            help="Standard deviation of a sample.  [default: as measured on the MLX90393]",
         ),
     ),
     section(
         "Robot",
         click.option(
             "--rate",
-            type=float,
+            type=options.POSITIVE,
             metavar="HZ",
-            help="Rate of the samples.  [default: the highest of the magnetometer]",
+            help="Sampling rate.  [default: the highest of the magnetometer]",
         ),
-        number("--speed", default=0.1, metavar="M/S", help="Speed of the robot."),
+        number(
+            "--speed", default=0.1, type=options.POSITIVE, metavar="M/S", help="Speed of the robot."
+        ),
         click.option(
             "--placement-error",
-            type=float,
+            type=options.POSITIVE,
             metavar="DEG",
             help="RMS error of the magnets' orientations.  [default: as calibrated, otherwise 6 "
-            "as of the published tags]",
+            "as for the published tags]",
         ),
     ),
 )

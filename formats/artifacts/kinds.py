@@ -286,9 +286,6 @@ class Boolean:
             raise InvalidValueError(f"expected true or false, not {type_name(value)}")
         return value
 
-    def parse_text(self, text: str) -> bool:
-        return self.parse({"true": True, "false": False}.get(text))
-
     def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> Any:
         return bool(value)
 
@@ -299,6 +296,7 @@ class Text:
 
     choices: tuple[str, ...] = ()
     is_blank_allowed: bool = True
+    hint: str | None = None
 
     @property
     def expected(self) -> str:
@@ -318,7 +316,9 @@ class Text:
             raise InvalidValueError(
                 f"{value!r} is not one of {choices}"
                 if len(self.choices) > 1
-                else f"expected {choices!r}, not {value!r}"
+                else f"expected {choices!r}, not {value!r}",
+                "",
+                self.hint,
             )
         if not (self.is_blank_allowed or value.strip()):
             raise InvalidValueError(f"expected {self.expected}")
@@ -344,9 +344,6 @@ class FilePath:
         if not isinstance(value, str) or not value:
             raise InvalidValueError(f"expected {self.expected}")
         return value
-
-    def parse_text(self, text: str) -> str:
-        return self.parse(text)
 
     def resolve(self, value: str, folder: Path) -> str:
         """Return the path of a file that is named in a TOML file of ``folder``."""
@@ -468,10 +465,6 @@ class ListOf:
         return tuple(
             parse_key(f"[{number}]", self.item, item, unit) for number, item in enumerate(value)
         )
-
-    def parse_text(self, text: str) -> tuple[Any, ...]:
-        item: Any = self.item
-        return (item.parse_text(text),)
 
     def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> Any:
         return [self.item.to_toml(item, unit) for item in value]

@@ -50,10 +50,10 @@ class LibraryMap:
 
 
 @functools.cache
-def entries() -> tuple[LibraryMap, ...]:
+def library_maps() -> tuple[LibraryMap, ...]:
     """Return all maps of the library in the order of their sizes."""
     maps = []
-    for item in (resources.files("locatk.formats.artifacts") / "floors").iterdir():
+    for item in (resources.files("locatk.formats.artifacts") / "library_maps").iterdir():
         if match := _FILE_NAME.fullmatch(item.name.removesuffix(".txt")):
             numbers = (int(match[key]) for key in ("detect", "rows", "columns"))
             maps.append(LibraryMap(item.name, match["alphabet"], match["window"], *numbers))
@@ -62,7 +62,7 @@ def entries() -> tuple[LibraryMap, ...]:
 
 @functools.cache
 def _codes(file: str) -> Codes:
-    text = (resources.files("locatk.formats.artifacts") / "floors" / file).read_text(
+    text = (resources.files("locatk.formats.artifacts") / "library_maps" / file).read_text(
         encoding="ascii"
     )
     return np.array([[int(digit, 16) for digit in line] for line in text.split()], np.int64)
@@ -80,11 +80,10 @@ def crop_map(options: DesignOptions) -> FloorMap | None:
         The options are invalid.
     """
     blank = empty_floor(options)
-    random = np.random.RandomState(
-        options.seed % 2**32
-    )  # its sequence is the same in all versions of numpy
+    # The sequence of a RandomState is the same in all versions of numpy.
+    random = np.random.RandomState(options.seed % 2**32)
     size = (options.rows, options.columns)
-    for entry in entries():
+    for entry in library_maps():
         if (entry.alphabet, entry.window) != (options.alphabet, options.window):
             continue
         rotations = [quarters for quarters in range(4) if _fits(size, entry, quarters)]

@@ -17,8 +17,6 @@ from locatk.formats.artifacts.schema import (
     Values,
     refuse_equal_positions,
 )
-from locatk.formats.sessions import capture_record
-from locatk.formats.sessions.reader import Session
 
 RECEIVER_FILE = "receiver.toml"
 """Name of the attachment that holds the receiver of a session."""
@@ -30,8 +28,6 @@ MAX_PHOTODIODES = 1_000
 
 NORMAL_LENGTH_TOLERANCE = 1e-3
 """Largest deviation of the length of a direction from 1, for rounded numbers."""
-
-LIGHTHOUSE_TOPIC = "/lighthouse/"
 
 
 def _receiver_of(values: Values) -> Receiver:
@@ -108,28 +104,3 @@ def receiver_attachments(receivers: Mapping[str, Receiver], devices: set[str]) -
     if texts and set(texts) == devices and len(set(texts.values())) == 1:
         return {RECEIVER_FILE: next(iter(texts.values()))}
     return {receiver_file(device): text for device, text in sorted(texts.items())}
-
-
-def read_receivers(session: Session) -> dict[str, Receiver]:
-    """Return the receiver of each device of a session; devices without one are left out.
-
-    Attachments take precedence. A recording of a Lighthouse deck without attachment, of an earlier
-    version, has the geometry of the deck.
-
-    Raises
-    ------
-    FormatError, ArtifactError
-        An attachment is damaged, or not a valid receiver.
-    """
-    prefix = receiver_file("").removesuffix(".toml")
-    topics = session.topics(LIGHTHOUSE_TOPIC)
-    devices = {topic.removeprefix(LIGHTHOUSE_TOPIC) for topic in topics}
-    for info in session.attachments():
-        if info.name.startswith(prefix) and info.name.endswith(".toml"):
-            devices.add(info.name.removeprefix(prefix).removesuffix(".toml"))
-    is_deck = (capture_record.capture(session) or {}).get("device") == DECK.name
-    receivers = {
-        device: attached_receiver(session, device) or (DECK if is_deck else None)
-        for device in sorted(devices)
-    }
-    return {device: receiver for device, receiver in receivers.items() if receiver is not None}

@@ -140,6 +140,8 @@ class Counts:
     def parse(self, value: Any, unit: Unit = NO_UNIT) -> dict[int, tuple[float, float]]:
         if not isinstance(value, dict):
             raise InvalidValueError(f"expected {self.expected}, not {type_name(value)}")
+        if not value:
+            raise InvalidValueError(f"expected {self.expected}, not an empty table")
         for key in value:
             if not re.fullmatch("[1-9]|1[0-6]", key):
                 raise InvalidValueError("expected a channel from 1 to 16 as key", key)
@@ -243,7 +245,7 @@ def _timed_visit(values: Values) -> MarkerVisit:
 _INTERVAL = Table(
     (
         Key("device", Text(), "device that rested on the marker"),
-        Key("start", Time(), "begin of its rest"),
+        Key("start", Time(), "start of its rest"),
         Key("end", Time(), "end of its rest"),
     ),
     _timed_visit,

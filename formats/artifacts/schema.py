@@ -69,7 +69,7 @@ REQUIRED: Any = object()
 MAX_FORMAT_VERSION = 10**6
 
 
-# ---- kinds
+# ---- kinds that need numpy or the TOML writer, which the module ``kinds`` must not import
 
 
 @dataclass(frozen=True)
@@ -222,6 +222,8 @@ class Table:
         unknown = [name for name in table if name not in names]
         near = difflib.get_close_matches(key.name, unknown, 1, MIN_KEY_SIMILARITY)
         hint = _TABLES_HINT if isinstance(key.kind, Tables) else None
+        if isinstance(key.kind, Text):
+            hint = key.kind.hint
         if near:
             hint = f"Is {near[0]!r} meant to be {key.name}?"
         raise InvalidValueError(f"missing key {key.name!r}", key.name, hint)
@@ -272,6 +274,7 @@ class Variant:
 
 
 _TABLES_HINT = "Write each one under [[{key}]]"
+_FORMAT_HINT = "This key names the kind of artifact: check that it is the right file"
 
 
 @dataclass(frozen=True)
@@ -456,7 +459,7 @@ def _header_table(*formats: str) -> Table:
     """Return the table of the header of a file of one of these formats (none: of any)."""
     return Table(
         (
-            Key("format", Text(formats), "kind of the file"),
+            Key("format", Text(formats, hint=_FORMAT_HINT), "kind of the file"),
             Key("format_version", Integer(1, MAX_FORMAT_VERSION), "version of the format"),
             Key("tool_version", Text(), "version of locatk that wrote the file", ""),
         ),
@@ -514,7 +517,9 @@ def read_format(path: str | os.PathLike[str], formats: Sequence[str] = ()) -> st
         It is not TOML, or of another format.
     """
     default = REQUIRED if formats else ""
-    table = Table((Key("format", Text(tuple(formats)), default=default),), is_open=True)
+    table = Table(
+        (Key("format", Text(tuple(formats), hint=_FORMAT_HINT), default=default),), is_open=True
+    )
     try:
         name: str = table.parse(toml.read(path))["format"]
     except InvalidValueError as error:

@@ -164,7 +164,7 @@ def run_single_threaded(call: str) -> list[float]:
     Parameters
     ----------
     call : str
-        Expression after ``locatk.formats.benchmarks.``, as in ``"dots.printing.memory()"``.
+        Expression after ``locatk.formats.benchmarks.``, as in ``"dots.printing.measure_memory()"``.
 
     Raises
     ------

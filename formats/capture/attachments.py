@@ -2,35 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from locatk.core.errors import InputError
 from locatk.formats import files
-from locatk.formats.artifacts import maps, sheets, tags
-from locatk.formats.artifacts import receiver as receivers
-from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.artifacts.schema import read_format
+from locatk.formats.artifacts.registry import attached_artifact, identify_artifact
 from locatk.formats.sessions.reader import Session
-
-KINDS: dict[str, tuple[str, Callable[..., Any]]] = {
-    artifacts.SCENE_FORMAT: (artifacts.SCENE_FILE, artifacts.loads_scene),
-    receivers.RECEIVER_FORMAT: (receivers.RECEIVER_FILE, receivers.loads_receiver),
-    sheets.MANIFEST_FORMAT: (sheets.SHEET_FILE, sheets.loads_manifest),
-    sheets.CAMERA_FORMAT: (sheets.CAMERA_FILE, sheets.loads_camera),
-    tags.TAG_FORMAT: (tags.TAG_FILE, tags.loads_tags),
-    tags.ARRAY_FORMAT: (tags.ARRAY_FILE, tags.loads_array),
-    maps.MAP_FORMAT: (maps.MAP_FILE, maps.loads_map),
-    maps.HALLS_FORMAT: (maps.HALLS_FILE, maps.loads_halls),
-}
-"""Format of an artifact to the name of its attachment and the function that parses it."""
-
-ATTACHED = dict(KINDS.values())
-"""Name of an attachment to the function that parses it."""
-
-BY_DEVICE = ("array", "halls", "receiver")
-"""Kinds that each device may have: ``array-<device>.toml``."""
 
 
 def attachments(paths: Iterable[Path]) -> dict[str, str]:
@@ -55,23 +33,21 @@ def attachments(paths: Iterable[Path]) -> dict[str, str]:
 def _of(path: Path) -> dict[str, str]:
     if path.suffix.lower() == ".mcap":
         return _of_session(path)
-    kind = read_format(path, tuple(KINDS))
-    name, loads = KINDS[kind]
+    artifact = identify_artifact(path).artifact
     text = files.read_text(path)
-    loads(text, file=path)
-    return {name: text}
+    artifact.loads(text, file=path)
+    return {artifact.file: text}
 
 
 def _of_session(path: Path) -> dict[str, str]:
     session = Session.open(path)
     texts = {}
     for info in session.attachments():
-        stem, dash, _ = info.name.partition("-")
-        loads = ATTACHED.get(f"{stem}.toml" if dash and stem in BY_DEVICE else info.name)
-        data = None if loads is None else session.attachment(info.name)
-        if loads is not None and data is not None:
+        entry = attached_artifact(info.name)
+        data = None if entry is None else session.attachment(info.name)
+        if entry is not None and data is not None:
             text = data.decode("utf-8", "replace")
-            loads(text, file=f"{path}:{info.name}")
+            entry.artifact.loads(text, file=f"{path}:{info.name}")
             texts[info.name] = text
     if not texts:
         raise InputError(

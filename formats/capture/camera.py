@@ -8,6 +8,7 @@ file.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import stat
@@ -21,7 +22,7 @@ from typing import Any, NamedTuple
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
 from locatk.formats.capture.port_listing import busy_error, find_port_users, permission_error
-from locatk.formats.importers.video import Video, is_cut
+from locatk.formats.importers.video import Video, is_cut, open_file, silence_opencv
 
 FORMATS = ("jpeg", "png")
 
@@ -50,17 +51,16 @@ class Frame(NamedTuple):
 
 
 class CameraPort:
-    """Camera, stream or video file; see :func:`port_of`."""
+    """Camera, stream or video file; see :func:`camera_port`."""
 
     def __init__(
-        self, place: str, *, clock: Callable[[], int], speed: float, format: str, grey: bool
+        self, address: str, *, clock: Callable[[], int], speed: float, format: str
     ) -> None:
-        self.name = f"camera:{place}"
-        self._address = place
+        self.name = f"camera:{address}"
+        self._address = address
         self._clock = clock
         self._speed = speed
         self._format = format
-        self._grey = grey
         self._properties: dict[str, str] = {}
         self.can_reconnect = not self._is_file()
 
@@ -84,42 +84,43 @@ class CameraPort:
         is_file = self._is_file()
         if is_file:
             _check_file(self._address)
-        capture = _opened(self._address, is_file)
-        if capture is None:
-            raise self._explain_error(is_file)
-        first = _grab(capture, self._clock)
-        if first is None:
-            capture.release()
-            raise SourceError(
-                f"{self.name} provides no frame",
-                hint="The video may be truncated"
-                if is_file
-                else "Check that no other program uses it",
+        with contextlib.ExitStack() as resources:
+            resources.enter_context(silence_opencv())
+            capture = _open_capture(self._address, is_file)
+            if capture is None:
+                raise self._explain_error(is_file)
+            resources.callback(capture.release)
+            first = _grab(capture, self._clock)
+            if first is None:
+                raise SourceError(
+                    f"{self.name} provides no frame",
+                    hint="The video may be truncated"
+                    if is_file
+                    else "Check that no other program uses it",
+                )
+            height, width = first[1].shape[:2]
+            self._properties = {
+                "width": str(width),
+                "height": str(height),
+                "fps": f"{_rate(capture):g}",
+                "backend": capture.getBackendName(),
+            }
+            return CameraLink(
+                capture,
+                first,
+                release=resources.pop_all().close,
+                clock=self._clock,
+                file=self._address if is_file else None,
+                speed=self._speed,
+                format=self._format,
             )
-        height, width = first[1].shape[:2]
-        self._properties = {
-            "width": str(width),
-            "height": str(height),
-            "fps": f"{_rate(capture):g}",
-            "backend": capture.getBackendName(),
-        }
-        return CameraLink(
-            capture,
-            first,
-            clock=self._clock,
-            file=self._address if is_file else None,
-            speed=self._speed,
-            format=self._format,
-            grey=self._grey,
-        )
 
     def describe(self) -> dict[str, str]:
-        """Return ``port``, ``format``, ``grey``; once it was open, also facts of the video.
+        """Return ``port`` and ``format``; once it was open, also facts of the video.
 
         These are ``width``, ``height``, ``fps`` (0 if unknown) and ``backend``, that of OpenCV.
         """
-        grey = {"grey": "true"} if self._grey else {}
-        return {"port": self.name, "format": self._format, **grey, **self._properties}
+        return {"port": self.name, "format": self._format, **self._properties}
 
     def _explain_error(self, is_file: bool) -> SourceError:
         if is_file or "://" in self._address:
@@ -140,19 +141,14 @@ class CameraPort:
         )
 
 
-def port_of(
-    place: str,
-    *,
-    clock: Callable[[], int],
-    speed: float = 1.0,
-    format: str = "jpeg",
-    grey: bool = False,
+def camera_port(
+    address: str, *, clock: Callable[[], int], speed: float = 1.0, format: str = "jpeg"
 ) -> CameraPort:
     """Return the camera at an address, not yet opened.
 
     Parameters
     ----------
-    place : str
+    address : str
         Number of a camera, URL (``rtsp://...``, ``http://...``), device or video file.
     clock : callable
         Returns the time in ns; called by several threads.
@@ -160,15 +156,13 @@ def port_of(
         Factor on the speed of a video file; 0 is as fast as it is read.
     format : str
         ``"jpeg"`` (quality 95) or ``"png"``, which is lossless.
-    grey : bool
-        Keep only the luminance.
 
     Raises
     ------
     SourceError
         The address or ``speed`` is invalid.
     """
-    if not place:
+    if not address:
         raise SourceError(
             "the name of the camera is empty", hint="Example: camera:0, camera:video.mp4"
         )
@@ -176,7 +170,7 @@ def port_of(
         raise SourceError(f"{speed} is not a valid speed", hint="Give 1, 10, or 0 for the fastest")
     if format not in FORMATS:
         raise ValueError(f"format {format!r} is none of {FORMATS}")
-    return CameraPort(place, clock=clock, speed=speed, format=format, grey=grey)
+    return CameraPort(address, clock=clock, speed=speed, format=format)
 
 
 class CameraLink:
@@ -193,19 +187,19 @@ class CameraLink:
         capture: Any,
         first: tuple[int, Any],
         *,
+        release: Callable[[], object],
         clock: Callable[[], int],
         file: str | None,
         speed: float,
         format: str,
-        grey: bool,
     ) -> None:
         self.dropped = 0
         self._capture = capture
+        self._release = release
         self._clock = clock
         self._file = file
         self._speed = speed
         self._format = format
-        self._grey = grey
         self._waiting = deque([first])
         self._bytes = int(first[1].nbytes)
         self._end: LinkEnded | LinkLost | None = None
@@ -240,8 +234,6 @@ class CameraLink:
     def _encode(self, time_ns: int, pixels: Any) -> Frame:
         import cv2
 
-        if self._grey and pixels.ndim == 3:
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
         options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if self._format == "jpeg" else []
         suffix = ".jpg" if self._format == "jpeg" else ".png"
         done, data = cv2.imencode(suffix, pixels, options)
@@ -266,7 +258,7 @@ class CameraLink:
         except Exception as error:  # Any error of a driver must be reported.
             end = LinkLost(f"{type(error).__name__}: {error}")
         finally:
-            self._capture.release()
+            self._release()
         with self._changed:
             self._end = end
             self._changed.notify_all()
@@ -328,34 +320,27 @@ def _check_file(path: str) -> None:
         raise SourceError(error.message, file=path, hint=error.hint) from None
 
 
-def _opened(place: str, is_file: bool) -> Any:
-    """Return an open ``cv2.VideoCapture``, or None; messages of OpenCV are switched off."""
-    # Read by the library when it opens its first video; -8 disables all messages.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+def _open_capture(address: str, is_file: bool) -> Any:
+    """Return an open ``cv2.VideoCapture``, or None."""
     import cv2
 
-    # This function moved between OpenCV 4 and 5.
-    (cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging).setLogLevel(0)
     capture = cv2.VideoCapture()
     if is_file:
-        # An absolute path cannot be mistaken for a network address.
-        is_ok = capture.open(os.path.abspath(place), cv2.CAP_FFMPEG)
-        # Keep the orientation of the sensor.
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    elif "://" in place:
+        is_open = open_file(capture, address)
+    elif "://" in address:
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC]
         options = [value for limit in limits for value in (limit, TIMEOUT_MS)]
-        is_ok = capture.open(place, cv2.CAP_FFMPEG, options)
-    elif place.isdecimal():
-        is_ok = capture.open(int(place), cv2.CAP_ANY)
+        is_open = capture.open(address, cv2.CAP_FFMPEG, options)
+    elif address.isdecimal():
+        is_open = capture.open(int(address), cv2.CAP_ANY)
     else:
         # Other backends would read from any device, and block.
-        is_ok = capture.open(place, cv2.CAP_V4L2)
-    return capture if is_ok else None
+        is_open = capture.open(address, cv2.CAP_V4L2)
+    return capture if is_open else None
 
 
 def _grab(capture: Any, clock: Callable[[], int]) -> tuple[int, Any] | None:
-    """Return (time in ns, pixels) of the next frame; None if is_ok is none."""
+    """Return (time in ns, pixels) of the next frame; None if there is none."""
     is_ok = capture.grab()
     time_ns = clock()
     if is_ok:

@@ -18,12 +18,12 @@ from locatk.core.clock_sync import TickClock
 from locatk.formats.artifacts import maps
 from locatk.formats.capture.clocks import ArrivalTimes, DeviceClock
 from locatk.formats.capture.reader_thread import ReceivedData
-from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.devices import Device, find_device
 from locatk.formats.devices.decoder import Batch, Counts, Decoder, Options, Stream
 from locatk.formats.devices.identification import MAX_IDENTIFICATION_S, Identifier, Verdict
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import frames, messages
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, Layout
 
 PAUSE_NS = 3_000_000
@@ -57,10 +57,10 @@ class Intake(Protocol):
         """Return the messages that are due at ``now_ns``, whether or not data were received."""
 
     def restart(self) -> Iterator[StampedMessage]:
-        """Return the messages that were pending back, after a reconnect."""
+        """Return the messages that were held back, after a reconnect."""
 
     def finish(self) -> Iterator[StampedMessage]:
-        """Return the messages that were pending back, at the end."""
+        """Return the messages that were held back, at the end."""
 
     def count(self, totals: CaptureStatistics) -> None:
         """Write the counts into ``totals``."""
@@ -124,7 +124,7 @@ class SerialIntake:
         self._first_ns: int | None = None
         text = (artifacts or {}).get(maps.HALLS_FILE)
         halls = () if text is None else maps.loads_halls(text).names
-        self._streams = MessageEncoder(name, halls)
+        self._encoder = MessageEncoder(name, halls)
         self._arrivals = ArrivalTimes()
         self._streams_by_device: dict[tuple[str, str], Stream] = {}
         self._with_artifacts: set[Stream] = set()
@@ -209,7 +209,8 @@ class SerialIntake:
         """
         self._opened = opened
         yield from self._records(self._restart_decoder)
-        self._streams.restart()  # after what was pending back, which is of the time before
+        # After what was held back, which was received before the reconnect.
+        self._encoder.restart()
 
     def _restart_decoder(self) -> list[Batch]:
         if self._decoder is not None:
@@ -226,7 +227,7 @@ class SerialIntake:
         self._offset = offset
 
     def finish(self) -> Iterator[StampedMessage]:
-        """Return the records that the decoder pending back."""
+        """Return the records that the decoder held back."""
         yield from self._records(self._settle)
         if self._decoder is not None:
             yield from self._records(self._decoder.finish)
@@ -238,13 +239,13 @@ class SerialIntake:
         """
         try:
             batches = decode()
-            stamped = list(self._streams.messages(batches, self._arrivals, self._last_ns or 0))
+            stamped = list(self._encoder.messages(batches, self._arrivals, self._last_ns or 0))
         except Exception as error:  # The decoder may be of another package.
             self._stop_decoding(error)
             return []
         for batch in batches:
             if len(batch):
-                self._streams_by_device[batch.stream.kind, self._streams.device(batch.stream)] = (
+                self._streams_by_device[batch.stream.kind, self._encoder.device(batch.stream)] = (
                     batch.stream
                 )
                 self.system = self.system or SYSTEMS.get(batch.stream.kind, "")
@@ -269,12 +270,12 @@ class SerialIntake:
         counts = self._counts
         totals.frames, totals.bad, totals.lost = counts.frames, counts.bad, counts.lost
         totals.skipped, totals.unknown = counts.skipped, counts.unknown
-        totals.samples = dict(self._streams.samples)
+        totals.samples = dict(self._encoder.samples)
 
     def remarks(self) -> list[str]:
         """Return new remarks of the decoder and the identification."""
-        remarks, self._remarks = self._remarks + self._streams.remarks, []
-        self._streams.remarks = []
+        remarks, self._remarks = self._remarks + self._encoder.remarks, []
+        self._encoder.remarks = []
         if self._decoder is not None:
             remarks += self._decoder.remarks
             self._decoder.remarks.clear()
@@ -283,7 +284,7 @@ class SerialIntake:
     def clocks(self) -> dict[str, str]:
         """Return offset, drift and jitter (95th percentile of the delay) of each device's clock."""
         entries: dict[str, str] = {}
-        for name, clock in self._streams.clocks().items():
+        for name, clock in self._encoder.clocks().items():
             if clock.jitter_ns is not None and clock.jitter_ns[1] < 0:
                 continue  # Ticks ahead of their arrival belong to no clock in step with the host.
             if clock.offset_ns is not None:
@@ -297,7 +298,7 @@ class SerialIntake:
 
     def rates(self) -> dict[str, float]:
         """Return decoded records per second by topic."""
-        return self._streams.rates()
+        return self._encoder.rates()
 
     def artifacts(self) -> dict[str, str]:
         """Return the default artifacts of the device, by its streams."""
@@ -432,7 +433,7 @@ class MessageEncoder:
         self.remarks: list[str] = []
         self._first: dict[str, int] = {}
         self._last: dict[str, int] = {}
-        self._times_of: dict[str, DeviceClock] = {}
+        self._clock_by_device: dict[str, DeviceClock] = {}
         self.samples: Counter[str] = Counter()
 
     def device(self, stream: Stream) -> str:
@@ -450,11 +451,13 @@ class MessageEncoder:
 
     def clocks(self) -> dict[str, TickClock]:
         """Return the clock model of each device that sends plausible ticks."""
-        return {name: clock.model for name, clock in self._times_of.items() if clock.rate is None}
+        return {
+            name: clock.model for name, clock in self._clock_by_device.items() if clock.rate is None
+        }
 
     def restart(self) -> None:
         """Restart the clock models after a reconnect."""
-        for clock in self._times_of.values():
+        for clock in self._clock_by_device.values():
             clock.restart()
 
     def messages(
@@ -512,9 +515,9 @@ class MessageEncoder:
         if batch.tick is None or ticks is None:
             return arrivals.wire_ns(batch.end)
         device = self.device(batch.stream)
-        clock = self._times_of.get(device)
+        clock = self._clock_by_device.get(device)
         if clock is None or clock.ticks != ticks:
-            clock = self._times_of[device] = DeviceClock(ticks)
+            clock = self._clock_by_device[device] = DeviceClock(ticks)
         believed = clock.rate is None
         times = clock.times(batch.stream.kind, batch.tick, arrivals.read_ns(batch.end))
         if believed and clock.rate is not None:

@@ -8,7 +8,6 @@ hints name the usual programs.
 from __future__ import annotations
 
 import os
-import re
 import stat
 import sys
 from collections import defaultdict
@@ -17,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from locatk.core.natural_order import natural_key
 from locatk.formats.capture.links import SourceError
 
 TTY_CLASS_DIR = Path("/sys/class/tty")
@@ -73,7 +73,7 @@ def find_ports_with_users() -> list[PortInfo]:
 def find_ports() -> list[PortInfo]:
     """Return all ports in natural order of their names."""
     ports = [_info(port) for port in _comports() if _exists(port.device)]
-    return sorted(ports, key=lambda info: _natural(info.device))
+    return sorted(ports, key=lambda info: natural_key(info.device))
 
 
 def _comports() -> list[Any]:
@@ -116,12 +116,6 @@ def _exists(device: str) -> bool:
         return (TTY_CLASS_DIR / name / "type").read_text(encoding="ascii").strip() != "0"
     except OSError:
         return True
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that orders ttyS10 after ttyS9."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
 PROC_DIR = Path("/proc")

@@ -100,7 +100,7 @@ class PortReader:
         self.high_water = 0
         self.pauses = 0
         """How often reading stopped because too much was waiting."""
-        self._thread = threading.Thread(target=self._run, name="locatk-receiver", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="locatk-reader", daemon=True)
 
     def start(self) -> None:
         """Start the thread."""
@@ -109,7 +109,7 @@ class PortReader:
     def stop(self) -> bool:
         """Read the bytes that have arrived, close the port and end the thread.
 
-        Return False if the thread hangs in a driver; it is remaining behind then.
+        Return False if the thread hangs in a driver; the thread is then left running.
         """
         if not self._stop.is_set():
             self._stop.set()

@@ -25,7 +25,8 @@ from locatk.formats.capture.reader_thread import (
     SourceEnded,
 )
 from locatk.formats.capture.recording_files import CHUNK_BYTES, RecordingFiles
-from locatk.formats.capture.statistics import CaptureStatistics, CaptureStatus, RecordingResult
+from locatk.formats.capture.status import CaptureStatus, RecordingResult
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
 
 WRITE_INTERVAL_S = 0.02
 """Interval between batches of received data; a message of a stream covers about so much time."""
@@ -92,10 +93,10 @@ class Recorder:
 
     Parameters
     ----------
-    receiver : PortReader
+    reader : PortReader
         Not yet started.
     intake : Intake
-    parts : RecordingFiles
+    files : RecordingFiles
     clock : HostClock
     limits : Limits
     tell : callable
@@ -106,16 +107,16 @@ class Recorder:
 
     def __init__(
         self,
-        receiver: PortReader,
+        reader: PortReader,
         intake: Intake,
-        parts: RecordingFiles,
+        files: RecordingFiles,
         clock: HostClock,
         limits: Limits,
         *,
         tell: Callable[[str], None],
         show: Callable[[CaptureStatus], None],
     ) -> None:
-        self._receiver, self._intake, self._parts = receiver, intake, parts
+        self._reader, self._intake, self._files = reader, intake, files
         self._clock, self._limits = clock, limits
         self._tell, self._show = tell, show
         self._totals = CaptureStatistics()
@@ -134,8 +135,8 @@ class Recorder:
         """
         self._start_ns = self._part_ns = self._last_data_ns = self._clock.now()
         self._silent = False
-        self._parts.flush()
-        self._receiver.start()
+        self._files.flush()
+        self._reader.start()
         syncing = threading.Event()
         syncer = threading.Thread(
             target=self._sync, args=(syncing,), name="locatk-sync", daemon=True
@@ -143,57 +144,55 @@ class Recorder:
         syncer.start()
         try:
             ended, failed = self._write_until_end(stop)
-            if not self._receiver.stop():
+            if not self._reader.stop():
                 self._report("the driver of the port hangs: bytes in its buffer are not recorded")
             self._write_remaining()
-        except (
-            LocatkError,
-            OSError,
-        ) as error:  # Errors of the disk; those of the port are events of the reader.
-            self._receiver.stop()
+        # Errors of the disk; those of the port are events of the reader.
+        except (LocatkError, OSError) as error:
+            self._reader.stop()
             ended, failed = self._disk_error(error), True
         except BaseException as error:
-            self._parts.finish(self._facts(f"{type(error).__name__}: {error}"))
+            self._files.finish(self._facts(f"{type(error).__name__}: {error}"))
             raise
         finally:
-            self._receiver.stop()
+            self._reader.stop()
             syncing.set()
         recorded = RecordingResult(
             totals=self._count(),
-            paths=self._parts.paths,
+            paths=self._files.paths,
             device=self._device(),
             started_ns=self._start_ns,
             ended_ns=self._clock.now(),
             ended=ended,
             failed=failed,
             system=self._intake.system,
-            artifacts=sorted(self._parts.artifacts),
+            artifacts=sorted(self._files.artifacts),
             clocks=self._intake.clocks(),
             rates=self._intake.rates(),
         )
-        if self._parts.is_gone():
+        if self._files.is_gone():
             recorded.failed = True
-            recorded.ended += f"; {self._parts.file.path} was removed or replaced"
+            recorded.ended += f"; {self._files.file.path} was removed or replaced"
         try:
-            self._parts.finish(self._facts(ended))
+            self._files.finish(self._facts(ended))
         except OSError as error:
             recorded.failed = True
-            missing = self._receiver.received - self._flushed_bytes
+            missing = self._reader.received - self._flushed_bytes
             recorded.ended = (
                 f"{error}; the end of the file is missing, with up to {missing} received bytes: "
                 "use `locatk recover`"
             )
-        recorded.file_bytes = self._parts.bytes_written
+        recorded.file_bytes = self._files.bytes_written
         syncer.join(self._limits.sync_s)
         return recorded
 
     def _flush(self) -> None:
-        self._parts.flush()
+        self._files.flush()
         self._flushed_bytes = self._count().bytes
 
     def _disk_error(self, error: LocatkError | OSError) -> str:
         """Return the error of the disk, and the number of received bytes that are not saved."""
-        unsaved = self._receiver.received - self._count().bytes
+        unsaved = self._reader.received - self._count().bytes
         return f"{error}" + (f"; {unsaved} received bytes are not in the file" if unsaved else "")
 
     def _write_until_end(self, stop: threading.Event) -> tuple[str, bool]:
@@ -203,7 +202,7 @@ class Recorder:
         while True:
             over = self._reason_to_stop(stop)
             ended = None
-            for events in _split_events(self._receiver.take()):
+            for events in _split_events(self._reader.take()):
                 ended = self._write(events) or ended
                 if self._is_full():
                     return "max-size", False
@@ -234,7 +233,7 @@ class Recorder:
 
     def _is_full(self) -> bool:
         limit = self._limits.max_bytes
-        return limit is not None and self._parts.bytes_written >= limit
+        return limit is not None and self._files.bytes_written >= limit
 
     def _elapsed_s(self) -> float:
         return (self._clock.now() - self._start_ns) * 1e-9
@@ -259,9 +258,9 @@ class Recorder:
             else:
                 ended = event
         self._take(received)
-        self._parts.write(self._intake.turn(self._clock.now()))
-        self._parts.system(self._intake.system)
-        self._parts.attach(self._intake.artifacts())
+        self._files.write(self._intake.turn(self._clock.now()))
+        self._files.system(self._intake.system)
+        self._files.attach(self._intake.artifacts())
         for remark in self._intake.remarks():
             self._report(remark)
         return ended
@@ -269,7 +268,7 @@ class Recorder:
     def _take(self, received: Sequence[ReceivedData]) -> None:
         if received:
             self._rotate()  # Before the first byte of a part, so that none is empty.
-            self._parts.write(self._intake.take(received))
+            self._files.write(self._intake.take(received))
 
     def _close_gap(self, event: Reconnected) -> None:
         assert self._disconnected_ns is not None
@@ -277,16 +276,16 @@ class Recorder:
         self._totals.gap_s += away_s
         self._disconnected_ns = None
         self._last_data_ns = event.time_ns
-        self._parts.write(self._intake.restart())
+        self._files.write(self._intake.restart())
         self._report(f"reconnected to {event.path} after {away_s:.1f} s", event.time_ns)
 
     def _write_remaining(self) -> None:
         """Write the data received between the last batch and the end."""
         if not self._is_full():
-            self._write(self._receiver.take())
+            self._write(self._reader.take())
         if self._disconnected_ns is not None:
             self._totals.gap_s += (self._clock.now() - self._disconnected_ns) * 1e-9
-        self._parts.write(self._intake.finish())
+        self._files.write(self._intake.finish())
         for remark in self._intake.remarks():
             self._report(remark)
 
@@ -295,7 +294,7 @@ class Recorder:
     ) -> str:
         """Run the checks of each second; return why to stop, ``""`` for no reason."""
         new = totals.since(before)
-        free = self._parts.file.free()
+        free = self._files.file.free()
         rate = new.bytes / elapsed_s
         self._show(
             CaptureStatus(
@@ -306,22 +305,21 @@ class Recorder:
                 rate,
                 new.frames / elapsed_s,
                 totals,
-                self._parts.bytes_written,
+                self._files.bytes_written,
                 free,
             )
         )
         self._check_silence()
         self._check_clock()
         self._check_frames(totals)
-        if self._receiver.pauses > self._pauses:
-            self._pauses = self._receiver.pauses
+        if self._reader.pauses > self._pauses:
+            self._pauses = self._reader.pauses
             self._report("the disk is slower than the port: reading is paused")
         return "" if free is None else self._check_disk(free)
 
     def _check_silence(self) -> None:
-        last_data_ns = max(
-            self._last_data_ns, self._receiver.last_data_ns
-        )  # Newer data may wait to be written.
+        # Newer data may wait to be written.
+        last_data_ns = max(self._last_data_ns, self._reader.last_data_ns)
         silent_s = (self._clock.now() - last_data_ns) * 1e-9
         if (
             self._disconnected_ns is None
@@ -364,7 +362,7 @@ class Recorder:
         available = free - self._limits.reserve_bytes
         if available <= 0:
             return "the disk is full up to --reserve"
-        per_s = self._parts.bytes_written / max(self._elapsed_s(), 1.0)
+        per_s = self._files.bytes_written / max(self._elapsed_s(), 1.0)
         if per_s > 0 and available / per_s < DISK_WARNING_S:
             if not self._disk_reported:
                 self._report(f"at this rate the disk will be full in {available / per_s:.0f} s")
@@ -379,29 +377,29 @@ class Recorder:
             limits.rotate_s is not None
             and (self._clock.now() - self._part_ns) * 1e-9 >= limits.rotate_s
         )
-        big = limits.rotate_bytes is not None and self._parts.part_bytes >= limits.rotate_bytes
+        big = limits.rotate_bytes is not None and self._files.part_bytes >= limits.rotate_bytes
         if old or big:
-            self._parts.next_part(self._facts("continued in the next part"))
+            self._files.next_part(self._facts("continued in the next part"))
             self._part_ns = self._clock.now()
             self._part_began = self._count()
-            self._parts.flush()
+            self._files.flush()
 
     def _report(self, text: str, time_ns: int | None = None) -> None:
         """Report a message to the user and in the session.
 
         Without a time it gets that of the last message, because earlier bytes may still wait.
         """
-        self._parts.log(text, time_ns or self._start_ns, level=Log.WARNING)
+        self._files.log(text, time_ns or self._start_ns, level=Log.WARNING)
         self._tell(text)
 
     def _count(self) -> CaptureStatistics:
         """Return the present statistics."""
         totals = self._totals
         self._intake.count(totals)
-        overruns = self._receiver.overruns
+        overruns = self._reader.overruns
         totals.overruns, totals.line_errors = overruns.lost, overruns.frame + overruns.parity
-        totals.dropped = self._receiver.dropped
-        totals.high_water_bytes = self._receiver.high_water
+        totals.dropped = self._reader.dropped
+        totals.high_water_bytes = self._reader.high_water
         totals.clock_step_s = self._step_s
         return CaptureStatistics(**vars(totals))
 
@@ -419,4 +417,4 @@ class Recorder:
     def _sync(self, done: threading.Event) -> None:
         """Force the file to the disk repeatedly, in a thread of its own."""
         while not done.wait(self._limits.sync_s):
-            self._parts.file.sync()
+            self._files.file.sync()

@@ -23,9 +23,8 @@ from google.protobuf.message import Message
 
 from locatk.core.errors import LocatkError, OutputExistsError
 from locatk.formats.capture.ingestion import StampedMessage
-from locatk.formats.capture.statistics import RECORD
 from locatk.formats.output import check_output
-from locatk.formats.sessions.mcap_file import SESSION_RECORD
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, SESSION_RECORD
 from locatk.formats.sessions.messages import timestamp
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -96,9 +95,8 @@ class RecordingFiles:
         self._last_ns = 0
         self.paths: list[Path] = []
         self._is_open = False
-        if (
-            numbered and overwrite
-        ):  # Remaining parts of an older recording would look like parts of this one.
+        # Parts of an older, longer recording would look like parts of this one.
+        if numbered and overwrite:
             old_parts = parts_of(path)
             for old in old_parts:
                 check_idle(old)
@@ -120,7 +118,7 @@ class RecordingFiles:
             facts["part"] = str(number)
         if number > 1:
             facts["started_ns"] = str(self._last_ns)
-        self._writer.metadata(RECORD, facts)
+        self._writer.metadata(CAPTURE_RECORD, facts)
         for name, text in self._artifacts.items():
             self._writer.attach_toml(name, text)
         for topic, message_class in self._content.declared:
@@ -165,9 +163,8 @@ class RecordingFiles:
             self._writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
             self._last_ns = max(self._last_ns, each.time_ns)
             self._pending += each.message.ByteSize()
-            if (
-                self._pending >= CHUNK_BYTES
-            ):  # Before the MCAP writer does, which allocates no space.
+            # Flush before the MCAP writer does, which allocates no space.
+            if self._pending >= CHUNK_BYTES:
                 self.flush()
 
     def log(self, text: str, time_ns: int, *, level: int = Log.WARNING) -> None:
@@ -205,7 +202,7 @@ class RecordingFiles:
             return
         self._is_open = False
         try:
-            self._writer.metadata(RECORD, facts)
+            self._writer.metadata(CAPTURE_RECORD, facts)
             self._writer.__exit__(None, None, None)
         finally:
             self._finished_bytes += self.file.tell()

@@ -12,10 +12,10 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from locatk.core.errors import FormatError
 from locatk.formats.capture.ingestion import AUTO, SerialIntake, StampedMessage
 from locatk.formats.capture.reader_thread import ReceivedData
-from locatk.formats.capture.statistics import RECORD, CaptureStatistics
 from locatk.formats.devices.decoder import Options
 from locatk.formats.schemas.serial_pb2 import SerialChunk
-from locatk.formats.sessions.mcap_file import CHANNELS_RECORD, SESSION_RECORD
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, CHANNELS_RECORD, SESSION_RECORD
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -87,7 +87,7 @@ def decode(
             file=session.path,
             hint="Give a recording of `locatk capture`; `locatk emulate` encodes other sessions",
         )
-    recorded = session.metadata().get(RECORD, {})
+    recorded = session.metadata().get(CAPTURE_RECORD, {})
     name = device or recorded.get("device") or AUTO
     attached = {**_attached(session), **(artifacts or {})}
     intakes = {
@@ -113,11 +113,11 @@ def decode(
             if data is not None and info.name not in attached:
                 writer.attach(info.name, data, info.media_type, info.time_ns)
         for key, record in session.metadata().items():
-            if key not in (SESSION_RECORD, RECORD, CHANNELS_RECORD):
+            if key not in (SESSION_RECORD, CAPTURE_RECORD, CHANNELS_RECORD):
                 writer.metadata(key, record)
         decoded = _decoded(intakes)
         writer.metadata(SESSION_RECORD, {"system": decoded.system})
-        writer.metadata(RECORD, _facts(recorded, intakes, decoded, Path(session.path).name))
+        writer.metadata(CAPTURE_RECORD, _facts(recorded, intakes, decoded, Path(session.path).name))
     return decoded
 
 
@@ -169,7 +169,8 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
     for topic, time_ns, payload in session.messages([*intakes, "/log"]):
         if topic == "/log":
             line = Log.FromString(payload)
-            if line.name.startswith("locatk"):  # not of a device: those are decoded is_reconnect
+            # Log messages of a device are decoded again; only those of the recorder are copied.
+            if line.name.startswith("locatk"):
                 yield from _decode_waiting(intakes, waiting)
                 yield StampedMessage("/log", line, time_ns, time_ns)
             continue

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from locatk.core.errors import InputError, LocatkError
-from locatk.formats.capture import attachments as artifacts
 from locatk.formats.capture import ports, replay
+from locatk.formats.capture.attachments import attachments
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import AUTO, CameraIntake, Intake, SerialIntake
 from locatk.formats.capture.links import Link, Port, SourceError
@@ -26,7 +26,7 @@ from locatk.formats.capture.recording_files import (
     RecordingFiles,
     check_outputs,
 )
-from locatk.formats.capture.statistics import CaptureStatus, RecordingResult
+from locatk.formats.capture.status import CaptureStatus, RecordingResult
 from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Options
 
@@ -112,7 +112,7 @@ def record(
     try:
         ready(port.name)
         facts = _facts(request, port, clock)
-        parts = RecordingFiles(
+        files = RecordingFiles(
             request.output,
             FileContent(facts, content, intake.declared),
             numbered=request.numbered,
@@ -121,8 +121,8 @@ def record(
     except BaseException:
         link.close()
         raise
-    receiver = PortReader(port, link, clock)
-    recorder = Recorder(receiver, intake, parts, clock, request.limits, tell=tell, show=show)
+    reader = PortReader(port, link, clock)
+    recorder = Recorder(reader, intake, files, clock, request.limits, tell=tell, show=show)
     return recorder.run(stop)
 
 
@@ -130,11 +130,10 @@ def _artifacts(request: CaptureRequest) -> dict[str, str]:
     """Return the attachments: those of a replayed session, and those given."""
     replayed: dict[str, str] = {}
     for path in _replayed_paths(request.port):
-        with contextlib.suppress(
-            LocatkError
-        ):  # Not a session, or without artifacts: opening the port reports it.
-            replayed |= artifacts.attachments([path])
-    return {**replayed, **artifacts.attachments(request.artifacts)}
+        # Not a session, or one without artifacts: opening the port reports it.
+        with contextlib.suppress(LocatkError):
+            replayed |= attachments([path])
+    return {**replayed, **attachments(request.artifacts)}
 
 
 def _open_port(
@@ -210,11 +209,10 @@ def _intake(request: CaptureRequest, content: Mapping[str, str]) -> Intake:
 
 def _port(request: CaptureRequest, clock: HostClock) -> Port:
     if request.is_camera:
-        from locatk.formats.capture import (
-            camera,
-        )  # OpenCV is slow to import, and not needed for bytes.
+        # OpenCV is slow to import, and not needed for bytes.
+        from locatk.formats.capture.camera import camera_port
 
-        return camera.port_of(
+        return camera_port(
             request.port.removeprefix(CAMERA),
             clock=clock.now,
             speed=request.speed,

@@ -1,7 +1,7 @@
 """Registry of the devices whose bytes locatk decodes, and sends when it emulates them.
 
-Each device is one module behind the contract of :mod:`.decoder`. Other packages add devices
-through the entry-point group ``locatk.devices``, whose entries point to a :class:`Device`.
+Each device is a module or package behind the contract of :mod:`.decoder`. Other distributions add
+devices through the entry-point group ``locatk.devices``, whose entries point to a :class:`Device`.
 """
 
 from __future__ import annotations

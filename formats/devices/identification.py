@@ -51,9 +51,6 @@ UNKNOWN_DEVICE = "raw"
 
 _PRINTABLE = bytes([*b"\t\n\r\x1b", *range(0x20, 0x7F)])
 
-CERTAIN, LIKELY, UNKNOWN = "sure", "likely", "none"
-"""Values of :attr:`Verdict.confidence`."""
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -63,14 +60,11 @@ class Verdict:
     ----------
     device : str
         Name of the device; ``"raw"`` if the bytes match none.
-    confidence : str
-        ``"sure"``, ``"likely"``, or ``"none"`` if the bytes match none.
     why : str
         Reason, as a phrase for the user.
     """
 
     device: str
-    confidence: str
     why: str
 
 
@@ -232,10 +226,10 @@ class Identifier:
                     for each in self._candidates
                     if self._is_match(each, _CERTAIN_PLAIN)
                     and (each.name == TEXT_DEVICE or not each.decoder.remarks)
-                    and self._is_not_chance(each)
+                    and self._beats_permutation(each)
                 ]
             if len(certain) == 1:
-                self._decide(certain[0], CERTAIN)
+                self._decide(certain[0])
         return self._verdict
 
     def settle(self) -> Verdict:
@@ -255,13 +249,13 @@ class Identifier:
         ]
         others = [each for each in self._candidates if self._is_match(each, _LIKELY_PLAIN)]
         for candidate in (*_best_first(with_checksum), *_best_first(others)):
-            if candidate in with_checksum or self._is_not_chance(candidate):
-                return self._decide(candidate, LIKELY)
+            if candidate in with_checksum or self._beats_permutation(candidate):
+                return self._decide(candidate)
         text = next((each for each in self._candidates if each.name == TEXT_DEVICE), None)
         if text is not None and text.meets(_LIKELY_LINE) and self._is_text():
-            return self._decide(text, LIKELY)
+            return self._decide(text)
         reason = "; ".join([self._reason_unknown(), *self._failures])
-        self._verdict = Verdict(UNKNOWN_DEVICE, UNKNOWN, reason)
+        self._verdict = Verdict(UNKNOWN_DEVICE, reason)
         return self._verdict
 
     def _is_match(self, candidate: _Candidate, required: _Requirement) -> bool:
@@ -277,7 +271,7 @@ class Identifier:
         printable = len(self._data) - len(bytes(self._data).translate(None, _PRINTABLE))
         return printable >= MIN_PRINTABLE_FRACTION * len(self._data)
 
-    def _is_not_chance(self, candidate: _Candidate) -> bool:
+    def _beats_permutation(self, candidate: _Candidate) -> bool:
         """Return whether the decoder finds far fewer frames in the permuted bytes."""
         if candidate.name == TEXT_DEVICE or candidate.is_proven:
             return True
@@ -299,7 +293,7 @@ class Identifier:
         candidate.is_proven = control.frames <= _MAX_CHANCE_FRACTION * candidate.frames
         return candidate.is_proven
 
-    def _decide(self, candidate: _Candidate, confidence: str) -> Verdict:
+    def _decide(self, candidate: _Candidate) -> Verdict:
         units = "lines" if candidate.name == TEXT_DEVICE else "frames"
         if candidate.name in CHECKSUM_DEVICES:
             units += " with a valid checksum"
@@ -307,7 +301,7 @@ class Identifier:
             f"{candidate.frames} {units} in the first {len(self._data)} bytes, "
             f"{candidate.fraction:.0%} of the bytes since the first one"
         )
-        self._verdict = Verdict(candidate.name, confidence, reason)
+        self._verdict = Verdict(candidate.name, reason)
         return self._verdict
 
     def _reason_unknown(self) -> str:

@@ -160,7 +160,7 @@ class RandomEvents:
         blocks = [self._upcoming]
         last = int(self._upcoming[-1]) if len(self._upcoming) else start - 1
         while last < self._done:
-            # A gap is cut where it has no end: sums of them must stay within 64 bits.
+            # A tiny probability gives huge gaps; their sums must stay within 64 bits.
             gaps = np.minimum(self._random.geometric(self._probability, DRAWN_GAPS), 1 << 48)
             blocks.append(last + np.cumsum(gaps))
             last = int(blocks[-1][-1])

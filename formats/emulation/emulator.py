@@ -63,7 +63,9 @@ class EmulationPlan:
 
 @dataclass
 class EmulationCounts:
-    """Counts of bytes; ``made`` is the sum of ``sent``, ``dropped``, ``unheard`` and ``overrun``.
+    """Counts of the bytes that an emulated device sent, and of those that were lost.
+
+    Each byte is counted once: ``made`` = ``sent`` + ``dropped`` + ``unheard`` + ``overrun``.
 
     Attributes
     ----------
@@ -245,8 +247,8 @@ class Emulator:
             self._plug_change_s += self._plan.away_s
 
     def _unplug(self) -> None:
-        # What is unread is taken back to be counted. A reader at work meanwhile would see a
-        # hole there and something after it, so it is let come to the end of what was sent.
+        # Unread bytes are removed and counted as lost. Removing them while a reader is active would
+        # leave a hole in its data, so the reader may first read up to the last byte sent.
         self._wait_until_read(UNPLUG_WAIT_S, stoppable=False)
         self._count_unread(self._port.unplug())
         self._reader_since_s = None

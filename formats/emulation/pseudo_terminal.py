@@ -66,7 +66,7 @@ class PseudoTerminal:
         exclusive = self._release()
         events = _poll(self._master, select.POLLIN)
         alone = bool(events & select.POLLHUP)
-        # It cannot be opened if a reader came and locked it in this very moment.
+        # Opening fails if a reader has opened and locked it since the check.
         with contextlib.suppress(OSError):
             self._slave = os.open(self.name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         if not alone:
@@ -128,7 +128,7 @@ class PseudoTerminal:
         for _ in range(MAX_READS):
             if not self.has_unread():
                 break
-            # Another one may be reading at this very moment, and keeps it for as long.
+            # Reading fails if a reader takes the bytes at the same time.
             with contextlib.suppress(BlockingIOError):
                 taken += len(os.read(self._slave, READ_BYTES))
         return taken
@@ -213,7 +213,7 @@ class PseudoPort:
         if self._terminal is None:
             return 0
         terminal, self._terminal = self._terminal, None
-        # The terminal's number may soon be another one's, so the link goes first.
+        # The link is removed first, because a new terminal may get the number of this one.
         with contextlib.suppress(OSError):
             if os.readlink(self.path) == terminal.name:
                 os.unlink(self.path)

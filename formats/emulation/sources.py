@@ -11,23 +11,17 @@ from math import radians
 from google.protobuf.message import DecodeError
 
 from locatk.core.errors import FormatError, InputError, error_context
-from locatk.formats.capture.statistics import RECORD
 from locatk.formats.devices import Device, find_device
 from locatk.formats.devices.decoder import Recording
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import field_samples, observations
-from locatk.formats.sessions.observations import (
-    read_halls,
-    read_magnetometers,
-    read_odometry,
-    read_sweeps,
-)
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.reader import Session
 
 RAW = "raw"
 """Device whose bytes are stored without decoding."""
 
-SWEEPS = ("/lighthouse/", "locatk.LighthouseSweep")
+SWEEPS = (observations.SWEEP_TOPIC_PREFIX, "locatk.LighthouseSweep")
 """Topic and schema."""
 
 
@@ -63,7 +57,7 @@ def select_source(session: Session, name: str | None = None) -> ByteSource:
     FormatError
         A stream of the session is damaged.
     """
-    recorded_by = session.metadata().get(RECORD, {}).get("device") or None
+    recorded_by = session.metadata().get(CAPTURE_RECORD, {}).get("device") or None
     wanted = name or recorded_by or _default_device(session)
     device = find_device(wanted)
     topics = session.topics("/", SerialChunk.DESCRIPTOR.full_name)
@@ -117,10 +111,12 @@ def _default_device(session: Session) -> str:
 def _read_recording(session: Session) -> Recording:
     """Return the observations of a session."""
     recording = Recording(
-        samples=read_magnetometers(session) if field_samples.MAGNETOMETERS.topics(session) else (),
-        halls=read_halls(session) if field_samples.HALLS.topics(session) else (),
-        sweeps=read_sweeps(session) if session.topics(*SWEEPS) else None,
-        odometry=read_odometry(session),
+        samples=observations.read_magnetometers(session)
+        if field_samples.MAGNETOMETERS.topics(session)
+        else (),
+        halls=observations.read_halls(session) if field_samples.HALLS.topics(session) else (),
+        sweeps=observations.read_sweeps(session) if session.topics(*SWEEPS) else None,
+        odometry=observations.read_odometry(session),
     )
     if not (recording.samples or recording.halls or recording.sweeps or recording.odometry):
         raise InputError(
@@ -166,6 +162,10 @@ def write_simulated_session(
             hint="Record its camera with `locatk capture camera:VIDEO`",
         )
     SYSTEMS[system](path, seed, overwrite)
+
+
+# The functions import the simulators, because recordings are emulated without them, and that of
+# polaris takes 0.35 s to import, as long as everything else.
 
 
 def _polaris(path: str | os.PathLike[str], seed: int, overwrite: bool) -> None:

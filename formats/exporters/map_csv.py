@@ -1,40 +1,18 @@
 """Landmark maps as the transponder list that vehicle controllers import (CSV).
 
-The columns are those of Goetting's navigation controllers (manual of the HG G-73650):
-``No;Code;X mm;Y mm;Attr1;Attr2;Attr3;Attr4``. A row is a landmark:
-
-- ``No`` counts the landmarks row by row from 0; ``Code`` is the code of the landmark, 0 to 15
-  (:mod:`locatk.core.landmarks.landmark`);
-- ``X mm`` and ``Y mm`` are its position in the frame of the map, as built if that is known;
-- ``Attr1`` is its heading as built in 1/100 degree, 0 as designed (the controller reads a heading
-  there for start transponders only);
-- ``Attr2``, ``Attr3`` and ``Attr4`` are 0: there is no start transponder.
-
-The table does not contain the alphabet, the window, the walls and the bars.
+The table is described in :mod:`locatk.formats.importers.map_csv`.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-import os
 
-from locatk.core.errors import FormatError, error_context
-from locatk.core.landmarks.landmark import CODE_COUNT
 from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
-from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
-from locatk.core.units import metres, mm_text
-
-HEADER = ("No", "Code", "X mm", "Y mm", "Attr1", "Attr2", "Attr3", "Attr4")
-
-MAX_COORDINATE_MM = 1e7
-"""10 km, larger than any floor: larger numbers are in another unit."""
+from locatk.core.units import mm_text
+from locatk.formats.importers.map_csv import HEADER
 
 POSITION_DECIMALS = 4
 """Decimals of a position in mm: 0.1 um."""
-
-MAX_HEADING_CENTIDEGREES = 18_000
 
 
 def dumps_csv(floor: FloorMap) -> str:
@@ -47,129 +25,3 @@ def dumps_csv(floor: FloorMap) -> str:
         position = ";".join(mm_text(coordinate, POSITION_DECIMALS) for coordinate in (x, y))
         lines.append(f"{number};{code};{position};{heading_centidegrees};0;0;0")
     return "\n".join(lines) + "\n"
-
-
-def loads_csv(
-    text: str,
-    *,
-    file: str | os.PathLike[str],
-    pitch_m: float | None = None,
-    tolerance_m: float = MAX_OFFSET_M,
-) -> FloorMap:
-    """Parse a table; pitch and cells are estimated from the positions.
-
-    Columns are identified by the header; without one, by their order. Other columns are ignored,
-    and attributes may be missing. Decimals may have a comma.
-
-    Parameters
-    ----------
-    text : str
-    file : path
-        Name in errors.
-    pitch_m, tolerance_m
-        See :func:`locatk.core.landmarks.map.grid_fit.fit_grid`.
-
-    Raises
-    ------
-    FormatError
-        It is not such a table; the error names the line and the column.
-    InputError
-        The positions are not on a grid; the error names the line of a deviating one.
-    """
-    codes: list[int] = []
-    poses: list[tuple[float, float, float]] = []
-    names: list[str] = []
-    columns = {name: index for index, name in enumerate(HEADER)}
-    rows = csv.reader(io.StringIO(text.removeprefix("\ufeff")), delimiter=";")
-    try:
-        for row in rows:
-            cells = [cell.strip() for cell in row]
-            if not any(cells):
-                continue
-            if not codes and not _is_number(cells[0]):
-                columns = _header(cells, file, rows.line_num)
-                continue
-            line = _Line(cells, columns, file, rows.line_num)
-            codes.append(line.integer("Code", 0, CODE_COUNT - 1))
-            # The heading of a start transponder is that of the vehicles.
-            is_start = line.number("Attr4", 0) == 1
-            heading = 0.0 if is_start else line.number("Attr1", MAX_HEADING_CENTIDEGREES)
-            x, y = (line.number(name, MAX_COORDINATE_MM) for name in ("X mm", "Y mm"))
-            poses.append((metres(x), metres(y), math.radians(heading / 100)))
-            names.append(f"line {rows.line_num}")
-    except csv.Error as error:
-        raise FormatError(str(error), file=file, where=rows.line_num) from None
-    if not codes:
-        raise FormatError(
-            "no landmarks", file=file, hint=f"Give lines as in {';'.join(HEADER[:4])}"
-        )
-    with error_context(file):
-        return floor_from_poses(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
-
-
-class _Line:
-    """Fields of one landmark by the names of their columns."""
-
-    def __init__(
-        self,
-        cells: list[str],
-        columns: dict[str, int],
-        file: str | os.PathLike[str],
-        number: int,
-    ) -> None:
-        self._cells, self._columns, self._file, self._number = cells, columns, file, number
-
-    def number(self, name: str, max_abs: float) -> float:
-        """Return a number of at most ``max_abs`` in size; 0 for a missing attribute."""
-        index = self._columns.get(name, len(self._cells))
-        text = self._cells[index].replace(",", ".") if index < len(self._cells) else ""
-        if not text and name.startswith("Attr"):
-            return 0.0
-        value = float(text) if _is_number(text) else math.nan
-        if name == "Attr4":
-            return value
-        if not abs(value) <= max_abs:
-            raise self._error(f"{text!r} under {name!r}, expected a number up to {max_abs:g}")
-        return value
-
-    def integer(self, name: str, low: int, high: int) -> int:
-        """Return a whole number from ``low`` to ``high``."""
-        index = self._columns[name]
-        text = self._cells[index] if index < len(self._cells) else ""
-        is_whole = text.isascii() and text.isdigit() and len(text) < 10
-        if not (is_whole and low <= int(text) <= high):
-            raise self._error(
-                f"{text!r} under {name!r}, expected a whole number from {low} to {high}, the "
-                "code of a landmark"
-            )
-        return int(text)
-
-    def _error(self, message: str) -> FormatError:
-        return FormatError(message, file=self._file, where=self._number)
-
-
-def _header(cells: list[str], file: str | os.PathLike[str], line: int) -> dict[str, int]:
-    """Return the columns by name; case and unit are ignored."""
-    bare = [cell.lower().translate(str.maketrans("", "", "[]()")) for cell in cells]
-    plain = {cell.removesuffix("mm").strip(): number for number, cell in enumerate(bare)}
-    columns = {
-        name: plain[key]
-        for name in HEADER
-        if (key := name.lower().removesuffix("mm").strip()) in plain
-    }
-    missing = [name for name in ("Code", "X mm", "Y mm") if name not in columns]
-    if missing:
-        raise FormatError(
-            f"no column {missing[0]!r}",
-            file=file,
-            where=line,
-            hint=f"Give columns separated by semicolons: {';'.join(HEADER)}",
-        )
-    return columns
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text.replace(",", ".")))
-    except ValueError:
-        return False

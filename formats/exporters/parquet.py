@@ -15,7 +15,7 @@ import numpy as np
 
 from locatk.core.errors import LocatkError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters.trajectory_csv import COLUMNS, SIGMA_AXES
+from locatk.formats.importers.trajectory_csv import COLUMNS, SIGMA_AXES
 from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.messages import triangle
 

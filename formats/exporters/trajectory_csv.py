@@ -12,28 +12,9 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.trajectory import Trajectory
+from locatk.formats.importers.trajectory_csv import COLUMNS, SIGMA_AXES
 from locatk.formats.output import atomic_write
 from locatk.formats.tables.timestamps import format_epoch_seconds
-
-COLUMNS = (
-    "time_s",
-    "device",
-    "x_m",
-    "y_m",
-    "z_m",
-    "qx",
-    "qy",
-    "qz",
-    "qw",
-    "sigma_x_m",
-    "sigma_y_m",
-    "sigma_z_m",
-    "sigma_heading_rad",
-)
-"""Header of the file. It is part of the contract (docs/formats.md): new columns go to the end."""
-
-SIGMA_AXES = (0, 1, 2, 5)
-"""Rows of a pose's covariance that belong to the four sigmas."""
 
 
 def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool = False) -> None:

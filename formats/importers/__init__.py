@@ -1,1 +1,1 @@
-"""Published recordings of others, read into the project's own arrays; one module a format."""
+"""Recordings and trajectories in files of other programs; a module or package a format."""

@@ -8,7 +8,6 @@ folder. They contain no times, which therefore follow from a rate: the first fra
 from __future__ import annotations
 
 import glob
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.natural_order import natural_key
 from locatk.formats import images
 from locatk.formats.sessions.frames import Shot
 from locatk.formats.tables.timestamps import UNDATED_START_NS
@@ -28,8 +28,6 @@ DEFAULT_RATE_HZ = 30.0
 
 MAGIC_BYTES = 12
 """Bytes at the beginning of a file that identify a compressed image."""
-
-_NUMBER = re.compile("([0-9]+)")
 
 
 class ImageFiles:
@@ -124,7 +122,9 @@ class ImageFiles:
             reason = self.warnings[0] if self.warnings else "there are none"
             raise FormatError(
                 f"none of {len(self._files)} files is usable: {reason}",
-                hint="Compare the --camera with the frames" if self._camera is not None else None,
+                hint="Compare the --camera with the frames"
+                if self._camera is not None
+                else "Give image files; `locatk import video` reads videos",
             )
 
 
@@ -148,7 +148,7 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         for file in _expand(path):
             by_path.setdefault(file.resolve(), file)
-    return sorted(by_path.values(), key=_natural)
+    return sorted(by_path.values(), key=natural_path_key)
 
 
 def _expand(path: Path) -> list[Path]:
@@ -202,14 +202,9 @@ def check_size(pixels: NDArray[Any], camera: Camera | None) -> None:
     )
 
 
-def _natural(path: Path) -> tuple[list[str | int], ...]:
-    """Return a sort key that compares numbers by value, and equal ones by their digits."""
-    parts = (path.parent.as_posix(), path.name)
-    split = [
-        [int(piece) if odd % 2 else piece for odd, piece in enumerate(_NUMBER.split(part))]
-        for part in parts
-    ]
-    return (*split, [path.as_posix()])
+def natural_path_key(path: Path) -> tuple[Any, Any]:
+    """Return a sort key: natural order of the folders, then of the names."""
+    return natural_key(path.parent.as_posix()), natural_key(path.name)
 
 
 def _head(file: Path) -> bytes:

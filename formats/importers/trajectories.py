@@ -8,10 +8,9 @@ from typing import Literal
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters.trajectory_csv import COLUMNS
 from locatk.formats.files import read_bytes
 from locatk.formats.importers.kitti import KITTI_COLUMNS, read_kitti
-from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.importers.tum import TUM_COLUMNS, read_tum
 
 Kind = Literal["solution", "session", "tum", "kitti", "csv"]

@@ -9,10 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.trajectory import Trajectory
-from locatk.formats.exporters.trajectory_csv import COLUMNS, SIGMA_AXES
 from locatk.formats.tables.delimited import Table, read_table
 
 Array = NDArray[np.float64]
+
+COLUMNS = (
+    "time_s",
+    "device",
+    "x_m",
+    "y_m",
+    "z_m",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+    "sigma_x_m",
+    "sigma_y_m",
+    "sigma_z_m",
+    "sigma_heading_rad",
+)
+"""Header of the file. It is part of the contract (docs/formats.md): new columns go to the end."""
+
+SIGMA_AXES = (0, 1, 2, 5)
+"""Rows of a pose's covariance that belong to the four sigmas."""
 
 POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9], COLUMNS[9:13]
 
@@ -30,7 +49,7 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     ----------
     path : path
         Columns ``qx`` to ``qw`` and the sigmas may be missing (all four of a kind); further
-        columns are ignored.
+        columns are ignored. A sigma that is empty or ``nan`` is unknown.
     frame : str
         Name of the frame, which is not part of the file.
 

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError
 from locatk.formats.importers.images import check_size
@@ -84,8 +86,6 @@ class Video:
         InputError
             Their size differs from that of the camera.
         """
-        import numpy as np
-
         count = guessed = 0
         last_ns = longest_ns = 0
         step_ns = round(1e9 / self._rate_hz) if self._rate_hz > 0 else DEFAULT_STEP_NS
@@ -198,28 +198,45 @@ def _is_text(path: Path) -> bool:
 @contextmanager
 def _capture(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a video and OpenCV, which prints nothing meanwhile."""
+    with silence_opencv() as cv2:
+        capture = cv2.VideoCapture()
+        try:
+            if _is_text(path) or not open_file(capture, path):
+                raise FormatError(
+                    "not a readable video",
+                    file=path,
+                    hint="Give MP4, MKV, AVI or WebM; `locatk import images` takes image files",
+                )
+            yield capture, cv2
+        finally:
+            capture.release()
+
+
+@contextmanager
+def silence_opencv() -> Iterator[Any]:
+    """Yield the module ``cv2``; OpenCV prints no messages in this context."""
     # The library reads this when it opens its first video; -8 means quiet.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    # OpenCV is slow to import, and must read the variable above.
     import cv2
 
     # OpenCV 5 moved these two functions.
     logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
     level = logging.getLogLevel()
     logging.setLogLevel(0)  # silent
-    capture = cv2.VideoCapture()
     try:
-        # An absolute path is never mistaken for a network address.
-        opened = not _is_text(path) and capture.open(os.path.abspath(path), cv2.CAP_FFMPEG)
-        if opened:
-            # Pixels stay at their positions on the sensor, as in image files.
-            capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        else:
-            raise FormatError(
-                "not a readable video",
-                file=path,
-                hint="Give MP4, MKV, AVI or WebM; `locatk import images` takes image files",
-            )
-        yield capture, cv2
+        yield cv2
     finally:
-        capture.release()
         logging.setLogLevel(level)
+
+
+def open_file(capture: Any, path: str | Path) -> bool:
+    """Open a video file with a ``cv2.VideoCapture``; return whether it is a readable video."""
+    import cv2
+
+    # An absolute path is never mistaken for a network address.
+    is_open: bool = capture.open(os.path.abspath(path), cv2.CAP_FFMPEG)
+    if is_open:
+        # Pixels stay at their positions on the sensor, as in image files.
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    return is_open

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from locatk.core import errors
-from locatk.core.errors import LocatkError
+from locatk.core.errors import LocatkError, system_hint
 from locatk.core.landmarks.results import LandmarkDetection, RobotFacts
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.results import TagDetection
@@ -175,7 +175,7 @@ def portable_error(error: LocatkError, names: dict[str, str]) -> LocatkError:
         rename(error.message) or "",
         file=rename(error.file),
         where=error.where,
-        hint=rename(error.hint),
+        hint=rename(error.hint or system_hint(error)),
     )
     return copy
 

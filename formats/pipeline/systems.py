@@ -21,6 +21,7 @@ from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.solution import Solution, SolverWarning
 from locatk.formats.artifacts import maps, scene, sheets, tags
+from locatk.formats.artifacts.registry import ARTIFACTS
 from locatk.formats.artifacts.schema import read_format
 from locatk.formats.sessions import observations, station_reports
 from locatk.formats.sessions.reader import Session
@@ -301,16 +302,10 @@ def check_artifacts(request: SolveRequest) -> None:
     ArtifactError
         A file is damaged.
     """
-    readers: dict[str, Callable[[Path], Any]] = {
-        scene.SCENE_FORMAT: scene.read_scene,
-        sheets.MANIFEST_FORMAT: sheets.read_manifest,
-        tags.TAG_FORMAT: tags.read_tags,
-        maps.MAP_FORMAT: maps.read_map,
-    }
     artifact = request.artifact
     if artifact is not None and artifact.suffix.lower() == ".toml":
-        reader = readers.get(read_format(artifact))
-        if reader is not None:
-            reader(artifact)
+        entry = ARTIFACTS.get(read_format(artifact))
+        if entry is not None:
+            entry.artifact.read(artifact)
     if request.camera is not None:
         sheets.read_camera(request.camera)

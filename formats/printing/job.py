@@ -86,9 +86,9 @@ def page_layouts(
     return layouts
 
 
-def steps(manifest: Manifest, document: Path | None = None) -> int:
+def count_steps(manifest: Manifest, document: Path | None = None) -> int:
     """Return how often :func:`draw` and its writers call ``done``."""
-    return rasters.bands(manifest) + (len(manifest.sheets) if document else 0)
+    return rasters.count_bands(manifest) + (len(manifest.sheets) if document else 0)
 
 
 def draw(

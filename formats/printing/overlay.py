@@ -17,12 +17,10 @@ from typing import Any
 import pikepdf
 from pikepdf import Array, Dictionary, Name, Pdf, Stream
 
-from locatk.core.dots.sheet import MM_PER_INCH
+from locatk.core.drawing import MM_PER_POINT
 from locatk.core.errors import FormatError, InputError
 from locatk.formats.files import read_bytes
 from locatk.formats.printing.separation.content import DAMAGE_ERRORS, BlackRemover
-
-MM_PER_POINT = MM_PER_INCH / 72
 
 SIZE_TOLERANCE_MM = 0.1
 """Largest difference in size between a stamp and its page."""
@@ -273,7 +271,7 @@ def _plain(value: float) -> float | int:
 def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
     """Open a document; errors while it is processed are reported as damage, too."""
     if b"%PDF-" not in read_bytes(path, 1024):
-        raise FormatError("not a PDF", file=path)
+        raise FormatError("not a PDF", file=path, hint="Save the document as PDF")
     try:
         # A repair may lose pages without a message.
         with Pdf.open(os.fspath(path), attempt_recovery=False) as pdf:

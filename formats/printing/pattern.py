@@ -55,7 +55,7 @@ def render(
     marks, crop : bool
         See :func:`locatk.formats.printing.page.draw_margin`. Too narrow margins remain empty.
     done : callable
-        Called after each of :func:`locatk.formats.printing.rasters.bands`.
+        Called after each of :func:`locatk.formats.printing.rasters.count_bands`.
 
     Raises
     ------

@@ -25,7 +25,7 @@ def _nothing() -> None:
     pass
 
 
-def bands(manifest: Manifest) -> int:
+def count_bands(manifest: Manifest) -> int:
     """Return the number of bands of all sheets of a manifest."""
     return sum(-(-sheet.size[1] // BAND_ROWS) for sheet in manifest.sheets)
 

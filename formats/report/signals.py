@@ -57,7 +57,7 @@ def signal_panels(session: Session, solution: Solution) -> list[Panel]:
     except LocatkError as error:
         # The report is on the solution, which is complete.
         hint = f"{error.hint}." if error.hint else ""
-        note = join_sentences(f"The recording cannot be drawn: {error}.", hint)
+        note = join_sentences(f"The recording cannot be drawn: {error.message}.", hint)
         return [Panel(SIGNALS_TITLE, note)]
     if panels:
         return panels

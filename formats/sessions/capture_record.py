@@ -8,8 +8,8 @@ from collections.abc import Collection
 from dataclasses import fields
 from typing import Any
 
-from locatk.formats.capture.statistics import RECORD, CaptureStatistics
-from locatk.formats.sessions.mcap_file import Segment
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, Segment
 from locatk.formats.sessions.reader import Session
 
 MAX_DESCRIBED_BYTES = 16 << 20
@@ -49,7 +49,7 @@ def _segments(session: Session, topics: Collection[str]) -> list[Segment]:
 
 def capture(session: Session) -> dict[str, Any] | None:
     """Return the record ``capture`` of a live recording with numbers parsed; None without one."""
-    record = session.index.metadata.get(RECORD)
+    record = session.index.metadata.get(CAPTURE_RECORD)
     return None if record is None else {key: _value(key, text) for key, text in record.items()}
 
 

@@ -20,8 +20,6 @@ from locatk.formats.sessions.station_reports import describe_unknown_stations
 
 T = TypeVar("T")
 
-SWEEP_TOPICS = "/lighthouse/"
-
 CHANNELS = range(1, 17)
 
 
@@ -58,13 +56,13 @@ def _sweeps(session: Session) -> tuple[dict[int, int] | None, dict[str, Any]]:
 
     In a large session only the index is read, and the counts are None.
     """
-    topics = session.topics(SWEEP_TOPICS)
+    topics = session.topics(observations.SWEEP_TOPIC_PREFIX)
     if not topics:
         return None, {}
     if not capture_record.is_small(session, topics):
         known = [capture_record.samples(session, topic) for topic in topics]
         return None, {
-            "devices": [topic.removeprefix(SWEEP_TOPICS) for topic in topics],
+            "devices": [topic.removeprefix(observations.SWEEP_TOPIC_PREFIX) for topic in topics],
             "sweeps": None if None in known else sum(number or 0 for number in known),
             "unread_bytes": capture_record.held_bytes(session, topics),
         }

@@ -42,6 +42,9 @@ MAGIC = b"\x89MCAP0\r\n"
 SESSION_RECORD = "locatk"
 """Name of the metadata record of every file of locatk: kind, system, versions."""
 
+CAPTURE_RECORD = "capture"
+"""Name of the metadata record of a recording: port, device, times and counts."""
+
 CHANNELS_RECORD = "channels"
 """Name of the metadata record of a live recording that lists its channels: id to topic and schema.
 

@@ -1,7 +1,7 @@
 """Contents of a session for a solver: sweeps, samples, frames, truth, odometry, artifacts.
 
-Lighthouse sweeps are read and written here. The readers of the other contents are re-exported
-from their modules.
+Lighthouse sweeps and receivers are read and written here. The readers of the other contents are
+re-exported from their modules.
 """
 
 from __future__ import annotations
@@ -12,17 +12,22 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from locatk.core.errors import FormatError
-from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts.maps import attached_map as read_map
-from locatk.formats.artifacts.receiver import read_receivers, receiver_attachments
+from locatk.formats.artifacts.receiver import (
+    attached_receiver,
+    receiver_attachments,
+    receiver_file,
+)
 from locatk.formats.artifacts.scene import SCENE_FILE, dumps_scene
 from locatk.formats.artifacts.scene import attached_scene as read_scene
 from locatk.formats.artifacts.sheets import attached_camera as read_camera
 from locatk.formats.artifacts.sheets import attached_manifest as read_manifest
 from locatk.formats.artifacts.tags import attached_tags as read_tags
+from locatk.formats.sessions import capture_record
 from locatk.formats.sessions.field_samples import read_halls, read_magnetometers
 from locatk.formats.sessions.frames import read_frames
 from locatk.formats.sessions.messages import MAX_BATCH_NS, SWEEPS, TimedMessage, batch_edges
@@ -64,6 +69,9 @@ __all__ = [
     "write_sweeps",
 ]
 
+SWEEP_TOPIC_PREFIX = "/lighthouse/"
+"""Topic of the sweeps of a device, without its name."""
+
 _SWEEP_RANGES = {
     "time_ns": (0, np.iinfo(np.int64).max),
     "sensor": (0, np.iinfo(np.int32).max),
@@ -84,7 +92,7 @@ def read_sweeps(session: Session) -> Sweeps:
     FormatError
         There are none, a message is damaged, or a value is outside its range.
     """
-    topics = session.topics("/lighthouse/", "locatk.LighthouseSweep")
+    topics = session.topics(SWEEP_TOPIC_PREFIX, "locatk.LighthouseSweep")
     if not topics:
         raise FormatError(
             "no lighthouse sweeps (topic /lighthouse/<device>)"
@@ -125,6 +133,31 @@ def _check_ranges(sweeps: Sweeps, path: str | None) -> None:
             )
 
 
+def read_receivers(session: Session) -> dict[str, Receiver]:
+    """Return the receiver of each device of a session; devices without one are omitted.
+
+    Attachments take precedence. A recording of a Lighthouse deck without attachment, of an earlier
+    version, has the geometry of the deck.
+
+    Raises
+    ------
+    FormatError, ArtifactError
+        An attachment is damaged, or not a valid receiver.
+    """
+    prefix = receiver_file("").removesuffix(".toml")
+    topics = session.topics(SWEEP_TOPIC_PREFIX)
+    devices = {topic.removeprefix(SWEEP_TOPIC_PREFIX) for topic in topics}
+    for info in session.attachments():
+        if info.name.startswith(prefix) and info.name.endswith(".toml"):
+            devices.add(info.name.removeprefix(prefix).removesuffix(".toml"))
+    is_deck = (capture_record.capture(session) or {}).get("device") == DECK.name
+    receivers = {
+        device: attached_receiver(session, device) or (DECK if is_deck else None)
+        for device in sorted(devices)
+    }
+    return {device: receiver for device, receiver in receivers.items() if receiver is not None}
+
+
 def sweep_messages(sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> Iterator[TimedMessage]:
     """Yield batches of ``sweeps`` by device and time, ascending in the time of the first sweep."""
     _check_ranges(sweeps, None)
@@ -141,7 +174,7 @@ def sweep_messages(sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> Iterator[
         part = slice(starts[number], stops[number])
         name = sweeps.devices[device[starts[number]]]
         message = SWEEPS.pack({"device": name}, {key: c[part] for key, c in columns.items()})
-        yield int(columns["time_ns"][part.start]), f"/lighthouse/{name}", message
+        yield int(columns["time_ns"][part.start]), SWEEP_TOPIC_PREFIX + name, message
 
 
 def write_sweeps(writer: SessionWriter, sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> None:

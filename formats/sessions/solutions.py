@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,11 @@ from locatk.core.polaris.results import PolarisFacts, TagDetection
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import GenericRecord, Solution, SolverWarning, from_json, to_json
 from locatk.core.trajectory import Trajectory
-from locatk.formats.artifacts import maps, sheets, tags
-from locatk.formats.artifacts import scene as scene_files
+from locatk.formats.artifacts.maps import MAP
+from locatk.formats.artifacts.scene import SCENE
+from locatk.formats.artifacts.schema import Artifact
+from locatk.formats.artifacts.sheets import MANIFEST
+from locatk.formats.artifacts.tags import TAGS
 from locatk.formats.sessions import foxglove
 from locatk.formats.sessions.messages import TimedMessage
 from locatk.formats.sessions.reader import Session
@@ -40,13 +43,13 @@ from locatk.formats.sessions.writer import SessionWriter
 SOLUTION_FILE = "solution.json"
 SOLUTION_VERSION = 1
 
-ARTIFACTS: tuple[tuple[type, str, Callable[[Any], str]], ...] = (
-    (Scene, scene_files.SCENE_FILE, scene_files.dumps_scene),
-    (Manifest, sheets.SHEET_FILE, sheets.dumps_manifest),
-    (Tags, tags.TAG_FILE, tags.dumps_tags),
-    (FloorMap, maps.MAP_FILE, maps.dumps_map),
+ARTIFACTS: tuple[tuple[type, Artifact[Any]], ...] = (
+    (Scene, SCENE),
+    (Manifest, MANIFEST),
+    (Tags, TAGS),
+    (FloorMap, MAP),
 )
-"""Type, attachment name and TOML writer of the artifacts that a solution can refer to."""
+"""Types of the artifacts that a solution can refer to, and their TOML files."""
 
 RESULT_TYPES: dict[str, tuple[type, type]] = {
     "lighthouse": (StationDetection, LighthouseFacts),
@@ -103,9 +106,9 @@ def write_solution(
     with SessionWriter(
         path, kind="solution", system=solution.system, facts=record, overwrite=overwrite
     ) as writer:
-        for kind, file, dumps in ARTIFACTS:
+        for kind, toml_file in ARTIFACTS:
             if isinstance(artifact, kind):
-                writer.attach_toml(file, dumps(artifact))
+                writer.attach_toml(toml_file.file, toml_file.dumps(artifact))
         text = _encode(plain(_solution_record(solution, name)))
         writer.attach(SOLUTION_FILE, text.encode(), "application/json")
         streams = [iter(_static_messages(solution, start_ns))]
@@ -192,16 +195,14 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
             )
         system = str(record["system"])
         detection_type, facts_type = RESULT_TYPES.get(system, (GenericRecord, GenericRecord))
+        attached = (toml_file.attached(session) for _, toml_file in ARTIFACTS)
         return Solution(
             system=system,
             method=str(record["method"]),
             trajectories=_trajectories(session, record["devices"]),
             rejected={str(key): int(count) for key, count in record["rejected"].items()},
             detections=tuple(from_json(detection_type, each) for each in record["detections"]),
-            artifact=scene_files.attached_scene(session)
-            or sheets.attached_manifest(session)
-            or tags.attached_tags(session)
-            or maps.attached_map(session),
+            artifact=next((item for item in attached if item is not None), None),
             warnings=_warnings(record),
             facts=from_json(facts_type, record["facts"]) if record["facts"] else None,
         )

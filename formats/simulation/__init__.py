@@ -1,5 +1,6 @@
 """Configuration files of the simulators.
 
-``config`` reads and writes the TOML file of any simulator; ``lighthouse``, ``dots``, ``polaris``
-and ``landmarks`` declare the settings of each and turn them into the options of its simulation.
+``settings`` are the declarations of keys; ``config`` reads and writes the TOML file of any
+simulator. ``lighthouse``, ``dots``, ``polaris`` and ``landmarks`` declare the settings of each and
+turn them into the options of its simulation.
 """

@@ -224,7 +224,8 @@ class SimulationConfig:
                 continue
             needed = self.setting(need.other)
             value = settings.get(need.other, self.default(needed))
-            if value not in need.values if need.values else value is None:
+            is_met = value in need.values if need.values else value is not None
+            if not is_met:
                 choices = " or ".join(map(str, need.values))
                 raise SettingsError(
                     f"{self.setting(need.key).title} needs {needed.title} {choices}".rstrip()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import os
@@ -11,7 +10,6 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from locatk.core.errors import FormatError
 from locatk.core.landmarks.landmark import PATTERNS, name
 from locatk.core.landmarks.published.driver import published_driver
 from locatk.core.landmarks.simulation.session import (
@@ -35,10 +33,10 @@ from locatk.formats.artifacts.kinds import (
     Row,
     Text,
 )
-from locatk.formats.files import read_text
 from locatk.formats.sessions import field_samples
 from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
 from locatk.formats.simulation.settings import Requirement, Setting
+from locatk.formats.tables.delimited import read_table
 
 STRATEGY = "robot.strategy"
 START, PATH_FILE, CELLS = "robot.start", "robot.path_file", "robot.cells"
@@ -528,29 +526,13 @@ def read_waypoints(file: Path) -> tuple[tuple[float, float], ...]:
     ------
     MissingDataError
         There is no such file.
-    FormatError
+    FormatError, InputError
         A column is missing, or a value is not a number.
     """
-    rows = csv.reader(read_text(file).removeprefix("\ufeff").splitlines())
-    header = [column.strip() for column in next(rows, [])]
-    if not {"x_mm", "y_mm"} <= set(header):
-        raise FormatError(
-            "no columns x_mm and y_mm", file=file, where=1, hint="Name them in the first line"
-        )
-    waypoints = []
-    for row in rows:
-        if not "".join(row).strip():
-            continue
-        try:
-            x, y = (float(row[header.index(column)]) * 1e-3 for column in ("x_mm", "y_mm"))
-            if not math.isfinite(x + y):
-                raise ValueError("not finite")
-        except (ValueError, IndexError):
-            raise FormatError(
-                "a waypoint is not two numbers", file=file, where=rows.line_num
-            ) from None
-        waypoints.append((x, y))
-    return tuple(waypoints)
+    table = read_table(file)
+    table.require("x_mm", "y_mm")
+    x_mm, y_mm = table.floats("x_mm").tolist(), table.floats("y_mm").tolist()
+    return tuple((x * 1e-3, y * 1e-3) for x, y in zip(x_mm, y_mm, strict=True))
 
 
 def write_simulation(

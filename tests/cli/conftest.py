@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -280,35 +281,6 @@ def _processes() -> Iterator[Callable[..., Process]]:
 
 
 @pytest.fixture
-def raw_bytes() -> Callable[..., bytes]:
-    """``raw_bytes(path, ...)``: the bytes in recordings, whose offsets must follow on; of a
-    damaged one what is left."""
-    from locatk.formats.schemas.serial_pb2 import SerialChunk
-
-    def join(*paths: Path, topic: str = "/serial/robot") -> bytes:
-        content = bytearray()
-        for path in paths:
-            for _, chunk in Session.open(path, damaged_ok=True).decoded(topic, SerialChunk):
-                assert chunk.byte_offset == len(content)
-                content += chunk.data
-        return bytes(content)
-
-    return join
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 9 MiB; the test is skipped where none can be mounted."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=9m", "locatk-test", str(folder)]
-    try:
-        made = subprocess.run(command, capture_output=True, text=True)
-    except OSError as error:
-        pytest.skip(f"no disk can be mounted: {error}")
-    if made.returncode:
-        pytest.skip(f"no disk can be mounted: {made.stderr.strip()}")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
+def raw_bytes(raw_bytes: Callable[..., bytes]) -> Callable[..., bytes]:
+    """Return the function of all tests, which reads the rest of damaged recordings here."""
+    return partial(raw_bytes, damaged_ok=True)

@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,13 +21,14 @@ from click.testing import CliRunner, Result
 from locatk.cli import app as app_module
 from locatk.cli import calibrate, console, failures
 from locatk.cli.app import COMMANDS, app
+from locatk.cli.command import GENERAL_OPTIONS, Command
 from locatk.core import errors
 
 Run = Callable[..., Result]
 
 
 def every_command(command: click.Command = app, path: tuple[str, ...] = ()) -> Iterator[tuple]:
-    """(path, command) of each command below the group."""
+    """Yield (path, command) of each command below the group."""
     if path:
         yield path, command
     if isinstance(command, click.Group):
@@ -68,6 +70,64 @@ def test_examples_are_valid_usage(path: tuple[str, ...], monkeypatch: pytest.Mon
             command = found
         command.make_context("example", args, resilient_parsing=False)
     console.reset()
+
+
+LEAVES = [
+    (" ".join(path), command)
+    for path, command in every_command()
+    if not isinstance(command, click.Group)
+]
+
+MAX_UNDIVIDED_OPTIONS = 8
+"""Most options of a command without sections, apart from those that most commands have."""
+
+
+def context_of(path: str, command: click.Command) -> click.Context:
+    parent = click.Context(app, info_name="locatk", **app.context_settings)
+    return click.Context(command, info_name=path, parent=parent, terminal_width=80)
+
+
+@pytest.mark.parametrize(("path", "command"), LEAVES, ids=[path for path, _ in LEAVES])
+def test_help_fits_80_columns(path: str, command: click.Command) -> None:
+    text = command.get_help(context_of(path, command))
+    assert [line for line in text.splitlines() if len(line) > 80] == []
+
+
+@pytest.mark.parametrize(("path", "command"), LEAVES, ids=[path for path, _ in LEAVES])
+def test_every_option_has_help_and_a_section(path: str, command: click.Command) -> None:
+    assert isinstance(command, Command)
+    context = context_of(path, command)
+    parameters = [p for p in command.get_params(context) if isinstance(p, click.Option)]
+    assert all(parameter.help for parameter in parameters)
+    own = [p for p in parameters if not GENERAL_OPTIONS.intersection(p.opts)]
+    general = [p for p in parameters if p not in own]
+    sections = Counter(command.section_of(parameter) for parameter in own)
+    assert sections["Options"] <= MAX_UNDIVIDED_OPTIONS
+    assert len(own) <= MAX_UNDIVIDED_OPTIONS or len(sections) > 1
+    assert {command.section_of(parameter) for parameter in general} == {"Options"}
+    text = command.get_help(context)
+    titles = [line[:-1] for line in text.splitlines() if line.endswith(":") and line[0] != " "]
+    assert {title for title in titles if title != "General"} == set(sections)
+    assert text.count("\nGeneral:\n") == 1
+    for parameter in parameters:
+        assert text.count(f" {parameter.opts[-1]} ") + text.count(f" {parameter.opts[-1]}\n") > 0
+
+
+@pytest.mark.parametrize("option", ["--json", "--quiet", "--verbose", "--overwrite", "--seed"])
+def test_an_option_has_the_same_words_everywhere(option: str) -> None:
+    texts = {
+        path: parameter.help.split(".")[0]
+        for path, command in LEAVES
+        for parameter in command.get_params(context_of(path, command))
+        if isinstance(parameter, click.Option) and option in parameter.opts
+    }
+    exceptions = {
+        "--json": {"solve", "emulate"},
+        # Their settings have seeds of their own, which the text has to distinguish.
+        "--seed": {"map design", "simulate polaris"},
+    }.get(option, set())
+    assert len({text for path, text in texts.items() if path not in exceptions}) == 1
+    assert exceptions <= set(texts)
 
 
 TABLES = [

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
@@ -21,6 +24,12 @@ def run(*args: object) -> Result:
 
 def too_wide(text: str) -> list[str]:
     return [line for line in text.splitlines() if len(line) > console.TEXT_COLUMNS]
+
+
+DRIVE = "t_s,x_mm,y_mm,heading_deg,front_mt,left_mt,rear_mt,right_mt\n" + "".join(
+    f"{0.01 * row:.2f},{row},0,0,0.1,0.2,0.1,0.3\n" for row in range(20)
+)
+"""Recording of a robot over landmarks."""
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +50,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             assert made.exit_code == 0, made.stderr
             solved = run("solve", f"{system}.mcap", "-o", f"{system}-solved.mcap")
             assert solved.exit_code in (0, 3), solved.stderr
+        design = Path("map.toml").read_text()
+        row = re.search(r'\n +("[0-9a-f]{4}"),', design)
+        assert row is not None
+        Path("double.toml").write_text(re.sub(r'"[0-9a-f]{4}"', row[1], design))
+        Path("drive.csv").write_text(DRIVE)
+        for name in ("frame1.png", "frame2.png"):
+            cv2.imwrite(name, np.full((60, 80), 200, np.uint8))
+        Path("broken.png").write_bytes(Path("frame1.png").read_bytes()[:40])
+        Path("x").mkdir()
+        Path("empty.toml").touch()
+        Path("picture.mcap").write_bytes(Path("frame1.png").read_bytes())
         yield path
     finally:
         os.chdir(before)
@@ -77,7 +97,23 @@ SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
         "print pattern -o sheet.pdf --overwrite",
         "print testsheet -o test.pdf --overwrite",
         "print landmarks map.toml -o pack.pdf --overwrite",
+        "print landmarks map.toml -o floor.pdf --floor --paper A1 --overwrite",
         "capture --list",
+        "tag design -o tags.toml --count 20 --min-distance 2 --bom parts.csv --overwrite",
+        "tag design -o mini.toml --order 2 --magnets 3 --clearance 4 --overwrite",
+        "tag check tag.toml",
+        "tag check tag.toml --sensors 3 --speed 3",
+        "tag decode 0,0:0 1,1:45 0,2:0 1,2:90 2,2:0",
+        "map design 5x5 --alphabet compass -o compass.toml --overwrite",
+        "map design --landmark",
+        "map check map.toml double.toml",
+        "map import map.csv -o imported.toml --overwrite",
+        *(f"simulate {system} -o new.mcap --overwrite" for system in ("polaris", "lighthouse")),
+        "simulate landmarks map.toml --landmarks 14 -o new.mcap --overwrite",
+        "import landmark-csv drive.csv --map map.toml -o imported.mcap --overwrite",
+        "import images frame1.png frame2.png broken.png -o imported.mcap --overwrite",
+        "bench infrared --data x",
+        "bench infrared --data x --full",
     ],
 )
 def test_results_fit_80_columns(folder: Path, command: str) -> None:
@@ -119,6 +155,79 @@ def test_options_of_a_command_are_in_sections() -> None:
     assert titles == ["Options:", "Input:", "Output:", "Batch:", "General:"]
     general = text[text.index("General:") :]
     assert all(option in general for option in ("--json", "--quiet", "--verbose", "--help"))
+
+
+WRONG_CALLS = [
+    "slove run.mcap",
+    "simulate lighthous -o x.mcap",
+    "solve lighthouse.mcap --artefact map.toml",
+    "solve missing.mcap -o x.mcap",
+    "solve x -o x.mcap",
+    "solve picture.mcap -o x.mcap",
+    "solve map.toml -o x.mcap",
+    "solve lighthouse.mcap -o nowhere/x.mcap",
+    "solve lighthouse.mcap -o lighthouse-solved.mcap",
+    "solve lighthouse.mcap -o lighthouse.mcap --overwrite",
+    "solve lighthouse.mcap -o x.mcap --artifact lighthouse.mcap",
+    "solve lighthouse.mcap -o x.mcap --artifact map.toml",
+    "solve lighthouse.mcap -o x.mcap --artifact empty.toml",
+    "eval lighthouse-solved.mcap --truth frame1.png",
+    "eval x --truth lighthouse.mcap",
+    "report lighthouse.mcap -o x.html",
+    "report x -o x.html",
+    "export lighthouse-solved.mcap --format csv -o x",
+    "export map.toml --format crazyflie-config -o x.yaml",
+    "info x",
+    "info frame1.png",
+    "info empty.toml",
+    "import saleae frame1.png -o x.mcap",
+    "import libsurvive x -o x.mcap",
+    "import video x -o x.mcap",
+    "import images map.toml -o x.mcap",
+    "import images frame1.png --sheet tag.toml -o x.mcap",
+    "import landmark-csv frame1.png --circle 25 -o x.mcap",
+    "decode lighthouse.mcap -o x.mcap",
+    "recover frame1.png -o x.mcap",
+    "capture replay:missing.mcap -o x.mcap",
+    "capture map.toml -o x.mcap",
+    "capture camera:map.toml -o x.mcap",
+    "emulate polars",
+    "simulate landmarks tag.toml -o x.mcap",
+    "simulate landmarks map.toml -o x.mcap --strategy pass --cell 99,99",
+    "simulate landmarks map.toml -o x.mcap --strategy path --path frame1.png",
+    "simulate dots -o x.mcap --config map.toml",
+    "calibrate scene polaris.mcap -o x.toml",
+    "calibrate camera lighthouse.mcap -o x.toml",
+    "calibrate tag lighthouse.mcap -o x.toml",
+    "calibrate map x -o x.toml",
+    "calibrate printer frame1.png --manifest map.toml --overwrite",
+    "print pattern -o x.pdf --overlay frame1.png",
+    "print pattern -o x.pdf --section 70,2",
+    "print tag map.toml -o x.pdf",
+    "print landmarks tag.toml -o x",
+    "print testsheet -o map.toml",
+    "tag design -o x.toml --spacing -3",
+    "tag check x",
+    "tag encode 5 --tag map.toml",
+    "map check tag.toml",
+    "map import frame1.png --format csv -o x.toml",
+    "bench dots --data map.toml",
+    "demo dots -o nowhere/x.html",
+    "demo dots --keep map.toml",
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", WRONG_CALLS)
+def test_a_wrong_call_gives_one_line_with_a_hint(folder: Path, command: str) -> None:
+    before = sorted(folder.rglob("*"))
+    result = run(*command.split())
+    assert result.exit_code in (1, 2)
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert "Hint: " in result.stderr
+    assert "internal error" not in result.stderr
+    assert sorted(folder.rglob("*")) == before
 
 
 LONG = "a text of many words " * 6

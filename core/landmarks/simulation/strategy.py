@@ -325,7 +325,10 @@ def _single_pass(task: _Task) -> Robot:
     ]
     if not cells:
         where = "" if options.cell is None else f" in cell {options.cell[0]},{options.cell[1]}"
-        raise InputError(f"the map has no landmark {options.pattern}{where}".replace("  ", " "))
+        raise InputError(
+            f"the map has no landmark {options.pattern}{where}".replace("  ", " "),
+            hint="A cell is row,column from 0; `locatk info` draws the map",
+        )
     cell = cells[rng.integers(len(cells))]
     mark = landmarks[cell]
     angle = rng.uniform(-math.pi, math.pi)

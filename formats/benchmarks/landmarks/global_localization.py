@@ -26,7 +26,7 @@ from locatk.core.landmarks.map.windows import window_path, window_readings
 from locatk.core.landmarks.simulation.options import Errors
 from locatk.core.landmarks.simulation.sensors import odometry
 from locatk.core.landmarks.solver import SolveOptions
-from locatk.formats.artifacts.map_library import entries
+from locatk.formats.artifacts.map_library import library_maps
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.timing import FIRST_SEED
 
@@ -39,7 +39,7 @@ MISREAD_FRACTION = 0.05
 WALK_LANDMARKS = 8
 
 START_STRIDE = 1
-"""Every how many starts one is measured."""
+"""Step between measured starts, in the list of all starts of a floor."""
 
 MAX_LISTED_WALKS = 10
 
@@ -93,7 +93,7 @@ def standard_floor(folder: Path) -> tuple[FloorMap, str]:
 
 def supplied_floor() -> tuple[FloorMap, str]:
     """Return a part of 24 x 24 landmarks of the supplied map, and its source."""
-    entry = next(e for e in entries() if (e.alphabet, e.window, e.detect) == ("16", "L", 0))
+    entry = next(e for e in library_maps() if (e.alphabet, e.window, e.detect) == ("16", "L", 0))
     codes = entry.codes()[:MAP_SIDE, :MAP_SIDE]
     return FloorMap(codes), f"cut of {entry.file}, which ships"
 

@@ -27,7 +27,7 @@ from locatk.core.landmarks.simulation.options import SimulationOptions
 from locatk.core.landmarks.simulation.passes import SinglePass
 from locatk.core.landmarks.simulation.session import simulate
 from locatk.core.landmarks.solver import solve
-from locatk.formats.artifacts.map_library import design_or_crop, entries
+from locatk.formats.artifacts.map_library import design_or_crop, library_maps
 from locatk.formats.artifacts.maps import dumps_map, loads_map
 from locatk.formats.benchmarks.figures import Duration, Figure
 from locatk.formats.benchmarks.landmarks.global_localization import (
@@ -281,7 +281,7 @@ def time_map_reading() -> tuple[float, float, float]:
 
 def largest_square() -> Figure:
     """Compare the largest square of the supplied maps with that of the prototype."""
-    sides = {(e.alphabet, e.window): min(e.rows, e.columns) for e in entries() if not e.detect}
+    sides = {(e.alphabet, e.window): min(e.rows, e.columns) for e in library_maps() if not e.detect}
     listed = ", ".join(
         f"{alphabet}/{window} {side}" for (alphabet, window), side in sorted(sides.items())
     )

@@ -60,7 +60,7 @@ COLUMN_KINDS = (
 )
 """Columns with a meaning, in the order in which they are tried."""
 
-WITH_UNIT_REMARK = ("magnetometers", "halls")
+KINDS_THAT_NEED_UNITS = ("magnetometers", "halls")
 """Kinds whose names are so special that a missing unit is remarked."""
 
 POSE_KEYS = ("x", "y", "heading")
@@ -229,7 +229,7 @@ def interpret_columns(names: Sequence[str]) -> ColumnLayout:
         kind = match.kind.field
         if not math.isnan(match.factor):
             by_kind[kind].setdefault(match.key, SiColumn(index, match.factor))
-        elif kind in WITH_UNIT_REMARK and not remarks:
+        elif kind in KINDS_THAT_NEED_UNITS and not remarks:
             remarks.append(f"the unit of column {name!r} is missing: name it {name}_ut")
     parts = []
     for kind, interpret in (

@@ -101,23 +101,23 @@ class _Log:
     ----------
     devices : dict of str to int
         Device numbers by name.
-    known : dict of bytes to int
-        The same by the bytes of the field, which repeat from line to line.
+    device_by_field : dict of bytes to int
+        Device numbers by the bytes of the field, which repeat from line to line.
     rows : list of tuple
         Sweeps in the order of :data:`SWEEP_DTYPE`; ``packed`` are earlier ones.
-    lines, records, marks, damaged : int
+    lines, records, without_sweep, damaged : int
         Lines, records of light, records without a sweep, and unreadable records.
     faults : list of str
         Warnings on the first damaged records.
     """
 
     devices: dict[str, int] = field(default_factory=dict)
-    known: dict[bytes, int] = field(default_factory=dict)
+    device_by_field: dict[bytes, int] = field(default_factory=dict)
     rows: list[tuple[int, ...]] = field(default_factory=list)
     packed: list[Rows] = field(default_factory=list)
     lines: int = 0
     records: int = 0
-    marks: int = 0
+    without_sweep: int = 0
     damaged: int = 0
     faults: list[str] = field(default_factory=list)
 
@@ -179,7 +179,7 @@ def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
         "files": ", ".join(Path(path).name for path in paths),
         "lines": f"{log.lines}, of which {log.records} are records of light",
         "sweeps": str(len(sweeps)),
-        "without a sweep": f"{log.marks} records of robots that decoded nothing",
+        "without a sweep": f"{log.without_sweep} records of robots that decoded nothing",
         "devices": ", ".join(
             f"{name} ({n} sweeps)" for name, n in zip(log.devices, per_device, strict=True)
         ),
@@ -282,7 +282,7 @@ def _number(fields: _Fields, key: bytes) -> int:
 
 def _device(log: _Log, fields: _Fields) -> int:
     source = fields.get(b"source") or fields.get(b"address") or DEFAULT_DEVICE.encode()
-    number = log.known.get(source)
+    number = log.device_by_field.get(source)
     if number is None:
         try:
             name = source.strip(b"\"'").decode()
@@ -290,7 +290,7 @@ def _device(log: _Log, fields: _Fields) -> int:
             name = ""
         if not (0 < len(name) <= MAX_NAME_CHARACTERS and name.isprintable()):
             raise _Damaged("the source is not a name")
-        number = log.known[source] = log.devices.setdefault(name, len(log.devices))
+        number = log.device_by_field[source] = log.devices.setdefault(name, len(log.devices))
     return number
 
 
@@ -302,7 +302,7 @@ def _add_processed(log: _Log, fields: _Fields, time_ns: int) -> None:
         raise _Damaged(f"db_time is {tick}")
     device = _device(log, fields)
     if not (0 <= polynomial < POLYNOMIAL_COUNT and 0 <= count < lfsr.SEQUENCE_LENGTH):
-        log.marks += 1
+        log.without_sweep += 1
         return
     log.add(time_ns, device, polynomial, count, tick, 0, UNKNOWN)
 
@@ -315,7 +315,7 @@ def _add_counts(log: _Log, fields: _Fields, time_ns: int) -> None:
         if 0 <= count < lfsr.SEQUENCE_LENGTH:
             log.add(time_ns, device, UNKNOWN, count, UNKNOWN, 0, UNKNOWN)
         else:
-            log.marks += 1
+            log.without_sweep += 1
 
 
 def _add_windows(log: _Log, fields: _Fields, time_ns: int) -> None:
@@ -334,7 +334,7 @@ def _add_windows(log: _Log, fields: _Fields, time_ns: int) -> None:
         if 0 <= polynomial < POLYNOMIAL_COUNT and 0 <= offset <= max_offset:
             log.add(time_ns, device, polynomial, 0, UNKNOWN, bits, offset)
         else:
-            log.marks += 1
+            log.without_sweep += 1
 
 
 _KINDS = {
@@ -354,7 +354,7 @@ def _rows(log: _Log, warnings: list[str]) -> Rows:
     index = lfsr.window_index(with_bits["bits"], with_bits["offset"], with_bits["polynomial"])
     rows["count"][windows] = index
     without_index = np.flatnonzero(windows)[index == lfsr.NO_INDEX]
-    log.marks += len(without_index)
+    log.without_sweep += len(without_index)
     rows = np.delete(rows, without_index)
     backwards = int(np.count_nonzero(np.diff(rows["time_ns"]) < 0))
     if backwards:

@@ -79,7 +79,7 @@ MAX_SAMPLE = 1 << 60
 """Largest number of a sample."""
 
 EXPORT_BATCH_EDGES = 1 << 17
-"""EdgeSegment of an export that are read at once."""
+"""Edges of an export that are read at once."""
 
 MAX_EXPORT_S = 1e6
 """Largest time of an export, at which float64 still resolves 0.1 ns."""
@@ -414,7 +414,7 @@ def export_rate(source: Source, header: Header) -> float | None:
 
 
 def _export_header(source: Source, version: int) -> tuple[int, int, int, int]:
-    """Read the level, begin and end in nanoseconds, and the number of edges of a chunk."""
+    """Read the level, start and end in nanoseconds, and the number of edges of a chunk."""
     values = source.values(EXPORT_1_STRUCT if version else EXPORT_0_STRUCT)
     state, begin, end, count = int(values[0]), values[-3], values[-2], int(values[-1])
     if state > 1:

@@ -49,10 +49,8 @@ class PatternSpace:
 INHERITED = "inherited"
 """Current colour space of a form that has not set one: that of its caller."""
 
-NOT_CONVERTIBLE = None
-"""Current colour space that cannot be converted."""
-
 CurrentSpace = ColourSpace | PatternSpace | str | None
+"""Current colour space; None if it cannot be converted."""
 
 DEVICE_OPERATORS = {"g": colours.GREY, "rg": colours.RGB, "k": colours.CMYK}
 """Operators that set colour and space; in upper case for lines."""
@@ -206,7 +204,7 @@ class BlackRemover:
         Parameters
         ----------
         stream : Stream
-        outer : Scope, optional
+        outer : ResourceScope, optional
             Resources of the content that paints it, for forms without resources.
         starts : bool
             True if no colour was set before, so that it starts with black.

@@ -19,10 +19,10 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from locatk.core.errors import FormatError, LocatkError, OutputExistsError
-from locatk.formats.capture.statistics import RECORD as CAPTURE_RECORD
 from locatk.formats.output import atomic_write, check_output, tool_version
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.mcap_file import (
+    CAPTURE_RECORD,
     CHANNELS_RECORD,
     MESSAGE_HEAD,
     SESSION_RECORD,

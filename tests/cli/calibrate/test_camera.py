@@ -67,6 +67,7 @@ def test_a_session_in_a_camera_out(locatk, tilted: Path, tmp_path: Path) -> None
     assert result.stderr == ""
 
 
+@pytest.mark.slow
 def test_the_camera_makes_poses_better(locatk, upright: Path, tmp_path: Path) -> None:
     """Whoever takes the middle of the frame for the camera's is off by 0.17 mm."""
     camera, run = tmp_path / "camera.toml", tmp_path / "drive.mcap"
@@ -165,6 +166,7 @@ def test_one_of_several_cameras(locatk, tmp_path: Path) -> None:
     assert "8 of 8 frames" in result.stdout
 
 
+@pytest.mark.slow
 def test_blank_frames_are_counted(locatk, tmp_path: Path) -> None:
     session = seen(8)
     blank = np.full((120, 188), 200, np.uint8)
@@ -181,6 +183,7 @@ def test_blank_frames_are_counted(locatk, tmp_path: Path) -> None:
     assert "skipped: 2 no pattern" in result.stdout
 
 
+@pytest.mark.slow
 def test_the_manifest_may_be_given(locatk, tmp_path: Path) -> None:
     run, out, sheet = (tmp_path / name for name in ("run.mcap", "camera.toml", "sheet.toml"))
     frames = seen(8).frames

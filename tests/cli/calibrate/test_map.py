@@ -157,6 +157,7 @@ def test_recordings_that_cannot_be_used_are_named(
     assert len(maps.read_map(out).built) == 6
 
 
+@pytest.mark.slow
 def test_the_map_may_be_given_and_must_be_there(
     locatk, sound: SimulatedSession, tmp_path: Path
 ) -> None:

@@ -27,10 +27,10 @@ from locatk.formats.capture import port_listing as listing
 from locatk.formats.capture import ports
 from locatk.formats.capture.links import Overruns
 from locatk.formats.capture.port_listing import PortInfo
-from locatk.formats.capture.recorder import CaptureStatus
 from locatk.formats.capture.recording_files import LiveFile
-from locatk.formats.capture.statistics import CaptureStatistics
+from locatk.formats.capture.status import CaptureStatus
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 

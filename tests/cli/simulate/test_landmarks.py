@@ -245,7 +245,8 @@ def test_a_path_from_a_file(locatk, floor: Path) -> None:
     way.write_text("x,y\n0,0\n")
     result = locatk("simulate", "landmarks", floor, "-o", out, "--overwrite", *given)
     assert result.exit_code == 1
-    assert "no columns x_mm and y_mm in " in result.stderr
+    assert "columns 'x_mm', 'y_mm' are missing" in result.stderr
+    assert "way.csv:1" in result.stderr
     way.write_text("x_mm,y_mm\n0,0\n1,one\n")
     result = locatk("simulate", "landmarks", floor, "-o", out, "--overwrite", *given)
     assert result.exit_code == 1

@@ -89,7 +89,7 @@ def test_correct_constant_errors_removes_large_errors(number: int) -> None:
     steady = np.zeros(3)
     steady[number] = 0.3
     result = correct_constant_errors(measured, steady, OdometryDrift(1, 1, 1))
-    # Arcs are correct_constant_errors by middle headings: the steps are small, not nothing.
+    # Arcs are corrected by middle headings: the steps are small, not nothing.
     np.testing.assert_allclose(result, true, atol=2e-4)
     assert np.abs(measured - true).max() > 0.02
 

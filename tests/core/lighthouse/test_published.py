@@ -28,6 +28,8 @@ from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot.recording import read_dotbot
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 Pairs = list[tuple[Trajectory, Trajectory]]
 
@@ -126,7 +128,6 @@ def test_grid_covariance_tells_the_scatter(grid: Grid) -> None:
     assert np.all(np.median(track.sigma[:, :3], axis=0) < 12 * found)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("places", "paper_mm"), [(8, 25.2), (20, 11.2), (100, 6.7)])
 def test_grid_from_few_places(grid: Grid, places: int, paper_mm: float) -> None:
     # The paper's Fig. 12; the bench does this sixty times for each number.

@@ -93,6 +93,7 @@ def test_every_heading_is_read(known_speed: Round) -> None:
         assert symbols == dict(zip(CELLS, SYMBOLS, strict=True))
 
 
+@pytest.mark.slow
 def test_at_the_bound(known_speed: Round) -> None:
     """Errors reach the Cramer-Rao bound at 0.5 uT: 0.0068 and 0.0072 mm, 0.056 degrees.
 
@@ -103,6 +104,7 @@ def test_at_the_bound(known_speed: Round) -> None:
     assert np.degrees(angle) < 1.15 * 0.056
 
 
+@pytest.mark.slow
 def test_pose_of_a_tag_that_is_as_designed(known_speed: Round) -> None:
     """The bound is 0.0026 and 0.0027 mm and 0.0032 degrees if the tag is known to be as designed.
 
@@ -113,6 +115,7 @@ def test_pose_of_a_tag_that_is_as_designed(known_speed: Round) -> None:
     assert np.degrees(heading) < 2 * 0.0032
 
 
+@pytest.mark.slow
 def test_sigma_of_the_angles(known_speed: Round) -> None:
     """Mean square of errors in their own standard deviations: 1, over 120 magnets."""
     z = known_speed.magnets / known_speed.sigma
@@ -122,12 +125,14 @@ def test_sigma_of_the_angles(known_speed: Round) -> None:
     assert np.abs(z).max() < 4.5
 
 
+@pytest.mark.slow
 def test_white_residual(known_speed: Round) -> None:
     residual = np.array([found.residual_sigma for found in known_speed.found])
     assert np.all(np.abs(residual - 1) < 0.1)
     assert all(found.other_sources == 0 for found in known_speed.found)
 
 
+@pytest.mark.slow
 def test_height_and_moments(known_speed: Round) -> None:
     for found in known_speed.found:
         assert found.height_m == pytest.approx(0.010, abs=5e-5)
@@ -135,6 +140,7 @@ def test_height_and_moments(known_speed: Round) -> None:
             assert magnet.moment_am2 == pytest.approx(Magnet().moment, rel=0.02)
 
 
+@pytest.mark.slow
 def test_array_in_the_tags_frame_is_the_inverse(world: Any, known_speed: Round) -> None:
     """There and back, with complex numbers."""
     for found in known_speed.found:

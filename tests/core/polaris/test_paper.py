@@ -461,6 +461,7 @@ def scored(data: Path, request: pytest.FixtureRequest) -> Scores:
     return scores
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", RUNS)
 def test_orientations_scatter_no_more_than_the_authors(scored: Scores, kind: str) -> None:
     each = np.exp(1j * np.array([run.angle_rad for run in scored[kind]]))
@@ -468,6 +469,7 @@ def test_orientations_scatter_no_more_than_the_authors(scored: Scores, kind: str
     assert scatter <= SCATTER_DEG[kind]
 
 
+@pytest.mark.slow
 def test_orientations_are_those_of_the_tag(scored: Scores, request: pytest.FixtureRequest) -> None:
     off = [run.angle_rad - NOMINAL[kind] for kind in RUNS for run in scored[kind]]
     off_deg = np.degrees(np.abs(np.angle(np.exp(1j * np.array(off)))))
@@ -477,11 +479,13 @@ def test_orientations_are_those_of_the_tag(scored: Scores, request: pytest.Fixtu
     assert np.sum(off_deg > 22.5) <= (1 if "10 mm" in request.node.name else 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", RUNS)
 def test_headings_of_the_position_pattern_are_the_authors(scored: Scores, kind: str) -> None:
     assert np.degrees(np.mean([abs(run.heading_rad) for run in scored[kind]])) <= HEADING_DEG[kind]
 
 
+@pytest.mark.slow
 def test_positions_are_no_worse_than_the_authors(
     scored: Scores, request: pytest.FixtureRequest
 ) -> None:

@@ -22,6 +22,8 @@ from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import Tags
 
+pytestmark = pytest.mark.slow
+
 Array = NDArray[np.float64]
 
 TAGS = Tags(codec="polaris-released")
@@ -108,7 +110,6 @@ def scatter_deg(some: list[Run]) -> float:
     return float(np.degrees(np.sqrt(np.mean(np.angle(rotated * rotated.mean(axis=0).conj()) ** 2))))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_no_wrong_bit(name: str, runs: dict[str, list[Run]]) -> None:
     """The authors: 5 wrong bits of 540 over their 30 runs."""

@@ -18,7 +18,7 @@ from locatk.formats.artifacts import map_library
 from locatk.formats.artifacts.map_library import (
     LibraryMap,
     crop_map,
-    entries,
+    library_maps,
     random_relabelling,
     rotated_map,
 )
@@ -48,7 +48,7 @@ def wanted(entry: LibraryMap, rows: int, columns: int, seed: int = 0) -> DesignO
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.file)
+@pytest.mark.parametrize("entry", library_maps(), ids=lambda entry: entry.file)
 def test_maps_of_the_library_hold(entry: LibraryMap) -> None:
     """By a count of words that shares nothing with the prover."""
     codes = entry.codes()
@@ -70,18 +70,20 @@ def test_maps_of_the_library_hold(entry: LibraryMap) -> None:
 
 @pytest.mark.parametrize("mode", LEAST, ids=str)
 def test_maps_are_at_least_as_large_as_promised(mode: tuple[str, str, int]) -> None:
-    sides = [min(e.rows, e.columns) for e in entries() if (e.alphabet, e.window, e.detect) == mode]
+    sides = [
+        min(e.rows, e.columns) for e in library_maps() if (e.alphabet, e.window, e.detect) == mode
+    ]
     assert max(sides) >= LEAST[mode]
 
 
 def test_every_mode_has_a_map() -> None:
     assert {(a, w) for a in ALPHABETS for w in WINDOWS} - {("6", "I2")} == {
-        (entry.alphabet, entry.window) for entry in entries()
+        (entry.alphabet, entry.window) for entry in library_maps()
     }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.file)
+@pytest.mark.parametrize("entry", library_maps(), ids=lambda entry: entry.file)
 def test_cropped_maps_are_unique_and_differ_by_seed(entry: LibraryMap) -> None:
     rows, columns = max(1, min(9, entry.rows - 1)), min(7, entry.columns)
     floors = [crop_map(wanted(entry, rows, columns, seed)) for seed in range(6)]
@@ -99,7 +101,7 @@ def test_cropped_maps_are_unique_and_differ_by_seed(entry: LibraryMap) -> None:
 
 
 def test_whole_maps_are_cropped_in_both_orientations() -> None:
-    (entry,) = [e for e in entries() if (e.alphabet, e.window, e.detect) == ("6", "I3", 0)]
+    (entry,) = [e for e in library_maps() if (e.alphabet, e.window, e.detect) == ("6", "I3", 0)]
     assert entry.rows != entry.columns
     for rows, columns in ((entry.rows, entry.columns), (entry.columns, entry.rows)):
         for seed in range(8):

@@ -14,7 +14,7 @@ from locatk.core.errors import ArtifactError
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.formats.artifacts import receiver as receivers
-from locatk.formats.artifacts.receiver import dumps_receiver, loads_receiver, read_receivers
+from locatk.formats.artifacts.receiver import dumps_receiver, loads_receiver
 from locatk.formats.capture.attachments import attachments
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.reader import Session
@@ -163,7 +163,7 @@ def test_each_device_has_its_receiver(
 ) -> None:
     session = write(tmp_path / "run.mcap", found, ("a", "b/c"))
     assert [info.name for info in session.attachments()] == names
-    read = read_receivers(session)
+    read = observations.read_receivers(session)
     assert read.keys() == found.keys()
     assert all(same(read[device], found[device]) for device in found)
     if names:
@@ -194,11 +194,11 @@ def recorded(path: Path, device: str, *attached: Receiver) -> Session:
 
 def test_recordings_of_a_deck_have_its_receiver(tmp_path: Path) -> None:
     """Recordings of earlier versions have no attachment."""
-    old = read_receivers(recorded(tmp_path / "1.mcap", "lighthouse-deck"))
+    old = observations.read_receivers(recorded(tmp_path / "1.mcap", "lighthouse-deck"))
     assert [*old] == ["robot"]
     assert same(old["robot"], DECK)
-    assert read_receivers(recorded(tmp_path / "2.mcap", "dotbot-gateway")) == {}
-    given = read_receivers(recorded(tmp_path / "3.mcap", "lighthouse-deck", WAND))
+    assert observations.read_receivers(recorded(tmp_path / "2.mcap", "dotbot-gateway")) == {}
+    given = observations.read_receivers(recorded(tmp_path / "3.mcap", "lighthouse-deck", WAND))
     assert same(given["robot"], WAND)
     [(name, text)] = receivers.deck_artifacts(None).items()
     assert name == "receiver.toml"

@@ -281,6 +281,11 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
             "channel",
         ),
         (
+            HEAD + MARKER + "sightings = [{ counts = {} }]",
+            "markers[0].sightings[0].counts",
+            "not an empty table",
+        ),
+        (
             HEAD + MARKER + "sightings = [{ counts = { 1 = [1, -2] } }]",
             "markers[0].sightings[0].counts.1",
             "of at least 0",

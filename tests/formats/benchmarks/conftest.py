@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import pytest
+
+from locatk.formats.benchmarks.figures import Figure
 
 
 @pytest.fixture(scope="session")
@@ -21,3 +23,16 @@ def run_here() -> Callable[[str], list[float]]:
         return [float(number) for number in numbers]
 
     return run
+
+
+@pytest.fixture(scope="session")
+def by_name() -> Callable[[Iterable[Figure]], dict[str, Figure]]:
+    """Return a function that returns figures by name, which occurs once."""
+
+    def collect(figures: Iterable[Figure]) -> dict[str, Figure]:
+        found = list(figures)
+        named = {figure.name: figure for figure in found}
+        assert len(named) == len(found)
+        return named
+
+    return collect

@@ -87,12 +87,9 @@ def quick() -> Any:
 
 
 @pytest.fixture(scope="module")
-def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
+def rows(by_name: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
     """All figures, without the published frame."""
-    found = dots.figures(tmp_path_factory.mktemp("empty"))
-    by_name = {figure.name: figure for figure in found}
-    assert len(by_name) == len(found)
-    return by_name
+    return by_name(dots.figures(tmp_path_factory.mktemp("empty")))
 
 
 @pytest.mark.slow

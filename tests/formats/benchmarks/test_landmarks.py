@@ -94,12 +94,9 @@ def quick(run_here: Callable[[str], list[float]]) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def rows(quick: None, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
+def rows(quick: None, by_name: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
     """All figures, with an empty data folder."""
-    found = landmarks.figures(tmp_path_factory.mktemp("empty"))
-    by_name = {figure.name: figure for figure in found}
-    assert len(by_name) == len(found)
-    return by_name
+    return by_name(landmarks.figures(tmp_path_factory.mktemp("empty")))
 
 
 @pytest.mark.slow

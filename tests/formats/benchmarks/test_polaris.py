@@ -73,7 +73,7 @@ TAG = 255183
 
 
 @pytest.fixture(scope="module")
-def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
+def rows(by_name: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
     """Return all figures of few passes, without the published runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(polaris_passes, "HEADINGS_DEG", (30,))
@@ -83,10 +83,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
         patch.setattr(polaris_passes, "FAULTS", faults)
         patch.setattr(polaris_speed, "TARGETS_MS", {180: polaris_speed.TARGETS_MS[180]})
         patch.setattr(polaris_speed, "LIBRARIES", ("no-such-library",))
-        found = polaris.figures(tmp_path_factory.mktemp("empty"))
-    by_name = {figure.name: figure for figure in found}
-    assert len(by_name) == len(found)
-    return by_name
+        return by_name(polaris.figures(tmp_path_factory.mktemp("empty")))
 
 
 @pytest.mark.slow
@@ -328,6 +325,7 @@ def test_a_pass_is_right_wrong_refused_or_silent(made: SimulatedSession) -> None
     assert polaris_passes.describe_outcomes(outcomes[3:4]) == "1 refused; 1 tie"
 
 
+@pytest.mark.slow
 def test_nothing_read_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polaris_passes, "REPEATED_PASSES", 1)
     monkeypatch.setattr(polaris_passes, "RANDOM_DESIGNS", 1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,8 +16,8 @@ import pytest
 from locatk.formats.capture import ports, recorder
 from locatk.formats.capture import setup as session
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns
-from locatk.formats.capture.recorder import CaptureStatus, Limits, RecordingResult
-from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.capture.recorder import Limits
+from locatk.formats.capture.status import CaptureStatus, RecordingResult
 from locatk.formats.sessions.reader import Session
 
 READ_TIMEOUT_S = 20.0
@@ -231,21 +230,6 @@ def _left_after(before: set[str]) -> set[str]:
 
 
 @pytest.fixture
-def raw_bytes() -> Callable[..., bytes]:
-    """``raw_bytes(path, ...)``: the bytes in these files, whose offsets must follow on."""
-
-    def join(*paths: Path, topic: str = "/serial/robot") -> bytes:
-        content = bytearray()
-        for path in paths:
-            for _, chunk in Session.open(path).decoded(topic, SerialChunk):
-                assert chunk.byte_offset == len(content)
-                content += chunk.data
-        return bytes(content)
-
-    return join
-
-
-@pytest.fixture
 def log_lines() -> Callable[..., list[str]]:
     """``log_lines(path)``: texts of ``/log``."""
     from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -256,21 +240,3 @@ def log_lines() -> Callable[..., list[str]]:
         ]
 
     return lines
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 9 MiB; the test is skipped where none can be mounted."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=9m", "locatk-test", str(folder)]
-    try:
-        made = subprocess.run(command, capture_output=True, text=True)
-    except OSError as error:
-        pytest.skip(f"no disk can be mounted: {error}")
-    if made.returncode:
-        pytest.skip(f"no disk can be mounted: {made.stderr.strip()}")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)

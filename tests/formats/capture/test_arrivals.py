@@ -26,6 +26,7 @@ def filled(table: np.ndarray, byte_ns: float = 0.0) -> ArrivalTimes:
     return arrivals
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(table=reads, byte_ns=st.floats(0, 500))
 def test_every_byte_has_the_time_of_its_read(table: np.ndarray, byte_ns: float) -> None:

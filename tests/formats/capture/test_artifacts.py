@@ -18,7 +18,7 @@ from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import maps, sheets, tags
 from locatk.formats.artifacts import receiver as receivers
 from locatk.formats.artifacts import scene as scenes
-from locatk.formats.capture.attachments import ATTACHED, KINDS, attachments
+from locatk.formats.capture.attachments import attachments
 from locatk.formats.sessions.writer import SessionWriter
 
 SCENE = scenes.dumps_scene(Scene(markers=(Marker("corner", np.zeros(3)),)))
@@ -52,20 +52,6 @@ def session(path: Path, **attached: str) -> Path:
 def test_each_kind_has_its_place_whatever_the_file_is_called(tmp_path: Path, name: str) -> None:
     path = write(tmp_path / "mine.toml", "# by hand\n" + TEXTS[name])
     assert attachments([path]) == {name: "# by hand\n" + TEXTS[name]}
-
-
-def test_all_kinds_that_solvers_read_are_known() -> None:
-    assert set(KINDS) == {
-        scenes.SCENE_FORMAT,
-        sheets.MANIFEST_FORMAT,
-        sheets.CAMERA_FORMAT,
-        tags.TAG_FORMAT,
-        tags.ARRAY_FORMAT,
-        maps.MAP_FORMAT,
-        maps.HALLS_FORMAT,
-        receivers.RECEIVER_FORMAT,
-    }
-    assert set(ATTACHED) == {*TEXTS, sheets.SHEET_FILE, sheets.CAMERA_FILE}
 
 
 def test_several_at_once(tmp_path: Path) -> None:

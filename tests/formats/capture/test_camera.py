@@ -19,7 +19,7 @@ import pytest
 
 from locatk.formats import images
 from locatk.formats.capture import camera
-from locatk.formats.capture.camera import CameraLink, Frame, port_of
+from locatk.formats.capture.camera import CameraLink, Frame, camera_port
 from locatk.formats.capture.links import LinkEnded, LinkLost, SourceError
 
 SIZE = (64, 48)
@@ -58,15 +58,14 @@ def shown(link: CameraLink) -> tuple[list[Frame], Exception]:
 
 
 @pytest.mark.parametrize("format", ["jpeg", "png"])
-@pytest.mark.parametrize("grey", [False, True])
-def test_frames_of_a_video(video: Path, format: str, grey: bool) -> None:
-    port = port_of(str(video), clock=ticks(), speed=0, format=format, grey=grey)
+def test_frames_of_a_video(video: Path, format: str) -> None:
+    port = camera_port(str(video), clock=ticks(), speed=0, format=format)
     frames, end = shown(port.open())
     assert isinstance(end, LinkEnded)
     assert [(frame.width, frame.height) for frame in frames] == [SIZE] * len(GREYS)
     pictures = [images.decode(frame.image) for frame in frames]
     assert {picture.format for picture in pictures} == {format}
-    assert {picture.pixels.ndim for picture in pictures} == {2 if grey else 3}
+    assert {picture.pixels.ndim for picture in pictures} == {3}
     levels = [float(picture.pixels.mean()) for picture in pictures]
     assert levels == pytest.approx(GREYS, abs=3)
     times = [frame.time_ns for frame in frames]
@@ -78,14 +77,14 @@ def test_png_loses_nothing(video: Path) -> None:
     capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     expected = [capture.read()[1][..., ::-1] for _ in GREYS]
     capture.release()
-    frames, _ = shown(port_of(str(video), clock=ticks(), speed=0, format="png").open())
+    frames, _ = shown(camera_port(str(video), clock=ticks(), speed=0, format="png").open())
     for frame, pixels in zip(frames, expected, strict=True):
         assert np.array_equal(images.decode(frame.image).pixels, pixels)
 
 
 def test_what_is_known_of_it(video: Path) -> None:
-    port = port_of(str(video), clock=ticks(), speed=0, grey=True)
-    before = {"port": f"camera:{video}", "format": "jpeg", "grey": "true"}
+    port = camera_port(str(video), clock=ticks(), speed=0)
+    before = {"port": f"camera:{video}", "format": "jpeg"}
     assert port.describe() == before
     link = port.open()
     assert link.overruns() is None
@@ -101,15 +100,25 @@ def test_what_is_known_of_it(video: Path) -> None:
 
 @pytest.mark.parametrize("speed", [1.0, 2.0])
 def test_a_video_keeps_its_pace(video: Path, speed: float) -> None:
-    frames, _ = shown(port_of(str(video), clock=time.monotonic_ns, speed=speed).open())
+    frames, _ = shown(camera_port(str(video), clock=time.monotonic_ns, speed=speed).open())
     # No frame is early: sleeping may take longer, never shorter.
     since = np.array([frame.time_ns for frame in frames[1:]]) - frames[0].time_ns
     due = np.arange(1, len(GREYS)) * 1e7 / speed
     assert (since >= due - 1e5).all()
 
 
+def test_messages_of_opencv_are_off_while_it_is_open(video: Path) -> None:
+    logging: Any = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
+    level = logging.getLogLevel()
+    assert level != 0
+    link = camera_port(str(video), clock=ticks(), speed=1e-3).open()
+    assert logging.getLogLevel() == 0
+    link.close()
+    assert logging.getLogLevel() == level
+
+
 def test_silence_until_a_frame_is_due(video: Path) -> None:
-    link = port_of(str(video), clock=ticks(), speed=1e-3).open()
+    link = camera_port(str(video), clock=ticks(), speed=1e-3).open()
     assert len(link.read(1.0)) == 1
     assert link.read(0.001) == []
     link.close()
@@ -119,7 +128,7 @@ def test_silence_until_a_frame_is_due(video: Path) -> None:
 
 def test_a_file_waits_for_who_reads_slowly(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera, "MAX_WAITING_BYTES", 3 * SIZE[0] * SIZE[1] * 2)
-    link = port_of(str(video), clock=ticks(), speed=0).open()
+    link = camera_port(str(video), clock=ticks(), speed=0).open()
     time.sleep(0.05)
     assert len(link._waiting) <= 3
     frames, _ = shown(link)
@@ -131,7 +140,7 @@ def test_a_video_that_is_cut_short(video: Path) -> None:
     data = video.read_bytes()
     sixth = [at for at in range(len(data)) if data.startswith(b"00dc", at)][6]
     video.write_bytes(data[:sixth])
-    frames, end = shown(port_of(str(video), clock=ticks(), speed=0).open())
+    frames, end = shown(camera_port(str(video), clock=ticks(), speed=0).open())
     assert 0 < len(frames) < len(GREYS)
     assert isinstance(end, LinkLost)
     assert "truncated" in str(end)
@@ -141,7 +150,7 @@ def refused(place: str) -> SourceError:
     """The error of what is no camera."""
 
     def attempt() -> None:
-        port_of(place, clock=ticks()).open().close()
+        camera_port(place, clock=ticks()).open().close()
 
     with pytest.raises(SourceError) as error:
         attempt()
@@ -177,11 +186,11 @@ def test_the_libraries_say_nothing(tmp_path: Path) -> None:
     (tmp_path / "some.mp4").write_bytes(os.urandom(4000))
     code = """
 import sys
-from locatk.formats.capture.camera import port_of
+from locatk.formats.capture.camera import camera_port
 from locatk.formats.capture.links import SourceError
 for place in sys.argv[1:]:
     try:
-        port_of(place, clock=lambda: 0).open()
+        camera_port(place, clock=lambda: 0).open()
     except SourceError as error:
         print(error)
 """
@@ -205,12 +214,12 @@ def test_a_device_without_rights_or_in_use(tmp_path: Path, monkeypatch: pytest.M
 
 def test_bad_arguments(video: Path) -> None:
     with pytest.raises(SourceError):
-        port_of("", clock=ticks())
+        camera_port("", clock=ticks())
     for speed in (-1.0, float("nan")):
         with pytest.raises(SourceError):
-            port_of(str(video), clock=ticks(), speed=speed)
+            camera_port(str(video), clock=ticks(), speed=speed)
     with pytest.raises(ValueError, match="tiff"):
-        port_of(str(video), clock=ticks(), format="tiff")
+        camera_port(str(video), clock=ticks(), format="tiff")
 
 
 # A camera that sends as long as it likes: Motion JPEG over HTTP, as network cameras do
@@ -246,7 +255,7 @@ def stream() -> Iterator[str]:
 
 def test_a_network_camera(stream: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera, "MAX_FRAME_GAP_S", 0.1)
-    port = port_of(stream, clock=ticks())
+    port = camera_port(stream, clock=ticks())
     assert port.can_reconnect
     for _ in range(2):
         frames, end = shown(port.open())
@@ -286,7 +295,7 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[bool]], Capture]:
 
     def plug(answers: list[bool]) -> Capture:
         capture = Capture(answers)
-        monkeypatch.setattr(camera, "_opened", lambda place, is_file: capture)
+        monkeypatch.setattr(camera, "_open_capture", lambda address, is_file: capture)
         return capture
 
     return plug
@@ -294,7 +303,7 @@ def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[bool]], Capture]:
 
 def test_a_camera_is_unplugged(driver: Callable[[list[bool]], Capture]) -> None:
     capture = driver([True, True, False, True])  # a single failure is none
-    port = port_of("0", clock=ticks())
+    port = camera_port("0", clock=ticks())
     frames, end = shown(port.open())
     assert len(frames) == 3
     assert isinstance(end, LinkLost)
@@ -314,7 +323,7 @@ def test_frames_that_nobody_reads_are_counted(
 ) -> None:
     monkeypatch.setattr(camera, "MAX_WAITING_BYTES", 4 * SIZE[0] * SIZE[1] * 3)
     capture = driver([True] * 10)
-    link = port_of("0", clock=ticks()).open()
+    link = camera_port("0", clock=ticks()).open()
     while not capture.released:
         time.sleep(0.01)
     frames, _ = shown(link)
@@ -334,7 +343,7 @@ def test_a_driver_that_fails(
         return answers.pop()
 
     monkeypatch.setattr(Capture, "retrieve", retrieve)
-    frames, end = shown(port_of("0", clock=ticks(), format="png").open())
+    frames, end = shown(camera_port("0", clock=ticks(), format="png").open())
     assert len(frames) == 1
     assert isinstance(end, LinkLost)
     assert "the driver is broken" in str(end)

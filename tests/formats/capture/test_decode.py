@@ -17,11 +17,11 @@ from locatk.formats.capture.ingestion import SerialIntake
 from locatk.formats.capture.reader_thread import ReceivedData
 from locatk.formats.capture.recording_files import LOG_NAME, FileContent, RecordingFiles
 from locatk.formats.capture.redecoding import decode, losses
-from locatk.formats.capture.statistics import RECORD
 from locatk.formats.devices import find_device
 from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
 from locatk.formats.sessions import messages
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
@@ -177,7 +177,7 @@ def test_what_is_told_stays(tmp_path: Path) -> None:
         tmp_path / "live.mcap", "lines", numbered(20), facts={"meta:robot": "7", "baud": "9600"}
     )
     decode(live, tmp_path / "again.mcap")
-    facts = Session.open(tmp_path / "again.mcap").metadata()[RECORD]
+    facts = Session.open(tmp_path / "again.mcap").metadata()[CAPTURE_RECORD]
     assert facts["note"] == "of a test"
     assert facts["meta:robot"] == "7"
     assert facts["port"] == "/dev/x"
@@ -195,7 +195,7 @@ def test_another_device(tmp_path: Path) -> None:
     assert decoded.devices == {"robot": "lines"}
     ((_, first), *_) = Session.open(tmp_path / "again.mcap").decoded("/readings/robot", Readings)
     assert list(first.names) == ["t", "u"]
-    facts = Session.open(tmp_path / "again.mcap").metadata()[RECORD]
+    facts = Session.open(tmp_path / "again.mcap").metadata()[CAPTURE_RECORD]
     assert facts["device"] == "lines"
     assert raw(tmp_path / "again.mcap") == raw(live)
 
@@ -205,7 +205,7 @@ def test_records_of_before_are_left_out(tmp_path: Path) -> None:
     decode(live, tmp_path / "again.mcap", device="raw")
     session = Session.open(tmp_path / "again.mcap")
     assert {channel.topic for channel in session.channels if channel.count} == {RAW}
-    assert not [key for key in session.metadata()[RECORD] if key.startswith("samples:")]
+    assert not [key for key in session.metadata()[CAPTURE_RECORD] if key.startswith("samples:")]
     assert raw(tmp_path / "again.mcap") == raw(live)
 
 
@@ -243,7 +243,7 @@ def test_artifacts_are_added_and_replaced(tmp_path: Path) -> None:
 def holed(path: Path, chunks: Sequence[tuple[int, int, bytes, bool]]) -> Path:
     """(ms, offset, bytes, opened) as they are."""
     with SessionWriter(path, system="") as writer:
-        writer.metadata(RECORD, {"device": "lines"})
+        writer.metadata(CAPTURE_RECORD, {"device": "lines"})
         for ms, offset, data, opened in chunks:
             chunk = SerialChunk(byte_offset=offset, data=data, opened=opened)
             writer.write(RAW, chunk, START_NS + ms * MS)

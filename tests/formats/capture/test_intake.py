@@ -17,9 +17,9 @@ from locatk.formats import devices as wire
 from locatk.formats.capture import ingestion
 from locatk.formats.capture.ingestion import PAUSE_NS, CameraIntake, SerialIntake, StampedMessage
 from locatk.formats.capture.reader_thread import ReceivedData
-from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks
 from locatk.formats.schemas.serial_pb2 import SerialChunk
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
 
 START_NS = 1_700_000_000_000_000_000
 MS = 1_000_000

@@ -7,6 +7,7 @@ import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 from serial.tools import list_ports
@@ -29,19 +30,21 @@ def usb(device: str, **known: object) -> ListPortInfo:
     return info
 
 
+ARDUINO: dict[str, Any] = {
+    "vid": 0x2341,
+    "pid": 0x43,
+    "serial_number": "95437",
+    "product": "Uno",
+    "description": "Uno",
+    "manufacturer": "Arduino",
+    "location": "1-2:1.0",
+}
+
+
 @pytest.fixture
 def arduino(monkeypatch: pytest.MonkeyPatch) -> None:
     """An Arduino, and ports that tell nothing."""
-    known = usb(
-        "/dev/ttyACM10",
-        vid=0x2341,
-        pid=0x43,
-        serial_number="95437",
-        product="Uno",
-        description="Uno",
-        manufacturer="Arduino",
-        location="1-2:1.0",
-    )
+    known = usb("/dev/ttyACM10", **ARDUINO)
     others = [usb("/dev/ttyACM9", serial_number=""), usb("/dev/ttyS4")]
     monkeypatch.setattr(list_ports, "comports", lambda: [known, *others])
 
@@ -58,16 +61,7 @@ def test_ports_in_natural_order() -> None:
 @pytest.mark.usefixtures("arduino")
 def test_all_that_is_known() -> None:
     bare, known, _ = find_ports_with_users()
-    assert known == PortInfo(
-        device="/dev/ttyACM10",
-        vid=0x2341,
-        pid=0x43,
-        serial_number="95437",
-        product="Uno",
-        description="Uno",
-        manufacturer="Arduino",
-        location="1-2:1.0",
-    )
+    assert known == PortInfo(device="/dev/ttyACM10", **ARDUINO)
     assert bare == PortInfo(device="/dev/ttyACM9")
     assert json.loads(json.dumps(asdict(known)))["pid"] == 67
 

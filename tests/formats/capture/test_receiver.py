@@ -35,7 +35,7 @@ def receive(port: Any) -> Iterator[Callable[..., PortReader]]:
     yield begin
     for each in made:
         each.stop()
-    assert not [each for each in threading.enumerate() if each.name == "locatk-receiver"]
+    assert not [each for each in threading.enumerate() if each.name == "locatk-reader"]
 
 
 def all_events(receiver: PortReader) -> list[Event]:
@@ -188,7 +188,7 @@ def test_a_link_that_breaks_whenever_it_is_opened_is_not_tried_for_ever_at_once(
     real = threading.Event.wait
 
     def wait(self: threading.Event, timeout: float | None = None) -> bool:
-        if threading.current_thread().name == "locatk-receiver" and timeout in (1, 2, 3, 4):
+        if threading.current_thread().name == "locatk-reader" and timeout in (1, 2, 3, 4):
             waits.append(timeout)
             timeout = 0.001
         return real(self, timeout)

@@ -287,6 +287,7 @@ def test_unplugged_and_plugged_in_again(
     assert float(facts["gap_s"]) == pytest.approx(recorded.totals.gap_s, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_device_that_does_not_come_back(port: Any, start: Any, raw_bytes: Any) -> None:
     running = start()
     port.refusals = [SourceError("not there") for _ in range(10_000)]

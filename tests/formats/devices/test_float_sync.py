@@ -95,6 +95,7 @@ def test_not_all_bits_that_are_no_number_are_plausible() -> None:
     assert is_plausible(bits.view(np.float32)).tolist() == [True, True, False, False]
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     gain=st.integers(0, 7),

@@ -523,6 +523,7 @@ def test_no_bytes_are_too_strange(data: bytes) -> None:
     assert decoded(data)[1].counts.frames == 0
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 9), st.binary(max_size=40)), max_size=20))
 def test_no_payload_is_too_strange(sent: list[tuple[int, bytes]]) -> None:

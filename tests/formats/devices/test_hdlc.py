@@ -64,6 +64,7 @@ def test_there_and_back(payload: bytes) -> None:
     assert frame[1:-1].replace(b"}^", b"~").replace(b"}]", b"}") == payload + fcs
 
 
+@pytest.mark.slow
 @given(payloads, st.booleans(), st.lists(st.integers(0, 500)))
 def test_pieces_do_not_matter(sent: list[bytes], shared: bool, cuts: list[int]) -> None:
     frames = [encode_hdlc(payload) for payload in sent]

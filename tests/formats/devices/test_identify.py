@@ -19,10 +19,7 @@ from locatk.formats.devices import DEVICES, Device
 from locatk.formats.devices import identification as identify
 from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream
 from locatk.formats.devices.identification import (
-    CERTAIN,
-    LIKELY,
     MAX_BYTES,
-    UNKNOWN,
     Identifier,
     Verdict,
 )
@@ -98,15 +95,19 @@ def sent(name: str, seed: int = 0) -> Iterator[tuple[str, list[bytes]]]:
             continue
 
 
-def listen(pieces: list[bytes], **known: Any) -> Verdict:
-    """The verdict, each piece after a pause."""
+def fed(pieces: list[bytes], **known: Any) -> Identifier:
+    """An identifier that received the pieces, each after a pause, until it was certain."""
     identifier = Identifier(**known)
     for piece in pieces:
         identifier.feed(piece, pause=True)
-        verdict = identifier.verdict()
-        if verdict is not None:
-            return verdict
-    return identifier.settle()
+        if identifier.verdict() is not None:
+            break
+    return identifier
+
+
+def listen(pieces: list[bytes], **known: Any) -> Verdict:
+    """The verdict, each piece after a pause."""
+    return fed(pieces, **known).settle()
 
 
 def cut(pieces: list[bytes], size: int) -> list[bytes]:
@@ -151,14 +152,13 @@ def test_no_device_is_taken_for_another(name: str) -> None:
 
 @pytest.mark.parametrize("name", SENDERS)
 def test_clean_frames_are_sure_soon(name: str) -> None:
-    for what, pieces in sent(name):
+    for _, pieces in sent(name):
         identifier, heard = Identifier(), 0
         while identifier.verdict() is None:
             identifier.feed(pieces.pop(0), pause=True)
             heard += 1
         verdict = identifier.verdict()
         assert verdict is not None
-        assert verdict.confidence == CERTAIN, what
         assert heard <= 50
         assert verdict.device == name
 
@@ -210,7 +210,7 @@ def noise(kind: str) -> bytes:
 )
 def test_what_fits_no_device_stays_raw(kind: str, boot: bytes) -> None:
     verdict = listen(cut([boot + noise(kind)], 300))
-    assert (verdict.device, verdict.confidence) == ("raw", UNKNOWN)
+    assert verdict.device == "raw"
     assert verdict.why.endswith("--baud")
 
 
@@ -232,14 +232,14 @@ def test_words_are_lines_when_nothing_else_comes(text: bytes) -> None:
         identifier.feed(piece)
         assert identifier.verdict() is None
     verdict = identifier.settle()
-    assert (verdict.device, verdict.confidence) == ("lines", LIKELY)
+    assert verdict.device == "lines"
     assert verdict is identifier.verdict() is identifier.settle()
     identifier.feed(b"more")
     assert len(identifier._data) == len(text)
 
 
 def test_reasons_for_raw() -> None:
-    assert Identifier().settle() == Verdict("raw", UNKNOWN, "no bytes received")
+    assert Identifier().settle() == Verdict("raw", "no bytes received")
     assert "all 50 bytes are 0x00: check the wiring" in listen([bytes(50)]).why
     assert "50 bytes match no known device" in listen([np.random.default_rng(0).bytes(50)]).why
 
@@ -320,9 +320,10 @@ def framed(frames: int) -> list[bytes]:
 
 def test_devices_of_other_packages() -> None:
     devices = [*DEVICES.values(), other("theirs", b"\xaa\x55", 20)]
-    assert listen(framed(100), devices=devices).device == "theirs"
-    assert listen(framed(100), devices=devices).confidence == CERTAIN
-    assert listen(framed(8), devices=devices).confidence == LIKELY
+    for frames, is_certain in ((100, True), (8, False)):
+        identifier = fed(framed(frames), devices=devices)
+        assert (identifier.verdict() is not None) == is_certain
+        assert identifier.settle().device == "theirs"
     assert listen(framed(3), devices=devices).device == "raw"
 
 
@@ -336,8 +337,9 @@ def test_a_decoder_that_takes_everything_is_not_believed() -> None:
 
 def test_a_decoder_that_doubts_is_not_sure() -> None:
     device = other("theirs", b"\xaa\x55", 20, "", ("which is which?",))
-    verdict = listen(framed(100), devices=[device])
-    assert (verdict.device, verdict.confidence) == ("theirs", LIKELY)
+    identifier = fed(framed(100), devices=[device])
+    assert identifier.verdict() is None
+    assert identifier.settle().device == "theirs"
 
 
 @pytest.mark.parametrize("where", ["decode", "feed", "finish"])
@@ -374,5 +376,5 @@ def test_options_reach_the_decoders() -> None:
     identifier = Identifier(Options(columns))
     identifier.feed(b"\n" + b"1,2\n" * 40)
     assert identifier.verdict() == Verdict(
-        "lines", CERTAIN, "40 lines in the first 161 bytes, 100% of the bytes since the first one"
+        "lines", "40 lines in the first 161 bytes, 100% of the bytes since the first one"
     )

@@ -415,6 +415,19 @@ def test_pulse_whose_word_stands_elsewhere_is_left_out() -> None:
         assert rows(decode(SYNC_FRAME, *head, inside, SYNC_FRAME)[0])[2] == (2, 5, 30_200)
 
 
+def test_counts_follow_from_the_offset_before_a_pulse() -> None:
+    """The offset after it, here two counts off, is used only for pulses before the first offset."""
+    got, _ = decode(
+        SYNC_FRAME,
+        frame(3, 0, 3, 0, word(4900, 3)),
+        frame(0, 400, 3, 5000, word(5000, 3)),
+        frame(1, 800, 3, 0, word(5100, 3)),
+        frame(2, 1200, 3, 5202, word(5202, 3)),
+        SYNC_FRAME,
+    )
+    assert got["count"].tolist() == [4900, 5000, 5100, 5202]
+
+
 def test_passages_without_an_offset_give_nothing() -> None:
     got, decoder = decode(SYNC_FRAME, frame(0, 0), frame(1, 100, 3, 0, word(100, 3)), SYNC_FRAME)
     assert len(got["count"]) == 0

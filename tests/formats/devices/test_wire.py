@@ -10,9 +10,9 @@ from locatk.core.errors import InputError
 from locatk.formats import devices as wire
 from locatk.formats.capture.ingestion import SerialIntake
 from locatk.formats.capture.reader_thread import ReceivedData
-from locatk.formats.capture.statistics import CaptureStatistics
 from locatk.formats.devices.decoder import Options, Recording
 from locatk.formats.devices.lines.decoder import LineDecoder
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
 
 MINE = wire.Device("mine", "lines of another package", 9600, f"{__name__}:made")
 

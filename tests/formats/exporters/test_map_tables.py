@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from locatk.core.errors import FormatError, InputError
 from locatk.core.landmarks.landmark import signs
 from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap, as_built_poses
-from locatk.formats.exporters.map_csv import HEADER, dumps_csv, loads_csv
-from locatk.formats.exporters.map_lif import dumps_lif, loads_lif
+from locatk.formats.exporters.map_csv import dumps_csv
+from locatk.formats.exporters.map_lif import dumps_lif
+from locatk.formats.importers.map_csv import HEADER, loads_csv
+from locatk.formats.importers.map_lif import loads_lif
 
 STAMP = datetime(2026, 3, 1, 12, 30, 5, 120_000, tzinfo=UTC)
 

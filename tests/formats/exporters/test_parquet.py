@@ -12,8 +12,8 @@ from locatk.core.errors import LocatkError, OutputExistsError
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.parquet import AXES, COVARIANCE, write_parquet
-from locatk.formats.exporters.trajectory_csv import COLUMNS, write_csv
-from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.exporters.trajectory_csv import write_csv
+from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.tables.timestamps import format_epoch_seconds
 
 START_NS = 1_700_000_000_123_456_789

@@ -43,7 +43,8 @@ from locatk.core.lighthouse.recording import Edges, StationReport
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.formats.artifacts import receiver as receivers
 from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.exporters import crazyflie
+from locatk.formats.exporters.crazyflie import dumps_config
+from locatk.formats.importers.crazyflie import read_config
 from locatk.formats.importers.dotbot.log import read_dotbot_log
 from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
@@ -511,8 +512,8 @@ FILES: dict[str, tuple[str, Sequence[bytes], Callable[[Path, bool], Any]]] = {
     "dotbot-log": ("pydotbot.log", LOGS, importer(lambda path: read_dotbot_log([path]))),
     "crazyflie": (
         "config.yaml",
-        [crazyflie.dumps_config(SCENE).encode()],
-        lambda path, _: artifacts.loads_scene(artifacts.dumps_scene(crazyflie.read_config(path))),
+        [dumps_config(SCENE).encode()],
+        lambda path, _: artifacts.loads_scene(artifacts.dumps_scene(read_config(path))),
     ),
     "scene": (
         "scene.toml",
@@ -602,7 +603,7 @@ from pathlib import Path
 from locatk.core.errors import LocatkError
 from locatk.formats.artifacts.receiver import read_receiver
 from locatk.formats.artifacts.scene import read_scene
-from locatk.formats.exporters.crazyflie import read_config
+from locatk.formats.importers.crazyflie import read_config
 from locatk.formats.importers.dotbot.log import read_dotbot_log
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.saleae.recording import read_saleae

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError, MissingDataError
-from locatk.formats.importers.images import ImageFiles, find_images
+from locatk.formats.importers.images import ImageFiles, find_images, natural_path_key
 from locatk.formats.importers.video import Video, is_cut
 from locatk.formats.sessions import frames, observations
 from locatk.formats.sessions.reader import Session
@@ -50,21 +50,17 @@ def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
 
 @given(st.lists(st.integers(0, 10**6), min_size=1, max_size=20, unique=True))
 def test_any_numbers_come_in_order(numbers: list[int]) -> None:
-    from locatk.formats.importers.images import _natural
-
-    paths = sorted((Path(f"run/f{number}.png") for number in numbers), key=_natural)
+    paths = sorted((Path(f"run/f{number}.png") for number in numbers), key=natural_path_key)
     assert [int(path.stem[1:]) for path in paths] == sorted(numbers)
 
 
 @pytest.mark.slow
 @given(st.lists(st.text(st.characters(exclude_characters="/\0"), min_size=1), min_size=2))
 def test_any_names_can_be_ordered(names: list[str]) -> None:
-    from locatk.formats.importers.images import _natural
-
     paths = [Path("run") / name for name in names]
     backward = paths[::-1]
-    backward.sort(key=_natural)
-    assert backward == sorted(paths, key=_natural)
+    backward.sort(key=natural_path_key)
+    assert backward == sorted(paths, key=natural_path_key)
 
 
 def test_folders_files_and_patterns(tmp_path: Path) -> None:

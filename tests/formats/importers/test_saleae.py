@@ -166,6 +166,7 @@ def test_both_ways_of_reading_agree(tmp_path: Path) -> None:
 # ---- rates
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mhz", [24, 25, 30, 32, 40, 48, 50, 62.5, 80, 100, 125, 160, 200, 250, 500]
 )

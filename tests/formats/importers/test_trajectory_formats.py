@@ -13,10 +13,10 @@ from locatk.core.errors import FormatError, InputError, LocatkError, OutputExist
 from locatk.core.geometry import matrix_from_quaternion, rotation_exp
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.kitti import write_kitti
-from locatk.formats.exporters.trajectory_csv import SIGMA_AXES, write_csv
+from locatk.formats.exporters.trajectory_csv import write_csv
 from locatk.formats.exporters.tum import write_tum
 from locatk.formats.importers.kitti import read_kitti
-from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.importers.trajectory_csv import SIGMA_AXES, read_csv
 from locatk.formats.importers.tum import read_tum
 from locatk.formats.tables import delimited, timestamps
 

@@ -203,6 +203,7 @@ def test_a_solution_without_scale_is_not_compared_with_metres() -> None:
     assert not any("MAE" in text or "[mm]" in text for text in said)
 
 
+@pytest.mark.slow
 def test_truth_of_other_devices_or_times_is_no_error() -> None:
     later = replace(track("red"), time_ns=track("red").time_ns + 10**12)
     for truth in ((track("green"),), (later,)):

@@ -219,6 +219,7 @@ def test_rulers_are_100_mm(part: str) -> None:
     check_rulers(render_pages(draw_installation_pack(HALL, A4, parts=(part,)).pages, "t"), 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(2, 2), (24, 24), (3, 28)])
 def test_the_plan_shows_each_code_in_its_place(shape: tuple[int, int]) -> None:
     floor = some_floor(*shape)

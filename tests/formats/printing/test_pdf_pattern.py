@@ -284,6 +284,7 @@ def words(data: bytes, number: int, made: Manifest) -> str:
     return found
 
 
+@pytest.mark.slow
 def test_margin_says_what_it_is() -> None:
     made = sheets()
     text = words(pattern.render(made), 0, made)
@@ -304,6 +305,7 @@ def test_narrow_margins_stay_empty() -> None:
         assert pattern.sheets_without_margin(made) == (["sheet-1"] if bare else [])
 
 
+@pytest.mark.slow
 def test_crop_marks_are_at_the_corners_of_the_pattern() -> None:
     made = sheets("A5")
     data = pattern.render(made, marks=False, crop=True)
@@ -449,6 +451,7 @@ def test_png_is_the_page(
     np.testing.assert_array_equal(png(made)[1], found)
 
 
+@pytest.mark.slow
 def test_png_is_what_the_pdf_shows() -> None:
     made = sheets("A5")
     shown = rasterise(pattern.render(made, marks=False), 300)
@@ -476,7 +479,7 @@ def test_steps_are_counted() -> None:
     )
     calls: list[None] = []
     pattern.render(two, done=lambda: calls.append(None))
-    assert len(calls) == rasters.bands(two) == 6
+    assert len(calls) == rasters.count_bands(two) == 6
 
 
 @pytest.mark.slow

@@ -196,6 +196,7 @@ def group_box(group: Xml.Element) -> tuple[float, float, float, float]:
     return min(x), min(y), max(x), max(y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tags", "count", "paper", "mirror"),
     [

@@ -45,6 +45,7 @@ def test_nan_is_no_peak() -> None:
     assert 500 in thin(1000, 50, values)
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(0, 10_000), max_size=50))
 def test_points_are_allotted_to_devices(counts: list[int]) -> None:
     shares = allot_points(counts, 3000)

@@ -111,6 +111,7 @@ def test_one_copy_of_the_script_and_no_address(tmp_path: Path) -> None:
     assert "'unsafe-inline'" not in policy.split("style-src")[0]
 
 
+@pytest.mark.slow
 def test_the_same_subjects_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.html", "b.html"):
         write_report(tmp_path / name, [evaluated(solution("red"))])
@@ -205,6 +206,7 @@ def test_truth_of_another_time_is_no_error() -> None:
     assert "No pose has truth of its device at its time" in said
 
 
+@pytest.mark.slow
 def test_a_scene_without_scale_has_no_metres() -> None:
     solved = solution("red", artifact=replace(SCENE, scale="unit"))
     subject = Subject("run.mcap", solved, truth=(track("red"),))
@@ -271,6 +273,7 @@ def test_devices_without_truth_are_named() -> None:
     assert "All poses are scored." in figure(subject, "Statistics").note
 
 
+@pytest.mark.slow
 def test_facts_have_units_and_no_lists_for_programs() -> None:
     facts = {"speed_mps": 0.5, "frames": [{"x": k} for k in range(200)], "robots": {"a": {"n": 1}}}
     subject = Subject(
@@ -380,6 +383,7 @@ def test_ellipses_are_in_the_frame_of_the_truth() -> None:
     np.testing.assert_allclose(np.ptp(first, axis=1), 2 * 2.4477 * np.array([0.05, 0.1]), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_path_that_rises_is_seen_from_the_side() -> None:
     steep = replace(solution("red"), trajectories=(track("red", rise_m=0.1),))
     titles = [panel.title for panel in report_panels(evaluated(steep))]
@@ -405,6 +409,7 @@ def test_poses_in_two_frames_share_no_map() -> None:
         assert f"camera-{name}" in names
 
 
+@pytest.mark.slow
 def test_outliers_are_at_the_upper_limit_and_counted() -> None:
     solved = solution("red", n=100)
     solved.trajectories[0].position[50, 0] += 40.0
@@ -458,6 +463,7 @@ def test_few_devices_are_named_and_the_rest_counted() -> None:
     assert "The legend names 7 of 20 devices" in panel.note
 
 
+@pytest.mark.slow
 def test_several_subjects_are_in_a_table_with_links() -> None:
     page = render_report([evaluated(solution("red")), Subject("b.mcap", solution("blue"))])
     assert '<a href="#s2">b.mcap</a>' in page

@@ -162,6 +162,7 @@ def test_sweeps_of_several_photodiodes_belong_to_their_own_moments(
     assert np.count_nonzero(held & ~posed) == sum(each.rejected for each in solution.detections)
 
 
+@pytest.mark.slow
 def test_tags_are_marked_where_their_field_is(polaris: tuple[Session, Solution]) -> None:
     session, solution = polaris
     whole, near = signals.signal_panels(session, solution)
@@ -281,6 +282,7 @@ def colours(png: bytes) -> int:
 # ---- missing, damaged and large recordings
 
 
+@pytest.mark.slow
 def test_a_large_recording_is_drawn_in_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -157,6 +157,7 @@ def test_schemas_are_those_that_viewers_know(solved: tuple[str, Path]) -> None:
         assert (folder / f"{schema.removeprefix('foxglove.')}_pb2.py").exists()
 
 
+@pytest.mark.slow
 def test_all_entities_are_connected_to_one_frame(solved: tuple[str, Path]) -> None:
     """Transforms form one tree, whose root is the frame of the artifact, the paths, the poses."""
     system, path = solved

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import mcap.reader
 import mcap.writer
@@ -105,6 +106,7 @@ SCENE = Scene(
 # ---- sweeps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [0, 1, 5000])
 @pytest.mark.parametrize("batch_ns", [1, 20_000_000, 10**15])
 def test_sweeps_round_trip(tmp_path: Path, n: int, batch_ns: int) -> None:
@@ -294,15 +296,15 @@ def test_session_round_trip(tmp_path: Path) -> None:
         np.column_stack([np.zeros((50, 2)), np.sin(heading / 2), np.cos(heading / 2)]),
         np.full((50, 6, 6), np.nan),
     )
-    observations.write_session(
-        path,
-        system="lighthouse",
-        sweeps=sweeps,
-        truth=truth,
-        odometry=[flat],
-        scene=SCENE,
-        facts={"source": "test", "rows": 3},
-    )
+    contents: dict[str, Any] = {
+        "system": "lighthouse",
+        "sweeps": sweeps,
+        "truth": truth,
+        "odometry": [flat],
+        "scene": SCENE,
+        "facts": {"source": "test", "rows": 3},
+    }
+    observations.write_session(path, **contents)
     session = Session.open(path)
     assert session.facts["kind"] == "session"
     assert session.metadata()["facts"] == {"source": "test", "rows": "3"}
@@ -321,15 +323,7 @@ def test_session_round_trip(tmp_path: Path) -> None:
     assert observations.read_trajectories(path)[0].device == "G"
 
     again = tmp_path / "again.mcap"
-    observations.write_session(
-        again,
-        system="lighthouse",
-        sweeps=sweeps,
-        truth=truth,
-        odometry=[flat],
-        scene=SCENE,
-        facts={"source": "test", "rows": 3},
-    )
+    observations.write_session(again, **contents)
     assert again.read_bytes() == path.read_bytes()
     with pytest.raises(OutputExistsError):
         observations.write_session(path, system="lighthouse", sweeps=sweeps)

@@ -17,7 +17,6 @@ from locatk.formats.artifacts.kinds import (
     Boolean,
     FilePath,
     Integer,
-    ListOf,
     Number,
     Record,
     Row,
@@ -165,7 +164,6 @@ def test_values_at_the_ends_of_a_range() -> None:
 def test_text_of_the_command_line() -> None:
     bar = Record({"cell": Row(Integer(), 2), "bar": Integer()})
     assert bar.parse_text("2,3:1") == ((2, 3), 1)
-    assert ListOf(bar).parse_text("2,3:1") == (((2, 3), 1),)
     assert Row(Number(), 2).parse_text("1.002,0.999") == (1.002, 0.999)
     for text in ("2,3", "2:1", "2,3,4:1", "2,3:1:0", "a,3:1", ""):
         with pytest.raises(ValueError, match=r"expected|invalid literal"):

@@ -20,7 +20,8 @@ from locatk.core.lighthouse.calibration import (
     Calibration,
 )
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.formats.exporters import crazyflie
+from locatk.formats.exporters.crazyflie import FORMER_MODEL_NOTE, dumps_config, write_config
+from locatk.formats.importers.crazyflie import MODEL_NOTE, loads_config, read_config
 
 CALIBRATION = """
     sweeps:
@@ -88,7 +89,7 @@ def scene(**changes: object) -> Scene:
 
 
 def test_reads_what_cflib_writes() -> None:
-    found = crazyflie.loads_config(SAMPLE)
+    found = loads_config(SAMPLE)
     first, second = found.stations
     assert (first.channel, second.channel) == (1, 12)
     assert first.position.tolist() == [-2.5, 1e-5, 3.125]
@@ -111,7 +112,7 @@ def test_reads_what_cflib_writes() -> None:
 def test_a_scene_from_a_configuration_is_a_valid_artifact(tmp_path: Path) -> None:
     from locatk.formats.artifacts.scene import dumps_scene, loads_scene
 
-    found = crazyflie.loads_config(SAMPLE)
+    found = loads_config(SAMPLE)
     again = loads_scene(dumps_scene(found))
     assert [s.channel for s in again.stations] == [1, 12]
     assert list(again.calibrations) == [4]
@@ -120,8 +121,8 @@ def test_a_scene_from_a_configuration_is_a_valid_artifact(tmp_path: Path) -> Non
 def test_the_same_after_writing_and_reading(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     before = scene(calibrations={7: Calibration(np.array(SWEEPS) / 3, "factory")}, ids={7: 12})
-    crazyflie.write_config(path, before)
-    after = crazyflie.read_config(path)
+    write_config(path, before)
+    after = read_config(path)
     for old, new in zip(before.stations, after.stations, strict=True):
         assert (new.channel, new.id) == (old.channel, old.id)
         assert new.position.tolist() == old.position.tolist()
@@ -130,14 +131,14 @@ def test_the_same_after_writing_and_reading(tmp_path: Path) -> None:
     assert after.calibrations[7].sweeps.tolist() == before.calibrations[7].sweeps.tolist()
     assert after.ids == {7: 12}
     with pytest.raises(OutputExistsError):
-        crazyflie.write_config(path, before)
-    crazyflie.write_config(path, before, overwrite=True)
-    assert crazyflie.dumps_config(before) == path.read_text()
+        write_config(path, before)
+    write_config(path, before, overwrite=True)
+    assert dumps_config(before) == path.read_text()
 
 
 def test_all_numbers_are_floats_for_yaml_readers() -> None:
     """cflib packs the values as they come: 1e-07 without a point would be a string there."""
-    data = yaml.safe_load(crazyflie.dumps_config(scene()))
+    data = yaml.safe_load(dumps_config(scene()))
     assert (data["type"], data["version"], data["systemType"]) == (
         "lighthouse_system_configuration",
         "1",
@@ -158,7 +159,7 @@ def test_cflib_reads_it(tmp_path: Path) -> None:
     pytest.importorskip("cflib", reason="cflib is not installed")
     from cflib.localization import LighthouseConfigFileManager
 
-    crazyflie.write_config(tmp_path / "config.yaml", scene())
+    write_config(tmp_path / "config.yaml", scene())
     geos, calibs, system = LighthouseConfigFileManager.read(str(tmp_path / "config.yaml"))
     assert system == 2
     packed = [bytearray(), bytearray()]
@@ -174,32 +175,30 @@ def test_only_factory_calibrations_are_written() -> None:
         IDEAL_CALIBRATION,
         Calibration(np.array(SWEEPS), "estimated"),
     ):
-        text = crazyflie.dumps_config(
-            scene(stations=(first, dataclasses.replace(second, calibration=other)))
-        )
+        text = dumps_config(scene(stations=(first, dataclasses.replace(second, calibration=other))))
         assert list(yaml.safe_load(text)["calibs"]) == [0]
         assert "# No factory calibration of channel 16" in text
-        again = crazyflie.loads_config(text)
+        again = loads_config(text)
         assert again.stations[1].calibration is GENERIC_CALIBRATION
 
 
 def test_scenes_that_cannot_be_written() -> None:
     with pytest.raises(InputError, match="no scale") as refused:
-        crazyflie.dumps_config(scene(scale="unit"))
+        dumps_config(scene(scale="unit"))
     assert refused.value.hint
     with pytest.raises(InputError, match="no stations") as refused:
-        crazyflie.dumps_config(Scene(scale="markers"))
+        dumps_config(Scene(scale="markers"))
     assert refused.value.hint
     lost = dataclasses.replace(scene().stations[0], position=np.array([0.0, np.nan, 0.0]))
     with pytest.raises(InputError, match="channel 1 is not finite"):
-        crazyflie.dumps_config(scene(stations=(lost,)))
+        dumps_config(scene(stations=(lost,)))
 
 
 def test_rotations_of_32_bits_and_of_four_digits() -> None:
     exact = rotation(5)
     for matrix, rounded in ((exact.astype(np.float32), False), (np.round(exact, 4), True)):
         text = SAMPLE.replace("[[0, -1, 0], [1, 0, 0], [0, 0, 1]]", str(matrix.tolist()))
-        found = crazyflie.loads_config(text)
+        found = loads_config(text)
         r = found.stations[1].rotation
         assert r @ r.T == pytest.approx(np.eye(3), abs=1e-12)
         assert r == pytest.approx(exact, abs=1e-4)
@@ -208,16 +207,16 @@ def test_rotations_of_32_bits_and_of_four_digits() -> None:
 
 @pytest.mark.parametrize("text", ["version: 1", 'version: "1"', "version: '1'"])
 def test_version_with_and_without_quotes(text: str) -> None:
-    assert crazyflie.loads_config(SAMPLE.replace("version: '1'", text)).stations
+    assert loads_config(SAMPLE.replace("version: '1'", text)).stations
 
 
 def test_missing_parts_and_unknown_keys() -> None:
     head = "type: lighthouse_system_configuration\nversion: '1'\n"
-    empty = crazyflie.loads_config(head)
+    empty = loads_config(head)
     assert (empty.stations, empty.calibrations, empty.scale) == ((), {}, "unit")
-    empty = crazyflie.loads_config(head + "geos: {}\ncalibs: {}\n")
+    empty = loads_config(head + "geos: {}\ncalibs: {}\n")
     assert (empty.stations, empty.notes) == ((), ())
-    extra = crazyflie.loads_config(head + "colour: red\nlights: [1, 2]\n")
+    extra = loads_config(head + "colour: red\nlights: [1, 2]\n")
     assert "'colour', 'lights'" in extra.notes[0]
 
 
@@ -225,7 +224,7 @@ def test_a_calibration_of_zeros_is_none() -> None:
     zeros = SAMPLE
     for value in {str(v) for row in SWEEPS for v in row} - {"0.0"}:
         zeros = zeros.replace(f": {value}\n", ": 0.0\n")
-    found = crazyflie.loads_config(zeros)
+    found = loads_config(zeros)
     assert found.stations[1].calibration is GENERIC_CALIBRATION
     assert found.stations[1].id == 1083618720
     assert found.calibrations == {}
@@ -278,7 +277,7 @@ def test_errors_name_key_and_expected_value(
         where += SAMPLE[: SAMPLE.index(old)].count("\n") + 1
     path.write_text(SAMPLE.replace(old, new, 1))
     with pytest.raises(ArtifactError, match=message) as refused:
-        crazyflie.read_config(path)
+        read_config(path)
     assert (refused.value.file, refused.value.where) == (str(path), where)
     assert "\n" not in str(refused.value)
 
@@ -312,7 +311,7 @@ def test_files_of_other_kinds(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "other.yaml"
     path.write_bytes(content)
     with pytest.raises(ArtifactError) as refused:
-        crazyflie.read_config(path)
+        read_config(path)
     assert refused.value.file == str(path)
     assert len(str(refused.value)) < 400
 
@@ -327,7 +326,7 @@ def test_damaged_files_give_an_error_or_a_scene(data: st.DataObject) -> None:
         content[place] ^= 1 << data.draw(st.integers(0, 7))
     cut = data.draw(st.integers(0, len(content)))
     try:
-        found = crazyflie.loads_config(bytes(content[: cut if cut % 3 == 0 else None]))
+        found = loads_config(bytes(content[: cut if cut % 3 == 0 else None]))
     except LocatkError:
         return
     for station in found.stations:
@@ -338,20 +337,18 @@ def test_damaged_files_give_an_error_or_a_scene(data: st.DataObject) -> None:
 @given(st.one_of(st.text(), st.binary().map(lambda b: b.decode("latin-1"))))
 def test_any_text(text: str) -> None:
     with contextlib.suppress(LocatkError):
-        crazyflie.loads_config(text)
+        loads_config(text)
 
 
 def test_scenes_solved_by_locatk_are_marked() -> None:
     """The key ``solver`` marks them; other tools ignore it."""
-    ours = crazyflie.loads_config(crazyflie.dumps_config(scene()))
-    assert crazyflie.MODEL_NOTE not in ours.notes
-    theirs = crazyflie.loads_config(SAMPLE)
-    assert crazyflie.MODEL_NOTE in theirs.notes
-    again = crazyflie.loads_config(
-        crazyflie.dumps_config(dataclasses.replace(theirs, scale="markers"))
-    )
-    assert crazyflie.MODEL_NOTE in again.notes
-    assert crazyflie.MODEL_NOTE in crazyflie.loads_config(SAMPLE + "solver: other\n").notes
+    ours = loads_config(dumps_config(scene()))
+    assert MODEL_NOTE not in ours.notes
+    theirs = loads_config(SAMPLE)
+    assert MODEL_NOTE in theirs.notes
+    again = loads_config(dumps_config(dataclasses.replace(theirs, scale="markers")))
+    assert MODEL_NOTE in again.notes
+    assert MODEL_NOTE in loads_config(SAMPLE + "solver: other\n").notes
     # A scene of an earlier version has another wording of the note.
-    former = dataclasses.replace(theirs, scale="markers", notes=(crazyflie.FORMER_MODEL_NOTE,))
-    assert "solver" not in crazyflie.dumps_config(former)
+    former = dataclasses.replace(theirs, scale="markers", notes=(FORMER_MODEL_NOTE,))
+    assert "solver" not in dumps_config(former)

@@ -1,4 +1,4 @@
-"""What is counted, since when, and how it is said."""
+"""Counts of a recording: differences, descriptions of losses, and the metadata record."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from locatk.formats.capture.statistics import CaptureStatistics
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
 
 counts = st.integers(0, 10**12)
 samples = st.dictionaries(st.sampled_from(("/a", "/b", "/c")), counts)
