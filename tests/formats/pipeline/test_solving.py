@@ -157,7 +157,7 @@ def test_errors_travel_between_processes() -> None:
     )
     copy = pickle.loads(pickle.dumps(error))
     assert type(copy) is DegenerateError
-    assert str(copy) == "sensor 3 stood still in s3://b/run.mcap"
+    assert str(copy) == "s3://b/run.mcap: sensor 3 stood still"
     plain = portable_error(LocatkError("no", hint="see /tmp/a.mcap"), {"/tmp/a.mcap": "a.mcap"})
     assert plain.hint == "see a.mcap"
 
