@@ -15,7 +15,7 @@ library       import  report of ``pich_mm`` instead of ``pitch_mm``
 pydantic 2.14    111  four lines: ``map.pitch_mm Field required``, ``map.pich_mm Extra inputs are
                       not permitted``, and two links
 msgspec 0.22      27  ``Object contains unknown field `pich_mm` - at `$.map```
-this module        -  ``missing key 'pitch_mm' in FILE:map.pitch_mm. Hint: Is 'pich_mm' meant to
+this module        -  ``FILE:map.pitch_mm: missing key 'pitch_mm'. Hint: Is 'pich_mm' meant to
                       be pitch_mm?``
 ============  ======  ==========================================================================
 

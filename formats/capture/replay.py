@@ -163,4 +163,4 @@ def _chunks(session: Session, topic: str) -> Generator[tuple[int, bytes], None, 
     except InputError as error:
         raise LinkLost(f"{error}; `locatk recover` saves the rest") from error
     if session.damage is not None:
-        raise LinkLost(f"{session.damage} in {session.path}")
+        raise LinkLost(f"{session.path}: {session.damage}")

@@ -230,7 +230,9 @@ def _times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str
         row = int(np.argmax(steps_ns <= 0)) + 1
         table.fail(
             row,
-            "the time goes backwards" if steps_ns[row - 1] < 0 else "the time of the previous row",
+            "the time goes backwards"
+            if steps_ns[row - 1] < 0
+            else "the time is that of the previous row",
             "Sort the rows by time, and write times with all of their digits",
         )
     return time_ns, clock

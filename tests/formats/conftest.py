@@ -24,6 +24,6 @@ def refused() -> Callable[..., None]:
         assert words in error.message
         assert "\n" not in str(error)
         place = artifact.file if where is None else f"{artifact.file}:{where}"
-        assert str(error).endswith(f" in {place}")
+        assert str(error) == f"{place}: {error.message}"
 
     return check

@@ -161,7 +161,7 @@ def read_dotbot_log(paths: Sequence[Path]) -> ImportedSession:
         before = log.records
         _read(Path(path), log)
         if log.records == before and len(paths) > 1:
-            warnings.append(f"no record of light in {path}")
+            warnings.append(f"{path}: no record of light")
     rows = _rows(log, warnings)
     if not len(rows):
         detail = f" ({log.records} records of light, {log.damaged} of them damaged)"

@@ -103,7 +103,7 @@ def test_who_may_not_write_is_told_so(tmp_path: Path, monkeypatch: pytest.Monkey
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr("builtins.open", refuse)
-    with pytest.raises(LocatkError, match=r"cannot write: Permission denied in .*run\.mcap"):
+    with pytest.raises(LocatkError, match=r"run\.mcap: cannot write: Permission denied"):
         LiveFile(tmp_path / "run.mcap")
 
 
@@ -120,7 +120,7 @@ def test_a_write_is_whole_or_nothing(tmp_path: Path) -> None:
     file = LiveFile(path)
     disk = on(file, room=10, at_once=4)
     file.write(b"whole")
-    with pytest.raises(DiskFullError, match=r"no space left in .*run\.mcap"):
+    with pytest.raises(DiskFullError, match=r"run\.mcap: no space left"):
         file.write(b"too much of it")
     assert file.tell() == 5
     assert path.read_bytes() == b"whole"

@@ -191,6 +191,7 @@ def test_a_session_that_is_cut_short(tmp_path: Path) -> None:
     assert len(pieces) > 50
     # Not the end of the recording: it is lost, and that is what the recorder will say.
     assert isinstance(end, LinkLost)
+    assert str(end).startswith(f"{file}: ")
     assert "cut short" in str(end)
     assert "cut short" in port.describe()["damage"]
 

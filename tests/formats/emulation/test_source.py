@@ -124,7 +124,7 @@ def test_a_damaged_chunk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     session = of_bytes(tmp_path / "run.mcap")
     source = select_source(session)
     monkeypatch.setattr(session, "messages", lambda topics: [("/serial/bar", 0, b"\xff")])
-    with pytest.raises(FormatError, match=r"damaged in .*run.mcap:/serial/bar"):
+    with pytest.raises(FormatError, match=r"run\.mcap:/serial/bar: .* damaged"):
         list(source.packets())
 
 
@@ -144,7 +144,7 @@ def test_streams_are_encoded(tmp_path: Path, recordings: list[Recording]) -> Non
 def test_all_streams_reach_the_device(tmp_path: Path, recordings: list[Recording]) -> None:
     for make, name in ((of_halls, "halls"), (of_sweeps, "sweeps")):
         source = select_source(make(tmp_path / f"{name}.mcap"), "fake")
-        with pytest.raises(InputError, match=rf"no samples of magnetometers in .*{name}.mcap"):
+        with pytest.raises(InputError, match=rf"{name}\.mcap: no samples of magnetometers"):
             list(source.packets())
         assert len(getattr(recordings[-1], name)) in (1, 5)
 

@@ -113,7 +113,7 @@ def test_a_number_that_overflows_is_quoted_as_written(tmp_path: Path) -> None:
     path = tmp_path / "rows.txt"
     path.write_text("1.5 2\n2.5 1e400\n")
     table = read_number_rows(path, ("t", "x"), hint="t x", time_column="t")
-    with pytest.raises(InputError, match=r"1e400 in column 'x' should be a finite .*rows\.txt:2"):
+    with pytest.raises(InputError, match=r"rows\.txt:2: 1e400 in column 'x' should be a finite "):
         table.floats("x")
 
 
