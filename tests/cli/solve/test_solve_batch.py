@@ -522,7 +522,7 @@ def test_a_cluster_loses_nothing_when_a_worker_is_killed(
     assert [tmp_path / entry["session"] for entry in told] == sorted(sessions)
     assert [entry["session"] for entry in told if "error" in entry] == ["day/still.mcap"]
     assert stderr == (
-        "Warning: one robot standing still in day/still.mcap. Hint: Drive it around.\n"
+        "Warning: day/still.mcap: one robot standing still. Hint: Drive it around.\n"
         "Incomplete: 1 of 7 sessions could not be solved.\n"
     )
     assert calls(sonar).count("slow") == 2
@@ -667,9 +667,9 @@ def test_s3_places(
         assert refused.exit_code == 1
         assert refused.stderr.startswith("Error: the bucket 'nobucket' does not exist. Hint: ")
     for place, words in (
-        ("s3://lab/day/none.mcap", "No such object in s3://lab/day/none.mcap"),
-        ("s3://lab/other/", "no *.mcap in s3://lab/other/"),
-        ("s3://lab/x*.mcap", "no file matches s3://lab/x*.mcap"),
+        ("s3://lab/day/none.mcap", "Error: s3://lab/day/none.mcap: No such object"),
+        ("s3://lab/other/", "Error: s3://lab/other/: no *.mcap in the folder"),
+        ("s3://lab/x*.mcap", "Error: s3://lab/x*.mcap: no file matches the pattern"),
         ("s3://nobucket/a.mcap", "s3://nobucket/a.mcap"),
         ("s5://lab/a.mcap", "s5"),
     ):
