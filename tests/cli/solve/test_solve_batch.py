@@ -280,7 +280,7 @@ def test_a_deadly_session_does_not_stop_the_batch(
     told = entries(done.stdout)
     assert [entry["session"] for entry in told] == [str(session) for session in sessions]
     assert [entry.get("error") for entry in told] == [None, "its process died 2 times", None, None]
-    assert "its process died 2 times in " in done.stderr
+    assert f"{sessions[1]}: its process died 2 times. Hint: " in done.stderr
     assert "Traceback" not in done.stderr
     assert set(contents(out)) == {"a.mcap", "b.mcap", "c.mcap"}
 
@@ -628,7 +628,7 @@ def test_s3_in_and_out(
     assert told["s3://lab/day/a.mcap"]["output"] == "s3://lab/out/a.mcap"
     assert "cut short" in told["s3://lab/day/cut.mcap"]["error"]
     assert "`locatk recover s3://lab/day/cut.mcap" in told["s3://lab/day/cut.mcap"]["hint"]
-    assert "standing still in s3://lab/day/still.mcap" in done.stderr
+    assert "s3://lab/day/still.mcap: one robot standing still. Hint: " in done.stderr
 
     assert locatk("solve", *sessions[:3], "-o", tmp_path / "out").exit_code == 0
     assert sorted(bucket.ls("lab/out", detail=False)) == [f"lab/out/{n}.mcap" for n in "abc"]
