@@ -47,7 +47,7 @@ def command(file: Path, output: Path, overwrite: bool, as_json: bool) -> None:
     else:
         console.result(_text(recovered))
     if not recovered.complete:
-        raise failures.Incomplete(f"lost {_lost(recovered)} in {file}")
+        raise failures.Incomplete(f"{file}: lost {_lost(recovered)}")
     if recovered.damaged:
         console.say(f"The index of {file} was damaged and rebuilt; no data were lost.")
 

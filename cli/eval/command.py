@@ -180,7 +180,7 @@ def command(
             ", ".join(each.device for each in side.trajectories) for side in (estimated, true)
         )
         raise InputError(
-            f"no device of the estimate is in {truth}",
+            f"none of its devices is in {truth}",
             file=estimate,
             hint=f"Name the pairs by --pair NAME=NAME: one of {estimated_devices}, and one of "
             f"{true_devices}",

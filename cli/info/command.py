@@ -53,7 +53,7 @@ def command(file: Path, as_json: bool) -> None:
         console.result(text(facts))
     if facts.get("damage"):
         hint = "; `locatk recover` saves the rest" if facts["recoverable"] else ""
-        raise failures.Incomplete(f"{facts['damage']} in {file}{hint}")
+        raise failures.Incomplete(f"{file}: {facts['damage']}{hint}")
 
 
 def _artifact(file: Path) -> dict[str, Any]:

@@ -195,11 +195,11 @@ def _expand(name: str) -> list[str] | None:
         return _expand_url(name)
     if os.path.isdir(name):
         files = _matching_files(os.path.join(glob.escape(name), "*.mcap"))
-        return _require_files(sorted(files), f"no *.mcap in the folder {name}")
+        return _require_files(sorted(files), name, "no *.mcap in the folder")
     if os.path.exists(name):
         return None
     if glob.has_magic(name):
-        return _require_files(sorted(_matching_files(name)), f"no file matches {name}")
+        return _require_files(sorted(_matching_files(name)), name, "no file matches the pattern")
     if not name:
         raise InputError("a file name is empty", hint="Check the variables of the shell")
     raise MissingDataError(
@@ -240,13 +240,14 @@ def _expand_url(url: str) -> list[str] | None:
                 raise FileNotFoundError(url)
         pattern = key if is_pattern else f"{key.rstrip('/')}/*.mcap"
         files = [str(store.unstrip_protocol(path)) for path in store.glob(pattern)]
-    problem = f"no file matches {url}" if is_pattern else f"no *.mcap in {url}"
-    return _require_files(sorted(files), problem)
+    problem = "no file matches the pattern" if is_pattern else "no *.mcap in the folder"
+    return _require_files(sorted(files), url, problem)
 
 
-def _require_files(files: list[str], problem: str) -> list[str]:
+def _require_files(files: list[str], name: str, problem: str) -> list[str]:
     if not files:
-        raise MissingDataError(problem, hint="Check the spelling, and that there are sessions")
+        hint = "Check the spelling, and that there are sessions"
+        raise MissingDataError(problem, file=name, hint=hint)
     return files
 
 

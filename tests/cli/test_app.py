@@ -210,13 +210,13 @@ def failing(error: BaseException) -> Callable[..., Result]:
         (
             errors.FormatError("not MCAP", file="a.mcap", where=3, hint="Give a session"),
             1,
-            "Error: not MCAP in a.mcap:3. Hint: Give a session.\n",
+            "Error: a.mcap:3: not MCAP. Hint: Give a session.\n",
         ),
         (errors.DegenerateError("one robot\nstood still"), 1, "Error: one robot stood still.\n"),
         (
             PermissionError(errno.EACCES, "denied", "/x/y"),
             1,
-            "Error: Permission denied in /x/y. Hint: Check the permissions of the file and of "
+            "Error: /x/y: Permission denied. Hint: Check the permissions of the file and of "
             "its folder.\n",
         ),
         (
@@ -227,7 +227,7 @@ def failing(error: BaseException) -> Callable[..., Result]:
         (
             IsADirectoryError(errno.EISDIR, "dir", "/x"),
             1,
-            "Error: Is a directory in /x. Hint: Name a file, not a folder.\n",
+            "Error: /x: Is a directory. Hint: Name a file, not a folder.\n",
         ),
         (
             ZeroDivisionError("division by zero"),

@@ -127,7 +127,7 @@ def test_eval_refuses_what_cannot_be_compared(
     two = record(tmp_path / "two.mcap", ("green", "blue"))
     result = locatk("eval", solved, "--truth", two)
     assert result.exit_code == 1
-    assert "no device of the estimate" in result.stderr
+    assert f"Error: {solved}: none of its devices is in {two}. Hint: Name" in result.stderr
     assert locatk("eval", session, "--truth", session).exit_code == 1  # not solved
     assert locatk("eval", solved).exit_code == 2
 

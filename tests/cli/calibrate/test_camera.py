@@ -151,7 +151,7 @@ def test_one_of_several_cameras(locatk, tmp_path: Path) -> None:
     out = tmp_path / "camera.toml"
     result = locatk("calibrate", "camera", run, "-o", out)
     assert result.exit_code == 1
-    assert f"several cameras: camera, camera1 in {run}" in result.stderr
+    assert f"Error: {run}: several cameras: camera, camera1. Hint" in result.stderr
     assert "--device" in result.stderr
     result = locatk("calibrate", "camera", run, "-o", out, "--device", "left")
     assert result.exit_code == 1
@@ -194,7 +194,7 @@ def test_the_manifest_may_be_given(locatk, tmp_path: Path) -> None:
     files.write_shots(run, {"camera": shots})
     result = locatk("calibrate", "camera", run, "-o", out)
     assert result.exit_code == 1
-    assert f"no manifest of the sheet in {run}" in result.stderr
+    assert f"{run}: the session has no manifest of the sheet" in result.stderr
     assert "--artifact" in result.stderr
     sheets.write_manifest(sheet, MANIFEST)
     result = locatk("calibrate", "camera", run, "-o", out, "--artifact", sheet, "--focal-px", 360)

@@ -164,7 +164,7 @@ def test_the_map_may_be_given_and_must_be_there(
     bare, out = write(tmp_path / "bare.mcap", sound, floor=None), tmp_path / "built.toml"
     result = locatk("calibrate", "map", bare, "-o", out)
     assert result.exit_code == 1
-    assert f"Error: the session has no map in {bare}" in result.stderr
+    assert f"Error: {bare}: the session has no map" in result.stderr
     assert "--artifact" in result.stderr
     assert not out.exists()
     given = tmp_path / "map.toml"

@@ -169,9 +169,9 @@ def test_nothing_usable_leaves_nothing(locatk, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("paths", "words"),
     [
-        (["missing"], "No such file or folder in missing"),
-        (["*.png"], "no file matches the pattern in *.png"),
-        (["empty"], "no image files (1 files of other kinds) in empty"),
+        (["missing"], "Error: missing: No such file or folder"),
+        (["*.png"], "Error: *.png: no file matches the pattern"),
+        (["empty"], "Error: empty: no image files (1 files of other kinds)"),
     ],
 )
 def test_where_there_are_no_images(
@@ -182,8 +182,7 @@ def test_where_there_are_no_images(
     (tmp_path / "empty" / "notes.txt").write_text("")
     result = locatk("import", "images", *paths, "-o", "run.mcap")
     assert result.exit_code == 1
-    assert result.stderr.startswith("Error: ")
-    assert words in result.stderr
+    assert result.stderr.startswith(words)
     assert result.stderr.count("\n") == 1
 
 
