@@ -42,7 +42,7 @@ def station_table(stations: Sequence[Mapping[str, Any]], scale: str | None = Non
         ("rejected", is_known("rejected"), lambda s: _or_dash(s["rejected"])),
         ("decoded", is_known("decode_rate"), lambda s: _percent(s["decode_rate"])),
         ("calibration", True, lambda s: s["calibration"] or "-"),
-        ("residual to others [mrad]", is_known("verification_rad"), _verification),
+        ("vs. others [mrad]", is_known("verification_rad"), _verification),
         ("OOTX frames", is_known("frames"), lambda s: _or_dash(s["frames"])),
         ("damaged", any(s["damaged"] for s in stations), lambda s: _or_dash(s["damaged"])),
         (f"position [{unit}]", is_known("position_m"), lambda s: _position(s["position_m"])),

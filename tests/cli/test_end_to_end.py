@@ -95,6 +95,7 @@ def test_bench_without_data_lists_every_figure(locatk, tmp_path: Path) -> None:
     assert answer["system"] == "lighthouse"
     assert answer["figures"]
     names = {"name", "value", "unit", "target", "better", "met", "peer", "peer_value", "how"}
+    names |= {"workload", "machine_factor", "reference_target"}
     for figure in answer["figures"]:
         assert set(figure) == names
         assert figure["better"] in ("lower", "higher")
