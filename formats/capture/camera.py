@@ -91,13 +91,12 @@ class CameraPort:
                 raise self._explain_error(is_file)
             resources.callback(capture.release)
             first = _grab(capture, self._clock)
+            if first is None and is_file:
+                hint = "The video may be truncated"
+                raise SourceError("the video has no frame", file=self._address, hint=hint)
             if first is None:
-                raise SourceError(
-                    f"{self.name} provides no frame",
-                    hint="The video may be truncated"
-                    if is_file
-                    else "Check that no other program uses it",
-                )
+                hint = "Check that no other program uses it"
+                raise SourceError(f"{self.name} provides no frame", hint=hint)
             height, width = first[1].shape[:2]
             self._properties = {
                 "width": str(width),

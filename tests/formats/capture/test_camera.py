@@ -173,7 +173,8 @@ def test_an_address_where_nobody_is() -> None:
 def test_files_that_are_no_videos(tmp_path: Path) -> None:
     assert "no such video" in str(refused(str(tmp_path / "none.mp4")))
     assert "cannot be read" in str(refused(str(tmp_path)))
-    for content in (b"", b"hello\n" * 100, os.urandom(4000)):
+    noise = np.random.default_rng(0).bytes(4000)
+    for content in (b"", b"hello\n" * 100, noise):
         path = tmp_path / "some.mp4"
         path.write_bytes(content)
         error = refused(str(path))
@@ -316,6 +317,15 @@ def test_a_camera_that_gives_nothing(driver: Callable[[list[bool]], Capture]) ->
     capture = driver([])
     assert str(refused("0")) == "camera:0 provides no frame"
     assert capture.released
+
+
+def test_a_video_without_frames_is_named(
+    driver: Callable[[list[bool]], Capture], tmp_path: Path
+) -> None:
+    driver([])
+    video = tmp_path / "empty.mp4"
+    video.write_bytes(bytes(100))
+    assert str(refused(str(video))) == f"{video}: the video has no frame"
 
 
 def test_frames_that_nobody_reads_are_counted(
