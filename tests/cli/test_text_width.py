@@ -112,8 +112,6 @@ SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
         "simulate landmarks map.toml --landmarks 14 -o new.mcap --overwrite",
         "import landmark-csv drive.csv --map map.toml -o imported.mcap --overwrite",
         "import images frame1.png frame2.png broken.png -o imported.mcap --overwrite",
-        "bench infrared --data x",
-        "bench infrared --data x --full",
     ],
 )
 def test_results_fit_80_columns(folder: Path, command: str) -> None:
