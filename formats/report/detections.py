@@ -14,7 +14,7 @@ from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.polaris.results import TagDetection
 from locatk.core.solution import Solution
 from locatk.formats.plots.units import format_count
-from locatk.formats.report.diagrams import REFUSED, USED, Diagrams
+from locatk.formats.report.diagram_grid import REFUSED, USED, DiagramGrid
 from locatk.formats.report.panels import Panel, Table, as_float, format_value, reason_text
 
 TITLE = "Detections"
@@ -259,7 +259,7 @@ def _draw_histograms(quantities: Mapping[str, Mapping[str, np.ndarray]], noun: s
 
     The values of a quantity are in named groups, of used and of refused detections.
     """
-    diagrams = Diagrams(1, len(quantities), shared_yaxes=True, horizontal_spacing=0.06)
+    grid = DiagramGrid(1, len(quantities), shared_yaxes=True, horizontal_spacing=0.06)
     for column, (quantity, groups) in enumerate(quantities.items(), 1):
         every = np.concatenate([values[np.isfinite(values)] for values in groups.values()])
         low, high = 0.0, 100.0
@@ -271,9 +271,9 @@ def _draw_histograms(quantities: Mapping[str, Mapping[str, np.ndarray]], noun: s
         colored = dict(
             zip(groups, zip(groups.values(), (USED, REFUSED), strict=False), strict=True)
         )
-        diagrams.add_histogram(column, edges, colored, "%{x:.4g}: %{y}")
+        grid.add_histogram(column, edges, colored, "%{x:.4g}: %{y}")
     has_legend = any(len(groups) > 1 for groups in quantities.values())
-    return diagrams.finish(
+    return grid.finish(
         300,
         [noun],
         column_titles=list(quantities),

@@ -28,10 +28,11 @@ from locatk.formats.plots.units import (
     format_number,
     select_unit,
 )
-from locatk.formats.report.diagrams import Diagrams, ValueRow, draw_values
+from locatk.formats.report.diagram_grid import DiagramGrid
 from locatk.formats.report.panels import Panel, Table, escape, join_names, join_sentences
 from locatk.formats.report.style import INK
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.value_diagrams import ValueRow, draw_values
 
 HISTOGRAM_BINS = 50
 """Number of bins of the histogram of errors, on an axis of about 900 pixels."""
@@ -221,14 +222,14 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
         }
     else:
         groups = {"all": (np.minimum(every, limit), ALL_DEVICES_COLOR)}
-    diagrams = Diagrams(1)
-    diagrams.add_histogram(1, edges, groups, f"%{{y}} poses around %{{x:.3g}} {escape(unit.name)}")
+    grid = DiagramGrid(1)
+    grid.add_histogram(1, edges, groups, f"%{{y}} poses around %{{x:.3g}} {escape(unit.name)}")
     for name, value, side, shift_px in (
         ("median", evaluation.median, "right", -4),
         ("95 %", evaluation.p95, "left", 4),
     ):
         if value * unit.per_si <= limit:
-            diagrams.add_vertical_line(
+            grid.add_vertical_line(
                 value * unit.per_si,
                 1,
                 1,
@@ -246,10 +247,10 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
                 },
             )
     highest = np.histogram(np.minimum(every, limit), edges)[0].max()
-    diagrams.figure.update_xaxes(range=[0, limit])
-    diagrams.figure.update_yaxes(range=[0, 1.3 * float(highest)])  # Space for the line names.
+    grid.figure.update_xaxes(range=[0, limit])
+    grid.figure.update_yaxes(range=[0, 1.3 * float(highest)])  # Space for the line names.
     title = f"error [{unit.name}]"
-    return diagrams.finish(
+    return grid.finish(
         280,
         ["poses"],
         column_titles=[title],

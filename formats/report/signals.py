@@ -6,7 +6,9 @@ The modules of :mod:`locatk.formats.report.systems` draw the signals of one devi
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any, Generic, TypeVar
 
@@ -16,9 +18,10 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, LocatkError
 from locatk.core.solution import Solution
+from locatk.formats.plots.series import origin_ns
 from locatk.formats.report.panels import Panel, join_names, join_sentences
 from locatk.formats.sessions import capture_record
-from locatk.formats.sessions.field_samples import SensorKind
+from locatk.formats.sessions.field_samples import Geometry, SensorKind
 from locatk.formats.sessions.mcap_file import DamageError, Segment, read_messages
 from locatk.formats.sessions.messages import BatchError
 from locatk.formats.sessions.reader import Session, open_mcap
@@ -67,55 +70,88 @@ def signal_panels(session: Session, solution: Solution) -> list[Panel]:
 
 
 @dataclass(frozen=True)
-class SignalSource(Generic[T]):
-    """Signals of one kind in a session.
+class DeviceRecording(Generic[T]):
+    """Samples of one device, to be drawn with a solution.
 
     Attributes
     ----------
+    device : str
+    title, note : str
+        Of the first panel of the device.
+    samples : T
+    solution : Solution
+    start_ns : int
+        Origin of the time axis.
+    """
+
+    device: str
+    title: str
+    note: str
+    samples: T
+    solution: Solution
+    start_ns: int
+
+    @property
+    def detections(self) -> list[Any]:
+        """Detections of the device."""
+        return [each for each in self.solution.detections if each.device == self.device]
+
+    def seconds(self, time_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return times on the time axis."""
+        return np.asarray((time_ns - self.start_ns) * 1e-9, np.float64)
+
+
+def device_panels(
+    session: Session,
+    solution: Solution,
+    *,
+    title: str,
+    note: str,
+    topic: str,
+    schema: str,
+    decode: Callable[[Session, str, list[bytes]], T],
+    draw: Callable[[DeviceRecording[T]], list[Panel]],
+) -> list[Panel]:
+    """Return the panels of up to :data:`MAX_DEVICES` devices.
+
+    Notes on the whole recording are in the first panel. A device without readable samples has a
+    panel that describes the problem.
+
+    Parameters
+    ----------
+    session : Session
+    solution : Solution
     title : str
         Of a panel, before the name of the device.
+    note : str
+        Explanation for the first device.
     topic, schema : str
         Prefix of the topics before the name of the device, and schema of the messages.
     decode : callable
         Return the samples of a session's topic from its messages; raises FormatError.
     draw : callable
-        Return the panels of a device, given its name, title, samples and notes.
-    note : str
-        Explanation for the first device.
+        Return the panels of a device.
     """
-
-    title: str
-    topic: str
-    schema: str
-    decode: Callable[[Session, str, list[bytes]], T]
-    draw: Callable[[str, str, T, str], list[Panel]]
-    note: str
-
-
-def device_panels(session: Session, solution: Solution, source: SignalSource[T]) -> list[Panel]:
-    """Return the panels of up to :data:`MAX_DEVICES` devices.
-
-    Notes on the whole recording are in the first panel. A device without readable samples has a
-    panel that describes the problem.
-    """
-    topics = session.topics(source.topic, source.schema)
-    read = read_excerpt(session, topics[:MAX_DEVICES])
-    devices = [topic.removeprefix(source.topic) for topic in topics]
-    notes = [source.note, *read.notes, missing_devices_note(solution, devices)]
+    topics = session.topics(topic, schema)
+    payloads_by_topic, problems = read_excerpt(session, topics[:MAX_DEVICES])
+    devices = [name.removeprefix(topic) for name in topics]
+    notes = [note, *problems, missing_devices_note(solution, devices)]
     if len(devices) > MAX_DEVICES:
         notes.append(f"Not drawn: {join_names(devices[MAX_DEVICES:])}.")
     note = join_sentences(*notes)
+    start_ns = origin_ns(session, solution)
     panels: list[Panel] = []
-    for topic, payloads in read.payloads.items():
-        device = topic.removeprefix(source.topic)
-        title = f"{source.title} {device}"
+    for name, payloads in payloads_by_topic.items():
+        device = name.removeprefix(topic)
+        heading = f"{title} {device}"
         try:
-            samples = source.decode(session, topic, payloads)
+            samples = decode(session, name, payloads)
         except FormatError as error:
-            panels.append(Panel(title, join_sentences(f"Not drawn: {error.message}.", note)))
+            panels.append(Panel(heading, join_sentences(f"Not drawn: {error.message}.", note)))
             note = ""
         else:
-            panels += source.draw(device, title, samples, note)
+            recording = DeviceRecording(device, heading, note, samples, solution, start_ns)
+            panels += draw(recording)
             note = "Drawn as above."
     return panels
 
@@ -138,26 +174,17 @@ def missing_devices_note(solution: Solution, recorded: Iterable[str]) -> str:
 # ---- reading
 
 
-@dataclass(frozen=True)
-class Excerpt:
-    """Messages of some topics.
-
-    Attributes
-    ----------
-    payloads : dict of str to list of bytes
-        By topic, in the order of the file.
-    notes : tuple of str
-        Sentences on parts that were left out or are damaged.
-    """
-
-    payloads: dict[str, list[bytes]]
-    notes: tuple[str, ...]
-
-
-def read_excerpt(session: Session, topics: Collection[str]) -> Excerpt:
+def read_excerpt(
+    session: Session, topics: Collection[str]
+) -> tuple[dict[str, list[bytes]], list[str]]:
     """Read messages of ``topics`` from about :data:`MAX_READ_BYTES` of a file.
 
-    Damaged parts are left out and counted in the notes.
+    Returns
+    -------
+    payloads : dict of str to list of bytes
+        By topic, in the order of the file.
+    notes : list of str
+        Sentences on parts that were left out or are damaged.
     """
     names = {
         entry.id: entry.topic for entry in session.index.channels.values() if entry.topic in topics
@@ -182,7 +209,7 @@ def read_excerpt(session: Session, topics: Collection[str]) -> Excerpt:
         )
     if damaged:
         notes.append(f"{damaged} of {len(chosen)} parts of the recording are damaged and missing.")
-    return Excerpt(payloads, tuple(notes))
+    return payloads, notes
 
 
 def _select_segments(segments: list[Segment], limit_bytes: int) -> list[Segment]:
@@ -195,18 +222,45 @@ def _select_segments(segments: list[Segment], limit_bytes: int) -> list[Segment]
     return [segments[k] for k in np.unique(chosen)]
 
 
+# ---- samples of magnetic sensors
+
+
 @dataclass(frozen=True)
-class FieldSamples:
-    """Samples of magnetic sensors: ascending times (n,) in ns, fields (n, sensors * axes) in T."""
+class FieldSamples(Generic[Geometry]):
+    """Samples of the magnetic sensors of one device.
+
+    Attributes
+    ----------
+    time_ns : (n,) int64 ndarray
+        Ascending.
+    field_t : (n, sensors, axes) float32 ndarray
+    geometry : Geometry or None
+        None if the positions of the sensors are unknown.
+    """
 
     time_ns: NDArray[np.int64]
     field_t: NDArray[np.float32]
+    geometry: Geometry | None
 
 
-def decode_field_samples(
-    kind: SensorKind[Any], session: Session, topic: str, payloads: list[bytes]
-) -> FieldSamples:
-    """Decode the samples of one device; the positions of its sensors need not be known.
+def field_panels(
+    session: Session,
+    solution: Solution,
+    kind: SensorKind[Geometry],
+    title: str,
+    note: str,
+    draw: Callable[[DeviceRecording[FieldSamples[Geometry]]], list[Panel]],
+) -> list[Panel]:
+    """Return the panels of magnetic sensors; the parameters are those of :func:`device_panels`."""
+    decode = partial(_decode_field_samples, kind)
+    source = {"title": title, "note": note, "topic": kind.topic, "schema": kind.schema}
+    return device_panels(session, solution, **source, decode=decode, draw=draw)
+
+
+def _decode_field_samples(
+    kind: SensorKind[Geometry], session: Session, topic: str, payloads: list[bytes]
+) -> FieldSamples[Geometry]:
+    """Decode the samples of one device.
 
     Raises
     ------
@@ -217,16 +271,17 @@ def decode_field_samples(
         first: Any = kind.layout(1).message.FromString(payloads[0]) if payloads else None
         if first is None or not first.sensors:
             raise FormatError("no samples", file=session.path, where=topic)
-        columns = kind.layout(int(first.sensors)).unpack(payloads).columns
+        sensors = int(first.sensors)
+        columns = kind.layout(sensors).unpack(payloads).columns
     except (DecodeError, BatchError):
         raise FormatError("a message is damaged", file=session.path, where=topic) from None
     time_ns = columns["time_ns"]
     if not len(time_ns):
         raise FormatError("no samples", file=session.path, where=topic)
     order = np.argsort(time_ns, kind="stable")
-    return FieldSamples(time_ns[order], columns["b_tesla"].reshape(len(time_ns), -1)[order])
-
-
-def seconds_since(time_ns: NDArray[Any], start_ns: int) -> NDArray[np.float64]:
-    """Return times on the time axis, which begins at ``start_ns`` in the whole report."""
-    return np.asarray((time_ns - start_ns) * 1e-9, np.float64)
+    field_t = columns["b_tesla"].reshape(len(time_ns), sensors, -1)
+    geometry: Any = None
+    with suppress(LocatkError):  # The field can be drawn without it.
+        geometry = kind.attached(session, topic.removeprefix(kind.topic))
+    is_valid = geometry is not None and len(geometry) == sensors
+    return FieldSamples(time_ns[order], field_t[order], geometry if is_valid else None)

@@ -9,6 +9,9 @@ FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, s
 INK, GRID = "#1d2733", "#e9edf1"
 """Colors of text and of grid lines."""
 
+DEVICE_LEGEND_RANK = 100
+"""Rank of devices in a legend, before everything else (the default of plotly is 1000)."""
+
 _AXIS: dict[str, Any] = {
     "gridcolor": GRID,
     "linecolor": "#9aa7b3",
@@ -224,3 +227,9 @@ body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bot
   button.copy, .modebar { display: none !important; }
 }
 """
+
+
+def faded(color: str, opacity: float) -> str:
+    """Return ``"#rrggbb"`` as a translucent color."""
+    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    return f"rgba({red},{green},{blue},{opacity:g})"

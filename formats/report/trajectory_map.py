@@ -23,17 +23,11 @@ from locatk.formats.plots.shapes import (
     is_in_legend,
 )
 from locatk.formats.plots.units import abbreviate, format_count
-from locatk.formats.report.diagrams import (
-    DEVICE_LEGEND_RANK,
-    allot_points,
-    faded,
-    thin,
-    thinning_note,
-)
 from locatk.formats.report.panels import Panel, escape, join_sentences
+from locatk.formats.report.style import DEVICE_LEGEND_RANK, faded
+from locatk.formats.report.thinning import Indices, allot_points, thin, thinning_note
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MAX_ASPECT = 1.75
 """Ratio of width to height up to which a map fills a page without scrolling."""

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-from locatk.core.errors import LocatkError
+from locatk.core.landmarks.halls import HallSensors
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import Solution
-from locatk.formats.plots.series import origin_ns
+from locatk.formats.plots.shapes import COLORS
+from locatk.formats.report import signal_diagrams
 from locatk.formats.report.detections import format_cell, format_probability
-from locatk.formats.report.diagrams import (
-    LINES_THINNED,
-    MAX_EVENT_LABELS,
-    NEUTRAL_COLORS,
-    SIGNAL_COLUMNS,
-    Diagrams,
-    Event,
-    Signals,
-    detail_panels,
-)
+from locatk.formats.report.diagram_grid import REFUSED, USED, DiagramGrid
 from locatk.formats.report.panels import (
     Panel,
     as_float,
@@ -27,15 +17,12 @@ from locatk.formats.report.panels import (
     join_sentences,
     reason_text,
 )
-from locatk.formats.report.signals import (
-    FieldSamples,
-    SignalSource,
-    decode_field_samples,
-    device_panels,
-    seconds_since,
-)
+from locatk.formats.report.signal_diagrams import Event, Signals
+from locatk.formats.report.signals import DeviceRecording, FieldSamples, field_panels
 from locatk.formats.sessions.field_samples import HALLS
 from locatk.formats.sessions.reader import Session
+
+SENSOR_COLORS = tuple(color for color in COLORS if color not in (USED, REFUSED))
 
 MAX_DETAILED_VISITS = 6
 """Number of visits that are drawn sample by sample, three in a row."""
@@ -54,52 +41,48 @@ NOTE = (
 
 def signal_panels(session: Session, solution: Solution) -> list[Panel]:
     """Return the channels of each robot with its detections, and details of some visits."""
-    start_ns = origin_ns(session, solution)
-
-    def draw(device: str, title: str, samples: FieldSamples, note: str) -> list[Panel]:
-        names = _sensor_names(session, device, samples.field_t.shape[1])
-        signals = Signals(
-            seconds_since(samples.time_ns, start_ns),
-            1e3 * samples.field_t[:, :, None],
-            names,
-            [NEUTRAL_COLORS[k % len(NEUTRAL_COLORS)] for k in range(len(names))],
-            ("field [mT]",),
-            "%{x:.2f} s, %{y:.2f} mT",
-        )
-        detections = [each for each in solution.detections if each.device == device]
-        events = [_event(detection, start_ns) for detection in detections]
-        details = detail_panels(
-            f"Visits of {device} in detail",
-            "The dotted line is the time of the detection.",
-            signals,
-            events,
-            [as_float(detection.probability) for detection in detections],
-            [(DETAIL_BEFORE_S, DETAIL_AFTER_S)] * len(events),
-            noun="visits",
-            limit=MAX_DETAILED_VISITS,
-            row_height_px=230,
-            mark_time=True,
-        )
-        return [_draw_recording(title, signals, events, note), *details]
-
-    decode = partial(decode_field_samples, HALLS)
-    source = SignalSource("Hall sensors of", HALLS.topic, HALLS.schema, decode, draw, NOTE)
-    return device_panels(session, solution, source)
+    return field_panels(session, solution, HALLS, "Hall sensors of", NOTE, _draw)
 
 
-def _sensor_names(session: Session, device: str, count: int) -> list[str]:
-    """Return the names of the sensors, numbers if they are unknown."""
-    try:
-        sensors = HALLS.attached(session, device)
-    except LocatkError:
-        sensors = None
-    if sensors is None or len(sensors) != count:
-        return [f"sensor {k + 1}" for k in range(count)]
-    return [escape(name) for name in sensors.names]
+def _draw(recording: DeviceRecording[FieldSamples[HallSensors]]) -> list[Panel]:
+    samples = recording.samples
+    count = samples.field_t.shape[1]
+    names = [f"sensor {k + 1}" for k in range(count)]
+    if samples.geometry is not None:
+        names = [escape(name) for name in samples.geometry.names]
+    signals = Signals(
+        recording.seconds(samples.time_ns),
+        1e3 * samples.field_t,
+        names,
+        [SENSOR_COLORS[k % len(SENSOR_COLORS)] for k in range(count)],
+        ("field [mT]",),
+        "%{x:.2f} s, %{y:.2f} mT",
+    )
+    events = [_event(detection, recording.start_ns) for detection in recording.detections]
+    grid = DiagramGrid(2, shared_xaxes=True, row_heights=[0.22, 0.78], vertical_spacing=0.02)
+    signal_diagrams.add_recording(grid, signals, events, ("used", "refused"))
+    is_labelled = len(events) <= signal_diagrams.MAX_EVENT_LABELS
+    note = join_sentences(
+        recording.note,
+        "" if events else "No landmark was detected.",
+        "" if is_labelled else "Hovering over a mark shows its landmark.",
+        grid.thinning_note,
+    )
+    details = signal_diagrams.detail_panels(
+        recording.device,
+        "visits",
+        "The dotted line is the time of the detection.",
+        signals,
+        events,
+        limit=MAX_DETAILED_VISITS,
+        mark_time=True,
+    )
+    return [Panel(recording.title, note, grid.finish(420, ["vertical field [mT]"])), *details]
 
 
 def _event(detection: LandmarkDetection, start_ns: int) -> Event:
     time_s = detection.time_s - start_ns * 1e-9
+    start_s, stop_s = time_s - MARK_HALF_WIDTH_S, time_s + MARK_HALF_WIDTH_S
     refused = escape(reason_text(detection.refused))
     cell, pattern = format_cell(detection.cell), escape(detection.pattern or "")
     name = " ".join(filter(None, (cell, pattern)))
@@ -109,25 +92,12 @@ def _event(detection: LandmarkDetection, start_ns: int) -> Event:
         f"residual {format_value(detection.residual_sigma, 1, '.2g')} sigma",
         *([f"refused: {refused}"] if refused else []),
     )
-    label = "<br>".join(filter(None, (refused, cell, pattern)))
     return Event(
-        time_s - MARK_HALF_WIDTH_S, time_s + MARK_HALF_WIDTH_S, label, description, refused
-    )
-
-
-def _draw_recording(title: str, signals: Signals, events: list[Event], note: str) -> Panel:
-    """Draw the whole recording of one robot."""
-    diagrams = Diagrams(2, shared_xaxes=True, row_heights=[0.22, 0.78], vertical_spacing=0.02)
-    diagrams.add_signals(2, signals)
-    diagrams.add_strip(events, ("used", "refused"), shaded_rows=(2,))
-    diagrams.limit_time(signals.time_s)
-    return Panel(
-        title,
-        join_sentences(
-            note,
-            "" if events else "No landmark was detected.",
-            "Hovering over a mark shows its landmark." if len(events) > MAX_EVENT_LABELS else "",
-            LINES_THINNED if len(signals.time_s) > 2 * SIGNAL_COLUMNS else "",
-        ),
-        diagrams.finish(420, ["vertical field [mT]"]),
+        start_s,
+        stop_s,
+        "<br>".join(filter(None, (refused, cell, pattern))),
+        description,
+        refused,
+        as_float(detection.probability),
+        (start_s - DETAIL_BEFORE_S, stop_s + DETAIL_AFTER_S),
     )

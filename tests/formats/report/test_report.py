@@ -25,10 +25,10 @@ from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import GenericRecord, Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plots.ground import build_ground, with_finite_positions
-from locatk.formats.report.diagrams import MAX_POSES
 from locatk.formats.report.evaluation import covariance_panels, error_panels
 from locatk.formats.report.report import render_report, report_panels, write_report
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.thinning import MAX_POSES
 from locatk.formats.report.trajectory_map import map_panels
 from locatk.formats.sessions.reader import Session
 

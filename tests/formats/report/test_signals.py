@@ -26,9 +26,9 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.simulation import session as polaris_simulate
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.report import diagrams, signals
+from locatk.formats.report import signals, thinning
 from locatk.formats.report.panels import Panel
-from locatk.formats.report.systems import lighthouse as lighthouse_signals
+from locatk.formats.report.sweep_outcomes import classify_sweeps
 from locatk.formats.sessions import field_samples, frames, observations
 from locatk.formats.sessions.reader import Session
 
@@ -158,7 +158,7 @@ def test_sweeps_of_several_photodiodes_belong_to_their_own_moments(
     deck = Session.open(tmp_path / "deck.mcap")
     (panel,) = signals.signal_panels(deck, solution)
     assert "no signals" not in panel.note
-    held, posed = lighthouse_signals._classify(one, solution)
+    held, posed = classify_sweeps(one, solution)
     assert np.count_nonzero(held & ~posed) == sum(each.rejected for each in solution.detections)
 
 
@@ -216,7 +216,7 @@ def test_hall_signals_have_their_peaks_and_detections(tmp_path: Path) -> None:
     whole, near = signals.signal_panels(session, solution)
     (left,) = (each for each in whole.figure.data if each.name == "left")
     assert np.nanmax(values(left)) == pytest.approx(31.0)
-    assert len(left.x) <= 2.1 * diagrams.SIGNAL_COLUMNS
+    assert len(left.x) <= 2.1 * thinning.SIGNAL_COLUMNS
     assert "Thinned" in whole.note
     (refused,) = (each for each in whole.figure.data if each.name == "refused (1)")
     assert refused.x[0] == pytest.approx(50, abs=0.01)
@@ -295,8 +295,8 @@ def test_a_large_recording_is_drawn_in_parts(
     )
     session = Session.open(tmp_path / "run.mcap")
     monkeypatch.setattr(signals, "MAX_READ_BYTES", 2 << 20)
-    read = signals.read_excerpt(session, session.topics("/halls/"))
-    size = sum(map(len, read.payloads["/halls/robot"]))
+    payloads, _ = signals.read_excerpt(session, session.topics("/halls/"))
+    size = sum(map(len, payloads["/halls/robot"]))
     assert size < 3.5 * (1 << 20)  # of 4.8 MB unpacked
     solution = landmarks_solution(*(landmark(at) for at in np.arange(1.0, 999.0)))
     whole, near = signals.signal_panels(session, solution)

@@ -1,0 +1,226 @@
+"""Diagrams of values over time, as lines or marks of each device."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from plotly.graph_objects import Figure
+from plotly.subplots import make_subplots
+
+from locatk.formats.plots.series import (
+    MAX_EXPECTED_DEVICES,
+    Series,
+    axis_limit,
+    interrupt_at_gaps,
+)
+from locatk.formats.plots.shapes import is_in_legend
+from locatk.formats.plots.units import abbreviate, format_count
+from locatk.formats.report.panels import escape, join_sentences
+from locatk.formats.report.style import DEVICE_LEGEND_RANK, INK, faded
+from locatk.formats.report.thinning import MAX_POSES, Indices, allot_points, thin, thinning_note
+
+Array = NDArray[np.float64]
+
+MAX_BAND_POINTS = 600
+"""Number of points of the outline of an expected error."""
+
+MAX_MARKED_VALUES = 800
+"""Number of values up to which each is marked by a point on its line."""
+
+ROW_HEIGHT_PX = 165
+"""Height of one of several diagrams above each other."""
+
+
+@dataclass(frozen=True)
+class ValueRow:
+    """One of several diagrams that share the time axis, in the unit of its title.
+
+    Attributes
+    ----------
+    title : str
+    values : dict of str to Series
+        By device.
+    expected : dict of str to Series
+        Bounds of 95 % of the values, by device; they are symmetric if the values are signed.
+    """
+
+    title: str
+    values: dict[str, Series]
+    expected: dict[str, Series]
+
+    def __post_init__(self) -> None:
+        """Remove devices without values, and expected values that are unknown or too many."""
+        values = {name: s for name, s in self.values.items() if len(s.value)}
+        known = {name: s for name, s in self.expected.items() if np.isfinite(s.value).any()}
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "expected", known if len(known) <= MAX_EXPECTED_DEVICES else {})
+
+    def magnitudes(self) -> Array:
+        """Return the finite absolute values of all devices."""
+        values = [np.abs(s.value[np.isfinite(s.value)]) for s in self.values.values()]
+        return np.concatenate(values) if values else np.empty(0)
+
+    def limit(self, reference: float | None) -> float:
+        """Return the upper limit of the value axis, which includes a reference value."""
+        bounds = [s.value for s in self.expected.values()]
+        limit = axis_limit(self.magnitudes(), np.concatenate(bounds) if bounds else None)
+        return limit if reference is None else max(limit, 1.15 * reference)
+
+
+def draw_values(
+    rows: Sequence[ValueRow],
+    colors: Mapping[str, str],
+    start_ns: int,
+    *,
+    signed: bool = False,
+    as_marks: bool = False,
+    reference: float | None = None,
+) -> tuple[Figure, str]:
+    """Draw values against time, and describe what the scales omit.
+
+    Parameters
+    ----------
+    rows : sequence of ValueRow
+    colors : mapping of str to str
+        By device.
+    start_ns : int
+        Origin of the time axis.
+    signed : bool
+        Values may be negative.
+    as_marks : bool
+        Draw marks instead of lines, and outliers as triangles at the upper limit; one row only.
+    reference : float, optional
+        Value to be included and marked by a line.
+
+    Returns
+    -------
+    figure : plotly Figure
+    note : str
+        Sentences on expected values, outliers and thinning.
+    """
+    figure: Figure = make_subplots(len(rows), 1, shared_xaxes=True, vertical_spacing=0.05)
+    beyond = total = shown = 0
+    for number, row in enumerate(rows, start=1):
+        limit, magnitude = row.limit(reference), row.magnitudes()
+        beyond += int(np.count_nonzero(magnitude > limit))
+        total += len(magnitude)
+        counts = allot_points([len(s.value) for s in row.values.values()], MAX_POSES // len(rows))
+        kept = {
+            name: thin(len(s.value), count, np.abs(s.value))
+            for (name, s), count in zip(row.values.items(), counts, strict=True)
+        }
+        shown += sum(map(len, kept.values()))
+        mode = "markers" if as_marks else _line_mode(len(kept), sum(counts))
+        for k, (name, s) in enumerate(row.values.items()):
+            traces = []
+            if name in row.expected:
+                is_first, is_only = k == 0 and number == 1, len(row.expected) == 1
+                bound = row.expected[name]
+                traces = _expected_traces(bound, start_ns, colors[name], signed, is_only, is_first)
+            look = {
+                "name": escape(abbreviate(name)),
+                "legendgroup": name,
+                "legendrank": DEVICE_LEGEND_RANK,
+                "showlegend": number == 1 and len(kept) > 1 and is_in_legend(k, len(kept)),
+            }
+            for trace in _value_traces(
+                s, kept[name], start_ns, colors[name], mode, limit if as_marks else None
+            ):
+                traces.append({**look, **trace})
+            for trace in traces:
+                # Triangles are on an overlaid axis, which is not one of a row.
+                cell = {} if "yaxis" in trace else {"row": number, "col": 1}
+                figure.add_trace({"type": "scatter", **trace}, **cell)
+        limits = [-limit if signed else 0, limit]
+        figure.update_yaxes(title={"text": row.title}, range=limits, row=number, col=1)
+    if reference is not None:
+        figure.add_hline(y=reference, line={"color": INK, "width": 1.2, "dash": "dash"})
+    figure.update_xaxes(title={"text": "time [s]"}, row=len(rows), col=1)
+    height = 360 if as_marks else ROW_HEIGHT_PX * len(rows) + 60
+    figure.update_layout(height=height)
+    if as_marks:
+        overlay = {"overlaying": "y", "range": [0, 1], "fixedrange": True, "visible": False}
+        figure.update_layout(yaxis2=overlay)
+    note = join_sentences(
+        _expected_note(max(len(row.expected) for row in rows), signed),
+        f"{format_count(beyond)} of {format_count(total, 'values')} lie beyond "
+        + ("this scale (triangles)" if as_marks else "these scales")
+        + ": double-click to see them."
+        if beyond
+        else "",
+        thinning_note(shown, total, "values"),
+    )
+    return figure, note
+
+
+def _line_mode(devices: int, points: int) -> str:
+    if devices > MAX_EXPECTED_DEVICES:
+        return "markers"  # Many lines would cover each other.
+    return "lines+markers" if points <= MAX_MARKED_VALUES else "lines"
+
+
+def _expected_note(devices: int, signed: bool) -> str:
+    if not devices:
+        return ""
+    lines = "between the thin lines" if signed else "below the thin lines"
+    region = "in the shaded area" if devices == 1 else lines
+    return f"By the solver's covariance, 95 % of the errors should be {region}."
+
+
+def _value_traces(
+    s: Series, kept: Indices, start_ns: int, color: str, mode: str, limit: float | None
+) -> list[dict[str, Any]]:
+    """Return the trace of a device and, with a ``limit``, triangles there for larger values."""
+    rows = np.column_stack([(s.time_ns[kept] - start_ns) * 1e-9, s.value[kept]])
+    if limit is None:
+        rows = interrupt_at_gaps(rows, s.time_ns, kept)
+    x, y = rows.T
+    trace = {
+        "x": x,
+        "y": y,
+        "mode": mode,
+        "line": {"color": color, "width": 1.1},
+        "marker": {"color": color, "size": 3.5 if limit is None else 4, "opacity": 0.8},
+        "hovertemplate": "%{x:.3f} s<br>%{y:.4g}",
+    }
+    if limit is None or not (y > limit).any():
+        return [trace]
+    is_outlier = y > limit
+    triangles = {
+        "x": x[is_outlier],
+        "y": np.full(np.count_nonzero(is_outlier), 0.975),
+        "yaxis": "y2",
+        "customdata": y[is_outlier],
+        "mode": "markers",
+        "marker": {"color": color, "size": 9, "symbol": "triangle-up"},
+        "hovertemplate": "%{x:.3f} s<br>%{customdata:.4g}",
+        "showlegend": False,
+    }
+    return [trace, triangles]
+
+
+def _expected_traces(
+    s: Series, start_ns: int, color: str, signed: bool, is_shaded: bool, is_first: bool
+) -> list[dict[str, Any]]:
+    """Return the outline of expected values, shaded for a single device."""
+    kept = thin(len(s.value), MAX_BAND_POINTS)
+    rows = np.column_stack([(s.time_ns[kept] - start_ns) * 1e-9, s.value[kept]])
+    x, y = interrupt_at_gaps(rows, s.time_ns, kept).T
+    look: dict[str, Any] = {
+        "x": x,
+        "mode": "lines",
+        "name": "95 % expected",
+        "legendgroup": "expected",
+        "line": {"color": faded(color, 0.55), "width": 1.2},
+        "hoverinfo": "skip",
+    }
+    fill = {"fill": "tonexty" if signed else "tozeroy", "fillcolor": faded(color, 0.13)}
+    outline = {**look, "y": y, "showlegend": is_first, **(fill if is_shaded else {})}
+    if not signed:
+        return [outline]
+    lower = {**look, "y": -y, "showlegend": False}
+    return [lower, outline]
