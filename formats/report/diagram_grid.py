@@ -11,7 +11,6 @@ from plotly.graph_objects import Figure
 from plotly.subplots import make_subplots
 
 from locatk.formats.plots.shapes import COLORS
-from locatk.formats.report.panels import join_sentences
 from locatk.formats.report.thinning import thin_marks
 
 Array = NDArray[np.float64]
@@ -37,22 +36,15 @@ class DiagramGrid:
     Attributes
     ----------
     figure : plotly Figure
-    has_thinned_lines, has_thinned_marks : bool
+    thinning_note : str
+        Sentence on lines or marks that are not drawn completely; empty if all are.
     """
 
     def __init__(self, rows: int, columns: int = 1, **layout: Any) -> None:
         self.figure: Figure = make_subplots(rows, columns, **layout)
         self.rows, self.columns = rows, columns
-        self.has_thinned_lines = self.has_thinned_marks = False
+        self.thinning_note = ""
         self._traces: list[dict[str, Any]] = []
-
-    @property
-    def thinning_note(self) -> str:
-        """Sentences on lines and marks that are not drawn, empty without any."""
-        return join_sentences(
-            LINES_THINNED if self.has_thinned_lines else "",
-            MARKS_THINNED if self.has_thinned_marks else "",
-        )
 
     def add(self, row: int, x: Any, y: Any, *, column: int = 1, **trace: Any) -> None:
         """Add a trace of plotly, by default a scatter; arrays are stored in single precision."""
@@ -67,7 +59,8 @@ class DiagramGrid:
         if not len(x):
             return
         kept = thin_marks(x, y)
-        self.has_thinned_marks |= len(kept) < len(x)
+        if len(kept) < len(x):
+            self.thinning_note = self.thinning_note or MARKS_THINNED
         self.add(row, x[kept], y[kept], mode="markers", marker=marker, **trace)
 
     def add_histogram(

@@ -126,8 +126,7 @@ def why_not_evaluated(subject: Subject) -> str:
 
 
 def _all_sigmas(solution: Solution) -> np.ndarray:
-    sigmas = [s.value for s in position_sigmas(solution).values()]
-    return np.concatenate(sigmas) if sigmas else np.zeros(0)
+    return np.concatenate([np.zeros(0), *(s.value for s in position_sigmas(solution).values())])
 
 
 def key_figures(subject: Subject) -> list[tuple[str, str]]:
@@ -364,8 +363,8 @@ def covariance_panels(subject: Subject) -> list[Panel]:
     """Return the standard deviations of the solver over time; none if it reports none."""
     solution = subject.solution
     trajectories = [t for t in solution.trajectories if len(t)]
-    sigmas = [t.sigma[:, :3][np.isfinite(t.sigma[:, :3])] for t in trajectories]
-    every = np.concatenate(sigmas) if sigmas else np.zeros(0)
+    sigmas = np.concatenate([np.zeros((0, 3)), *(t.sigma[:, :3] for t in trajectories)])
+    every = sigmas[np.isfinite(sigmas)]
     size = float(np.percentile(every, 90)) if len(every) else 0.0
     unit = select_unit(size, unscaled=is_unscaled(solution))
     rows = []

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.polaris.results import TagDetection
-from locatk.formats.report.diagram_grid import REFUSED, USED, DiagramGrid, single_precision
+from locatk.formats.report.diagram_grid import (
+    LINES_THINNED,
+    REFUSED,
+    USED,
+    DiagramGrid,
+    single_precision,
+)
 from locatk.formats.report.panels import as_float
 from locatk.formats.report.thinning import SIGNAL_COLUMNS, column_maxima
 
@@ -23,7 +29,8 @@ def add_field_map(
     grid: DiagramGrid, row: int, time_s: Array, magnitude_ut: NDArray[Any], ordinate: Array
 ) -> None:
     """Add the magnitude (n, sensors) over time and the ordinates (sensors,) of the sensors."""
-    grid.has_thinned_lines |= len(time_s) > SIGNAL_COLUMNS
+    if len(time_s) > SIGNAL_COLUMNS:
+        grid.thinning_note = LINES_THINNED
     order = np.argsort(ordinate, kind="stable")
     x, largest = column_maxima(time_s, magnitude_ut[:, order])
     is_known = np.isfinite(largest).any()

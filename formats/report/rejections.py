@@ -60,14 +60,15 @@ def rejection_panel(solution: Solution) -> Panel:
     counts = {code: count for code, count in solution.rejected.items() if count}
     if not counts:
         return Panel(TITLE, "Nothing was rejected.")
-    reasons = {code: explain(solution.system, code) for code in solution.rejected}
-    totals = _count_observations(solution, reasons)
+    reasons = {code: explain(solution.system, code) for code in counts}
     order = sorted(counts, key=lambda code: (reasons[code].unit, -counts[code]))
-    rows = []
     rejected = Counter[str]()
     for code in order:
+        rejected[reasons[code].unit] += counts[code]
+    totals = _count_observations(solution, rejected)
+    rows = []
+    for code in order:
         reason, count = reasons[code], counts[code]
-        rejected[reason.unit] += count
         total = totals.get(reason.unit, 0)
         fraction = (
             f"{100 * count / total:.3g} % of {format_count(total, reason.unit)}" if total else "-"
@@ -84,11 +85,8 @@ def rejection_panel(solution: Solution) -> Panel:
     return Panel(TITLE, f"Rejected: {', '.join(summary)}.", figure, table)
 
 
-def _count_observations(solution: Solution, reasons: Mapping[str, Reason]) -> dict[str, int]:
-    """Return the number of all observations by unit, rejected or not."""
-    rejected = Counter[str]()
-    for code, count in solution.rejected.items():
-        rejected[reasons[code].unit] += count
+def _count_observations(solution: Solution, rejected: Counter[str]) -> dict[str, int]:
+    """Return the number of all observations by unit, given that of rejected ones."""
     detections = solution.detections
     if solution.system == "lighthouse":
         # A moment from which one station was left out has a pose nevertheless.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.formats.report.diagram_grid import REFUSED, USED, DiagramGrid
+from locatk.formats.report.diagram_grid import LINES_THINNED, REFUSED, USED, DiagramGrid
 from locatk.formats.report.panels import Panel
 from locatk.formats.report.thinning import MAX_MARKS, SIGNAL_COLUMNS, envelope, thin
 
@@ -97,7 +97,8 @@ def add_signals(
     grid: DiagramGrid, row: int, signals: Signals, component: int = 0, column: int = 1, **trace: Any
 ) -> None:
     """Add one component of all sensors as lines through its extremes."""
-    grid.has_thinned_lines |= len(signals.time_s) > 2 * SIGNAL_COLUMNS
+    if len(signals.time_s) > 2 * SIGNAL_COLUMNS:
+        grid.thinning_note = LINES_THINNED
     for sensor, (name, color) in enumerate(zip(signals.names, signals.colors, strict=True)):
         x, y = envelope(signals.time_s, signals.value[:, sensor, component])
         look = {"mode": "lines", "line": {"color": color, "width": 1}, "name": name}

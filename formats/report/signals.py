@@ -21,7 +21,7 @@ from locatk.core.solution import Solution
 from locatk.formats.plots.series import origin_ns
 from locatk.formats.report.panels import Panel, join_names, join_sentences
 from locatk.formats.sessions import capture_record
-from locatk.formats.sessions.field_samples import Geometry, SensorKind
+from locatk.formats.sessions.field_samples import DeviceSamples, Geometry, SensorKind
 from locatk.formats.sessions.mcap_file import DamageError, Segment, read_messages
 from locatk.formats.sessions.messages import BatchError
 from locatk.formats.sessions.reader import Session, open_mcap
@@ -225,31 +225,13 @@ def _select_segments(segments: list[Segment], limit_bytes: int) -> list[Segment]
 # ---- samples of magnetic sensors
 
 
-@dataclass(frozen=True)
-class FieldSamples(Generic[Geometry]):
-    """Samples of the magnetic sensors of one device.
-
-    Attributes
-    ----------
-    time_ns : (n,) int64 ndarray
-        Ascending.
-    field_t : (n, sensors, axes) float32 ndarray
-    geometry : Geometry or None
-        None if the positions of the sensors are unknown.
-    """
-
-    time_ns: NDArray[np.int64]
-    field_t: NDArray[np.float32]
-    geometry: Geometry | None
-
-
 def field_panels(
     session: Session,
     solution: Solution,
     kind: SensorKind[Geometry],
     title: str,
     note: str,
-    draw: Callable[[DeviceRecording[FieldSamples[Geometry]]], list[Panel]],
+    draw: Callable[[DeviceRecording[DeviceSamples[Geometry | None]]], list[Panel]],
 ) -> list[Panel]:
     """Return the panels of magnetic sensors; the parameters are those of :func:`device_panels`."""
     decode = partial(_decode_field_samples, kind)
@@ -259,8 +241,8 @@ def field_panels(
 
 def _decode_field_samples(
     kind: SensorKind[Geometry], session: Session, topic: str, payloads: list[bytes]
-) -> FieldSamples[Geometry]:
-    """Decode the samples of one device.
+) -> DeviceSamples[Geometry | None]:
+    """Decode the samples of one device; the geometry is None if it is unknown or does not fit.
 
     Raises
     ------
@@ -280,8 +262,10 @@ def _decode_field_samples(
         raise FormatError("no samples", file=session.path, where=topic)
     order = np.argsort(time_ns, kind="stable")
     field_t = columns["b_tesla"].reshape(len(time_ns), sensors, -1)
+    device = topic.removeprefix(kind.topic)
     geometry: Any = None
-    with suppress(LocatkError):  # The field can be drawn without it.
-        geometry = kind.attached(session, topic.removeprefix(kind.topic))
-    is_valid = geometry is not None and len(geometry) == sensors
-    return FieldSamples(time_ns[order], field_t[order], geometry if is_valid else None)
+    with suppress(LocatkError):  # The field can be drawn without the positions of the sensors.
+        geometry = kind.attached(session, device)
+    if geometry is not None and len(geometry) != sensors:
+        geometry = None
+    return DeviceSamples(device, geometry, time_ns[order], field_t[order])

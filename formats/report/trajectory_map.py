@@ -58,8 +58,8 @@ TRANSPARENT = "rgba(0,0,0,0)"
 def map_panels(solution: Solution, ground: Ground, start_ns: int, title: str) -> list[Panel]:
     """Return the map from above and, if the trajectories are not flat, from the side."""
     panels = [_map_panel(solution, ground, start_ns, title, (0, 1))]
-    positions = [p[np.isfinite(p).all(axis=1)] for p in ground.paths.values()]
-    every = np.concatenate(positions) if positions else np.zeros((0, 3))
+    every = np.concatenate([np.zeros((0, 3)), *ground.paths.values()])
+    every = every[np.isfinite(every).all(axis=1)]
     if len(every) > 1:
         low, high = np.percentile(every, (1, 99), axis=0)
         width, rise = float(np.max((high - low)[:2])), float(high[2] - low[2])

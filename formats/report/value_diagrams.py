@@ -61,8 +61,8 @@ class ValueRow:
 
     def magnitudes(self) -> Array:
         """Return the finite absolute values of all devices."""
-        values = [np.abs(s.value[np.isfinite(s.value)]) for s in self.values.values()]
-        return np.concatenate(values) if values else np.empty(0)
+        values = np.concatenate([np.zeros(0), *(s.value for s in self.values.values())])
+        return np.abs(values[np.isfinite(values)])
 
     def limit(self, reference: float | None) -> float:
         """Return the upper limit of the value axis, which includes a reference value."""

@@ -18,8 +18,8 @@ from locatk.formats.report.panels import (
     reason_text,
 )
 from locatk.formats.report.signal_diagrams import Event, Signals
-from locatk.formats.report.signals import DeviceRecording, FieldSamples, field_panels
-from locatk.formats.sessions.field_samples import HALLS
+from locatk.formats.report.signals import DeviceRecording, field_panels
+from locatk.formats.sessions.field_samples import HALLS, DeviceSamples
 from locatk.formats.sessions.reader import Session
 
 SENSOR_COLORS = tuple(color for color in COLORS if color not in (USED, REFUSED))
@@ -44,7 +44,7 @@ def signal_panels(session: Session, solution: Solution) -> list[Panel]:
     return field_panels(session, solution, HALLS, "Hall sensors of", NOTE, _draw)
 
 
-def _draw(recording: DeviceRecording[FieldSamples[HallSensors]]) -> list[Panel]:
+def _draw(recording: DeviceRecording[DeviceSamples[HallSensors | None]]) -> list[Panel]:
     samples = recording.samples
     count = samples.field_t.shape[1]
     names = [f"sensor {k + 1}" for k in range(count)]

@@ -22,12 +22,12 @@ from locatk.formats.report.panels import (
     reason_text,
 )
 from locatk.formats.report.signal_diagrams import Event, Signals, add_recording, detail_panels
-from locatk.formats.report.signals import DeviceRecording, FieldSamples, field_panels
-from locatk.formats.sessions.field_samples import MAGNETOMETERS
+from locatk.formats.report.signals import DeviceRecording, field_panels
+from locatk.formats.sessions.field_samples import MAGNETOMETERS, DeviceSamples
 from locatk.formats.sessions.reader import Session
 
 Array = NDArray[np.float64]
-Recording = DeviceRecording[FieldSamples[SensorArray]]
+Samples = DeviceSamples[SensorArray | None]
 
 MAX_DETAILED_PASSES = 3
 """Number of passes that are drawn sample by sample."""
@@ -61,7 +61,7 @@ def signal_panels(session: Session, solution: Solution) -> list[Panel]:
     return field_panels(session, solution, MAGNETOMETERS, "Magnetic field along", NOTE, _draw)
 
 
-def _draw(recording: Recording) -> list[Panel]:
+def _draw(recording: DeviceRecording[Samples]) -> list[Panel]:
     detections, start_ns = recording.detections, recording.start_ns
     is_located = recording.samples.geometry is not None
     ordinate, names = _locate_sensors(recording.samples)
@@ -95,7 +95,7 @@ def _draw(recording: Recording) -> list[Panel]:
     return [Panel(recording.title, note, figure), *details]
 
 
-def _locate_sensors(samples: FieldSamples[SensorArray]) -> tuple[Array, list[str]]:
+def _locate_sensors(samples: Samples) -> tuple[Array, list[str]]:
     """Return the ordinates of the sensors (across the bar in mm, or their numbers), and names."""
     numbers = range(1, samples.field_t.shape[1] + 1)
     if samples.geometry is None:
@@ -105,7 +105,7 @@ def _locate_sensors(samples: FieldSamples[SensorArray]) -> tuple[Array, list[str
     return ordinate, [f"{k} ({offset} mm)" for k, offset in zip(numbers, offsets, strict=True)]
 
 
-def _signals(recording: Recording, ordinate: Array, names: list[str]) -> Signals:
+def _signals(recording: DeviceRecording[Samples], ordinate: Array, names: list[str]) -> Signals:
     """Return the field of each sensor and axis, minus its median, in colors by position."""
     field = recording.samples.field_t
     median = np.zeros(field.shape[1:], np.float32)
