@@ -80,14 +80,16 @@ def landmark_table(
     return _table([cells(each) for each in detections], limit, device_column="robot")
 
 
-def _table(rows: Sequence[Mapping[str, str]], limit: int | None, device_column: str) -> Table:
+def _table(
+    rows: Sequence[Mapping[str, str]], limit: int | None = None, device_column: str = ""
+) -> Table:
     """Return the first rows, without the column of devices if there is only one device, and
     without that of refusals if it is empty."""
     shown = rows[:limit]
     omitted_columns = set()
-    if len({row[device_column] for row in rows}) < 2:
+    if len({row.get(device_column) for row in rows}) < 2:
         omitted_columns.add(device_column)
-    if not any(row["refused"] for row in shown):
+    if not any(row.get("refused") for row in shown):
         omitted_columns.add("refused")
     header = tuple(name for name in rows[0] if name not in omitted_columns) if rows else ()
     cells = [tuple(row[name] for name in header) for row in shown]
@@ -148,24 +150,23 @@ def detection_panel(solution: Solution) -> Panel:
 
 def _station_panel(solution: Solution) -> Panel:
     rows = [
-        (
-            str(detection.channel),
-            detection.id or "-",
-            str(detection.period_ticks),
-            detection.calibration,
-            str(detection.sweeps),
-            str(detection.rejected),
-            format_value(detection.residual_rad, 1e3, ".3f"),
-        )
+        {
+            "channel": str(detection.channel),
+            "id": detection.id or "-",
+            "period [ticks]": str(detection.period_ticks),
+            "calibration": detection.calibration,
+            "sweeps": str(detection.sweeps),
+            "rejected": str(detection.rejected),
+            "residual [mrad]": format_value(detection.residual_rad, 1e3, ".3f"),
+        }
         for detection in solution.detections
     ]
-    header = ("channel", "id", "period [ticks]", "calibration", "sweeps", "rejected")
     return Panel(
         TITLE,
         "Base stations of the recording, with the number of sweeps that are part of a pose and of "
         "sweeps from rejected moments. The residual is the angle by which light planes miss their "
         "common point, if there are redundant ones.",
-        table=Table((*header, "residual [mrad]"), rows),
+        table=_table(rows),
     )
 
 
@@ -217,18 +218,17 @@ def _frame_panel(solution: Solution) -> Panel:
         "rejected": [frame for frame in frames if frame.rejected],
     }
     rows = [
-        (
-            name,
-            str(len(group)),
-            f"{100 * len(group) / len(frames):.1f}",
-            _format_median(group, "dots", 1, ".0f"),
-            _format_median(group, "corrected_bits", 1, ".0f"),
-            _format_median(group, "confidence", 100, ".2f"),
-        )
+        {
+            "frames": name,
+            "count": str(len(group)),
+            "fraction [%]": f"{100 * len(group) / len(frames):.1f}",
+            "dots": _format_median(group, "dots", 1, ".0f"),
+            "bits corrected": _format_median(group, "corrected_bits", 1, ".0f"),
+            "confidence [%]": _format_median(group, "confidence", 100, ".2f"),
+        }
         for name, group in groups.items()
         if group
     ]
-    header = ("frames", "count", "fraction [%]", "dots", "bits corrected", "confidence [%]")
     values = {
         quantity: {
             f"{name} ({len(group)})": np.array([scale * getattr(each, field) for each in group])
@@ -244,7 +244,7 @@ def _frame_panel(solution: Solution) -> Panel:
         f"{format_count(len(frames), 'frames')} of the camera. Dots, corrected bits and confidence "
         "are medians.",
         _draw_histograms(values, "frames"),
-        Table(header, rows),
+        _table(rows),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from plotly.graph_objects import Figure
 
@@ -32,7 +34,7 @@ from locatk.formats.report.diagram_grid import DiagramGrid
 from locatk.formats.report.panels import Panel, Table, escape, join_names, join_sentences
 from locatk.formats.report.style import INK
 from locatk.formats.report.subject import Subject
-from locatk.formats.report.value_diagrams import ValueRow, draw_values
+from locatk.formats.report.value_diagrams import ValueRow, value_panel
 
 HISTOGRAM_BINS = 50
 """Number of bins of the histogram of errors, on an axis of about 900 pixels."""
@@ -177,8 +179,8 @@ def error_panels(subject: Subject) -> list[Panel]:
     if has_rotation.any():
         values = split_by_device(evaluation, evaluation.rotation_errors_deg, has_rotation)
         row = ValueRow(f"rotation error [{DEGREES.name}]", values, {})
-        figure, note = draw_values([row], colors, start_ns, as_marks=True)
-        panels.append(Panel("Rotation error over time", note, figure))
+        title = "Rotation error over time"
+        panels.append(value_panel(title, "", [row], colors, start_ns, as_marks=True))
     panels += _nees_panels(evaluation, colors, start_ns)
     statistics = _statistics_table(evaluation, unit)
     panels.append(Panel("Statistics", _statistics_note(solution, evaluation), table=statistics))
@@ -199,13 +201,14 @@ def _error_panel(
         split_by_device(evaluation, evaluation.errors * unit.per_si),
         split_by_device(evaluation, bound * unit.per_si),
     )
-    figure, note = draw_values([row], colors, start_ns, as_marks=True)
+    panel = value_panel("Error over time", "", [row], colors, start_ns, as_marks=True)
     is_known = np.isfinite(bound)
     if is_known.any() and evaluation.consistency is None:
         inside = evaluation.errors <= bound
         percent = 100 * np.count_nonzero(inside) / np.count_nonzero(is_known)
-        note = join_sentences(note, f"{percent:.0f} % of the errors are.")
-    return Panel("Error over time", note, figure)
+        note = join_sentences(panel.note, f"{percent:.0f} % of the errors are.")
+        return replace(panel, note=note)
+    return panel
 
 
 def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Figure:
@@ -279,8 +282,8 @@ def _axis_panel(
         values = split_by_device(evaluation, residual[:, axis])
         expected = split_by_device(evaluation, bound[:, axis])
         rows.append(ValueRow(f"{name} [{unit.name}]", values, expected))
-    figure, note = draw_values(rows, colors, start_ns, signed=True)
-    return Panel("Error by axis", join_sentences("Estimate minus truth.", note), figure)
+    explanation = "Estimate minus truth."
+    return value_panel("Error by axis", explanation, rows, colors, start_ns, signed=True)
 
 
 def _nees_panels(evaluation: Evaluation, colors: dict[str, str], start_ns: int) -> list[Panel]:
@@ -291,14 +294,14 @@ def _nees_panels(evaluation: Evaluation, colors: dict[str, str], start_ns: int) 
         return []
     ratio = evaluation.nees / np.array(CHI2_95_QUANTILES)[evaluation.nees_dof]
     row = ValueRow("NEES / 95 % quantile", split_by_device(evaluation, ratio, is_known), {})
-    figure, note = draw_values([row], colors, start_ns, as_marks=True, reference=1.0)
     explanation = (
         "Normalized estimation error squared (NEES), divided by its 95 % quantile. "
         f"{100 * consistency.inside:.0f} % of {format_count(consistency.n, 'poses')} are below 1. "
         f"The mean NEES is {format_number(consistency.mean)} times the expected one (1 if the "
         "covariances are right)."
     )
-    return [Panel("Consistency of the covariance", join_sentences(explanation, note), figure)]
+    title = "Consistency of the covariance"
+    return [value_panel(title, explanation, [row], colors, start_ns, as_marks=True, reference=1.0)]
 
 
 def _statistics_table(evaluation: Evaluation, unit: Unit) -> Table:
@@ -384,6 +387,6 @@ def covariance_panels(subject: Subject) -> list[Panel]:
     if not rows:
         return []
     colors = device_colors([t.device for t in solution.trajectories])
-    figure, note = draw_values(rows, colors, origin_ns(subject.session, solution))
-    frame = "Standard deviations reported by the solver, in its own frame."
-    return [Panel("Standard deviation over time", join_sentences(frame, note), figure)]
+    title, start_ns = "Standard deviation over time", origin_ns(subject.session, solution)
+    explanation = "Standard deviations reported by the solver, in its own frame."
+    return [value_panel(title, explanation, rows, colors, start_ns)]

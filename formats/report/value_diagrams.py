@@ -19,7 +19,7 @@ from locatk.formats.plots.series import (
 )
 from locatk.formats.plots.shapes import is_in_legend
 from locatk.formats.plots.units import abbreviate, format_count
-from locatk.formats.report.panels import escape, join_sentences
+from locatk.formats.report.panels import Panel, escape, join_sentences
 from locatk.formats.report.style import DEVICE_LEGEND_RANK, INK, faded
 from locatk.formats.report.thinning import MAX_POSES, Indices, allot_points, thin, thinning_note
 
@@ -71,7 +71,9 @@ class ValueRow:
         return limit if reference is None else max(limit, 1.15 * reference)
 
 
-def draw_values(
+def value_panel(
+    title: str,
+    explanation: str,
     rows: Sequence[ValueRow],
     colors: Mapping[str, str],
     start_ns: int,
@@ -79,11 +81,13 @@ def draw_values(
     signed: bool = False,
     as_marks: bool = False,
     reference: float | None = None,
-) -> tuple[Figure, str]:
-    """Draw values against time, and describe what the scales omit.
+) -> Panel:
+    """Draw values against time, with notes on expected values, outliers and thinning.
 
     Parameters
     ----------
+    title, explanation : str
+        The explanation is the beginning of the note.
     rows : sequence of ValueRow
     colors : mapping of str to str
         By device.
@@ -95,12 +99,6 @@ def draw_values(
         Draw marks instead of lines, and outliers as triangles at the upper limit; one row only.
     reference : float, optional
         Value to be included and marked by a line.
-
-    Returns
-    -------
-    figure : plotly Figure
-    note : str
-        Sentences on expected values, outliers and thinning.
     """
     figure: Figure = make_subplots(len(rows), 1, shared_xaxes=True, vertical_spacing=0.05)
     beyond = total = shown = 0
@@ -146,6 +144,7 @@ def draw_values(
         overlay = {"overlaying": "y", "range": [0, 1], "fixedrange": True, "visible": False}
         figure.update_layout(yaxis2=overlay)
     note = join_sentences(
+        explanation,
         _expected_note(max(len(row.expected) for row in rows), signed),
         f"{format_count(beyond)} of {format_count(total, 'values')} lie beyond "
         + ("this scale (triangles)" if as_marks else "these scales")
@@ -154,7 +153,7 @@ def draw_values(
         else "",
         thinning_note(shown, total, "values"),
     )
-    return figure, note
+    return Panel(title, note, figure)
 
 
 def _line_mode(devices: int, points: int) -> str:

@@ -95,9 +95,9 @@ def _event(detection: LandmarkDetection, start_ns: int) -> Event:
     return Event(
         start_s,
         stop_s,
-        "<br>".join(filter(None, (refused, cell, pattern))),
-        description,
-        refused,
-        as_float(detection.probability),
-        (start_s - DETAIL_BEFORE_S, stop_s + DETAIL_AFTER_S),
+        label="<br>".join(filter(None, (refused, cell, pattern))),
+        description=description,
+        refused=refused,
+        certainty=as_float(detection.probability),
+        detail_s=(start_s - DETAIL_BEFORE_S, stop_s + DETAIL_AFTER_S),
     )

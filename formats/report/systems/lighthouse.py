@@ -132,5 +132,5 @@ def _add_rate(
     """Add the number of times (n,) per second in each interval as steps."""
     rate = np.histogram(time_s, edges)[0] / np.diff(edges)
     trace["hovertemplate"] = f"%{{x:.1f}} s: %{{y:.1f}} {noun}/s"
-    line["shape"] = "hv"
+    line = {**line, "shape": "hv"}
     grid.add(2, edges, np.append(rate, rate[-1]), mode="lines", line=line, **trace)

@@ -142,9 +142,9 @@ def _event(detection: TagDetection, start_ns: int) -> Event:
     return Event(
         start_s,
         stop_s,
-        f"{detection.tag_id} ({margin})" if is_identified else refused,
-        description,
-        refused,
-        as_float(detection.margin),
-        (start_s - detail_s, stop_s + detail_s),
+        label=f"{detection.tag_id} ({margin})" if is_identified else refused,
+        description=description,
+        refused=refused,
+        certainty=as_float(detection.margin),
+        detail_s=(start_s - detail_s, stop_s + detail_s),
     )
