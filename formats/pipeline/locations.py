@@ -22,9 +22,8 @@ from locatk.core.errors import (
     InputError,
     LocatkError,
     MissingDataError,
-    OutputExistsError,
 )
-from locatk.formats.output import check_output
+from locatk.formats.output import check_output, output_exists_error
 from locatk.formats.sessions.mcap_file import SESSION_RECORD, DamageError
 from locatk.formats.sessions.reader import Session, read_index
 
@@ -371,9 +370,7 @@ def check_writable(location: str, *, overwrite: bool) -> None:
             "a web address cannot be written", file=location, hint="Name a file or folder with -o"
         )
     elif not overwrite and exists(location):
-        raise OutputExistsError(
-            f"output {location!r} exists", hint="Add --overwrite or choose another name"
-        )
+        raise output_exists_error(location)
 
 
 def check_bucket(location: str) -> None:
@@ -394,7 +391,9 @@ def check_bucket(location: str) -> None:
             pass  # The user may write into a bucket without permission to inspect it.
         except FileNotFoundError:
             raise MissingDataError(
-                f"the bucket {bucket!r} does not exist", hint="Create it, or check the spelling"
+                f"no such bucket {bucket!r}",
+                file=location,
+                hint="Create it, or check the spelling",
             ) from None
 
 
@@ -421,7 +420,8 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
         store, key = fsspec.core.url_to_fs(url)
     except ImportError as error:
         raise LocatkError(
-            f"{protocol}:// cannot be read: {short_reason(error)}",
+            f"cannot be read or written ({short_reason(error)})",
+            file=url,
             hint='Install it: pip install "locatk[s3]"',
         ) from None
     except ValueError as error:
