@@ -55,7 +55,7 @@ def command(
     """
     from locatk.formats.capture.attachments import attachments
     from locatk.formats.capture.redecoding import decode, losses
-    from locatk.formats.devices.decoder import Options
+    from locatk.formats.devices.interface import Options
 
     options.guard_output(output, overwrite=overwrite, inputs=[recording, *artifact])
     with console.working("Decoding"):

@@ -36,17 +36,12 @@ def check_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> No
     """
     target = Path(path)
     if not os.path.isdir(target.parent):
-        raise MissingDataError(
-            f"no folder {str(target.parent)!r} to write into", hint="Create the folder first"
-        )
+        raise MissingDataError("no such folder", file=target.parent, hint="Create the folder first")
     # A device or a folder cannot be replaced by a file, not even with --overwrite.
     if os.path.exists(target) and not os.path.isfile(target):
-        raise OutputExistsError(
-            f"output {str(target)!r} is not a regular file",
-            hint="Name a file, not a folder",
-        )
+        raise OutputExistsError("not a regular file", file=target, hint="Name a file, not a folder")
     if os.path.lexists(target) and not overwrite:
-        raise _output_exists(target)
+        raise output_exists_error(target)
 
 
 @contextlib.contextmanager
@@ -102,14 +97,14 @@ def _move_to_free_name(part: Path, target: Path) -> None:
     try:
         os.link(part, target)
     except FileExistsError:
-        raise _output_exists(target) from None
+        raise output_exists_error(target) from None
     except OSError:
         # The file system has no hard links (FAT, some network shares): reserve the name with an
         # empty file first, which is as safe except for a crash in between.
         try:
             open(target, "xb").close()
         except FileExistsError:
-            raise _output_exists(target) from None
+            raise output_exists_error(target) from None
         try:
             os.replace(part, target)
         except BaseException:
@@ -119,9 +114,10 @@ def _move_to_free_name(part: Path, target: Path) -> None:
         part.unlink()
 
 
-def _output_exists(target: Path) -> OutputExistsError:
+def output_exists_error(target: str | os.PathLike[str]) -> OutputExistsError:
+    """Return the error for an output that exists and must not be replaced."""
     return OutputExistsError(
-        f"output {str(target)!r} exists", hint="Add --overwrite or choose another name"
+        "output exists", file=target, hint="Add --overwrite or choose another name"
     )
 
 

@@ -26,7 +26,7 @@ def data_folder(explicit: Path | None = None) -> Path | None:
     if explicit is not None:
         if not Path(explicit).is_dir():
             raise MissingDataError(
-                f"no data folder {str(explicit)!r}", hint="Name the folder with --data"
+                "no such data folder", file=explicit, hint="Name the folder with --data"
             )
         return Path(explicit)
     named = os.environ.get(VARIABLE)

@@ -334,7 +334,7 @@ class Reader:
 
     def store(self, bucket: str) -> None:
         """A bucket with the sessions of the folder, where the page names it first."""
-        from locatk.formats.pipeline.locations import read_facts
+        from locatk.formats.pipeline.session_search import read_facts
 
         if bucket in self.buckets:
             return

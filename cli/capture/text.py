@@ -42,9 +42,7 @@ class Live:
 
     def waiting(self, why: str) -> None:
         """Report a port that is not available yet."""
-        missing = "no such port "
-        detail = f" for {why.removeprefix(missing)}" if why.startswith(missing) else f": {why}"
-        console.say(f"Waiting{detail}; Ctrl-C ends it.")
+        console.say(f"Waiting: {why}; Ctrl-C ends it.")
 
     def tell(self, text: str) -> None:
         """Report an event."""

@@ -94,7 +94,8 @@ def import_sweeps(
     reader: Any, paths: tuple[Path, ...], output: Path, given: dict[str, Any], overwrite: bool
 ) -> tuple[dict[str, Any], str | None]:
     """Import sweeps; returns the results for ``--json`` and a summary of the losses."""
-    from locatk.formats.sessions import lighthouse_description, observations
+    from locatk.formats.descriptions.lighthouse import describe_station
+    from locatk.formats.sessions import observations
 
     with console.working("Reading"):
         imported = reader(list(paths), **_reader_arguments(paths, given))
@@ -110,9 +111,7 @@ def import_sweeps(
             overwrite=overwrite,
         )
     sweeps = imported.sweeps
-    stations = [
-        lighthouse_description.station(report, report.channel) for report in imported.stations
-    ]
+    stations = [describe_station(report, report.channel) for report in imported.stations]
     truth_poses = sum(map(len, imported.truth))
     truth = f", {truth_poses} truth poses" if truth_poses else ""
     console.say(f"{len(sweeps)} sweeps of {_device_list(sweeps.devices)}{truth}")
@@ -133,7 +132,7 @@ def import_scene(
 ) -> tuple[dict[str, Any], str | None]:
     """Import the stations of a configuration as ``scene.toml``; returns as `import_sweeps`."""
     from locatk.formats.artifacts import scene as artifacts
-    from locatk.formats.sessions import lighthouse_description
+    from locatk.formats.descriptions.lighthouse import describe_scene
 
     if output.suffix.lower() != ".toml":
         raise click.UsageError(
@@ -141,7 +140,7 @@ def import_scene(
         )
     scene = reader(paths[0])
     artifacts.write_scene(output, scene, overwrite=overwrite)
-    description = lighthouse_description.scene(scene)
+    description = describe_scene(scene)
     stations = [{key: each[key] for key in SCENE_KEYS} for each in description["stations"]]
     warnings = list(scene.notes)
     if stations:

@@ -59,17 +59,17 @@ def command(file: Path, as_json: bool) -> None:
 def _artifact(file: Path) -> dict[str, Any]:
     """Read and describe an artifact."""
     from locatk.formats.artifacts.registry import identify_artifact
-    from locatk.formats.sessions import description, lighthouse_description
+    from locatk.formats.descriptions import dots, landmarks, lighthouse, polaris
 
     descriptions: dict[str, Callable[[Any], dict[str, Any]]] = {
-        "scene": lighthouse_description.scene,
-        "receiver": lambda receiver: {"receivers": [lighthouse_description.receiver(receiver)]},
-        "manifest": description.manifest,
-        "camera": lambda camera: {"camera": description.camera(camera)},
-        "tag": description.tags,
-        "array": lambda array: {"arrays": [description.array(array)]},
-        "map": description.floor,
-        "halls": lambda halls: {"halls": [description.hall_sensors(halls)]},
+        "scene": lighthouse.describe_scene,
+        "receiver": lambda receiver: {"receivers": [lighthouse.describe_receiver(receiver)]},
+        "manifest": dots.describe_manifest,
+        "camera": lambda camera: {"camera": dots.describe_camera(camera)},
+        "tag": polaris.describe_tags,
+        "array": lambda array: {"arrays": [polaris.describe_array(array)]},
+        "map": landmarks.describe_map,
+        "halls": lambda halls: {"halls": [landmarks.describe_hall_sensors(halls)]},
     }
     entry = identify_artifact(file)
     facts = descriptions[entry.kind](entry.artifact.read(file))
@@ -78,6 +78,7 @@ def _artifact(file: Path) -> dict[str, Any]:
 
 def _recording(file: Path) -> dict[str, Any]:
     """Describe a session, a solution, or a recording of another tool."""
+    from locatk.formats.descriptions import dots, landmarks, lighthouse, polaris
     from locatk.formats.sessions import capture_record
     from locatk.formats.sessions.reader import Session
 
@@ -103,14 +104,14 @@ def _recording(file: Path) -> dict[str, Any]:
         "damage": session.damage,
         "recoverable": session.damage is not None,
     }
-    if facts.get("system") == "lighthouse":
-        from locatk.formats.sessions import lighthouse_description
-
-        described |= lighthouse_description.recording(session)
-    elif facts.get("system") in ("dots", "polaris", "landmarks"):
-        from locatk.formats.sessions import description
-
-        described |= getattr(description, facts["system"])(session)
+    systems = {
+        "dots": dots,
+        "landmarks": landmarks,
+        "lighthouse": lighthouse,
+        "polaris": polaris,
+    }
+    if facts.get("system") in systems:
+        described |= systems[facts["system"]].describe_recording(session)
     return described
 
 

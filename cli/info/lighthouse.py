@@ -24,7 +24,7 @@ def station_table(stations: Sequence[Mapping[str, Any]], scale: str | None = Non
     Parameters
     ----------
     stations : sequence of mapping
-        As described by :func:`locatk.formats.sessions.lighthouse_description.station`.
+        As described by :func:`locatk.formats.descriptions.lighthouse.describe_station`.
     scale : str, optional
         Origin of the scale of the scene; positions are in units if it is ``"unit"``.
     """

@@ -38,12 +38,7 @@ FORMATS = ("pdf", "svg")
     default="A4",
     show_default=True,
     metavar="PAPER",
-    help="A0 to A5, Letter, Tabloid, or WxHmm as in 600x900mm.",
-)
-@click.option(
-    "--landscape/--portrait",
-    default=None,
-    help="Orientation of the paper.  [default: the one that needs fewer pages]",
+    help="A0 to A5, Letter, Tabloid, or WxHmm as in 600x900mm, rotated if that saves pages.",
 )
 @click.option(
     "--margin",
@@ -68,7 +63,6 @@ def tag(
     format_name: str | None,
     ids: tuple[int, ...],
     size: str,
-    landscape: bool | None,
     margin_mm: float,
     mirror: bool,
     overwrite: bool,
@@ -99,7 +93,6 @@ def tag(
         tags,
         _layouts(tag_file, tags, ids),
         paper_mm,
-        landscape=landscape,
         margin_mm=margin_mm,
         mirror=mirror,
     )

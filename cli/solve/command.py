@@ -211,11 +211,11 @@ def command(
 
 def _check_scene(sessions: Sequence[str]) -> None:
     """Refuse --save-scene for systems that do not estimate a scene."""
-    from locatk.formats.pipeline import locations, systems
+    from locatk.formats.pipeline import session_search, systems
 
     if len(sessions) > 1:
         raise click.UsageError("--save-scene needs exactly one session.")
-    name = locations.read_facts(sessions[0]).get("system", "")
+    name = session_search.read_facts(sessions[0]).get("system", "")
     system = systems.SYSTEMS.get(name)
     if isinstance(system, systems.System) and not system.estimates_scene:
         raise click.UsageError(f"--save-scene is for lighthouse: {name} estimates no scene.")

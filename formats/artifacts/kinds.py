@@ -409,10 +409,10 @@ class Record:
         for key in value:
             if key not in self.fields:
                 hint = nearest_key_hint(key, self.fields)
-                raise InvalidValueError(f"unknown key {key!r}", key, hint)
+                raise InvalidValueError(f"unknown key {key!r}", hint=hint)
         for key in self.fields:
             if key not in value:
-                raise InvalidValueError(f"missing key {key!r}", key)
+                raise InvalidValueError(f"missing key {key!r}")
         return tuple(parse_key(key, kind, value[key]) for key, kind in self.fields.items())
 
     def parse_text(self, text: str) -> tuple[Any, ...]:

@@ -15,8 +15,8 @@ library       import  report of ``pich_mm`` instead of ``pitch_mm``
 pydantic 2.14    111  four lines: ``map.pitch_mm Field required``, ``map.pich_mm Extra inputs are
                       not permitted``, and two links
 msgspec 0.22      27  ``Object contains unknown field `pich_mm` - at `$.map```
-this module        -  ``FILE:map.pitch_mm: missing key 'pitch_mm'. Hint: Is 'pich_mm' meant to
-                      be pitch_mm?``
+this module        -  ``FILE:map: missing key 'pitch_mm'. Hint: Is 'pich_mm' meant to be
+                      pitch_mm?``
 ============  ======  ==========================================================================
 
 pydantic accepts ``true`` as a number; msgspec accepts ``inf`` within a range, and has no ranges of
@@ -209,8 +209,9 @@ class Table:
             names = {key.name for key in self.keys}
             for name in value:
                 if name not in names:
-                    hint = nearest_key_hint(name, names)
-                    raise InvalidValueError(f"unknown key {name!r}", name, hint)
+                    raise InvalidValueError(
+                        f"unknown key {name!r}", hint=nearest_key_hint(name, names)
+                    )
         return values if self.convert is None else self.convert(values)
 
     def _parse_key(self, key: Key, table: Mapping[str, Any]) -> Any:
@@ -221,12 +222,14 @@ class Table:
         names = {known.name for known in self.keys}
         unknown = [name for name in table if name not in names]
         near = difflib.get_close_matches(key.name, unknown, 1, MIN_KEY_SIMILARITY)
-        hint = _TABLES_HINT if isinstance(key.kind, Tables) else None
-        if isinstance(key.kind, Text):
+        hint = None
+        if isinstance(key.kind, Tables):
+            hint = _TABLES_HINT.replace("{key}", f"{{key}}.{key.name}")
+        elif isinstance(key.kind, Text):
             hint = key.kind.hint
         if near:
             hint = f"Is {near[0]!r} meant to be {key.name}?"
-        raise InvalidValueError(f"missing key {key.name!r}", key.name, hint)
+        raise InvalidValueError(f"missing key {key.name!r}", hint=hint)
 
     def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> Any:
         values = value if self.to_values is None else self.to_values(value)
@@ -498,7 +501,7 @@ def parse_document(
         for name in unknown_keys(table, body):
             if difflib.get_close_matches(name, header_names, 1, MIN_KEY_SIMILARITY):
                 hint = nearest_key_hint(name, header_names)
-                raise InvalidValueError(f"unknown key {name!r}", name, hint)
+                raise InvalidValueError(f"unknown key {name!r}", hint=hint)
         return table.parse(body)
     except InvalidValueError as error:
         raise _located(error, file) from None
@@ -528,6 +531,8 @@ def read_format(path: str | os.PathLike[str], formats: Sequence[str] = ()) -> st
 
 
 def _located(error: InvalidValueError, file: str | os.PathLike[str]) -> ArtifactError:
-    table = re.sub(r"\[\d+\]", "", error.key)
-    hint = error.hint and error.hint.replace("{key}", table)
+    path = re.sub(r"\[\d+\]", "", error.key)
+    hint = error.hint
+    if hint is not None:
+        hint = hint.replace("{key}.", f"{path}." if path else "").replace("{key}", path)
     return ArtifactError(error.message, file=file, where=error.key or None, hint=hint)

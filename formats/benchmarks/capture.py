@@ -27,7 +27,7 @@ from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.timing import FIRST_SEED, machine_factor, time_call, time_command
 from locatk.formats.devices import DEVICES
-from locatk.formats.devices.decoder import Options, Recording
+from locatk.formats.devices.interface import Options, Recording
 from locatk.formats.devices.locatk_frames.payloads import FrameWriter, Type, series
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import mcap_file

@@ -57,9 +57,9 @@ from locatk.formats.benchmarks.timing import (
     run_single_threaded,
     time_call,
 )
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
-from locatk.formats.importers.lighthouse import ImportedSession
 from locatk.formats.importers.saleae.recording import read_light
 
 Array = NDArray[np.float64]

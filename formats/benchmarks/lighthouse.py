@@ -34,7 +34,7 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Duration, Figure, measure_or_explain
 from locatk.formats.benchmarks.timing import measure_single_threaded, time_call
 from locatk.formats.importers.dotbot.recording import read_dotbot
-from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.reader import Session
 

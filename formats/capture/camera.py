@@ -96,7 +96,7 @@ class CameraPort:
                 raise SourceError("the video has no frame", file=self._address, hint=hint)
             if first is None:
                 hint = "Check that no other program uses it"
-                raise SourceError(f"{self.name} provides no frame", hint=hint)
+                raise SourceError("no frame was received", file=self.name, hint=hint)
             height, width = first[1].shape[:2]
             self._properties = {
                 "width": str(width),
@@ -123,10 +123,8 @@ class CameraPort:
 
     def _explain_error(self, is_file: bool) -> SourceError:
         if is_file or "://" in self._address:
-            return SourceError(
-                f"no video from {self._address}",
-                hint="Check the address, and that the camera is on",
-            )
+            hint = "Check the address, and that the camera is on"
+            return SourceError("no video was received", file=self._address, hint=hint)
         path = f"/dev/video{self._address}" if self._address.isdecimal() else self._address
         if os.path.exists(path):
             if not os.access(path, os.R_OK | os.W_OK):
@@ -134,10 +132,8 @@ class CameraPort:
             if find_port_users([path])[path]:
                 return busy_error(self.name, path)
         devices = sorted(str(each) for each in Path("/dev").glob("video*"))
-        return SourceError(
-            f"no camera {self._address}",
-            hint=f"Available: {', '.join(devices)}" if devices else "Check that it is plugged in",
-        )
+        hint = f"Available: {', '.join(devices)}" if devices else "Check that it is plugged in"
+        return SourceError("no such camera", file=self.name, hint=hint)
 
 
 def camera_port(

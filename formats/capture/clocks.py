@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.clock_sync import RATE_LIMIT, TickClock
-from locatk.formats.devices.decoder import Ticks
+from locatk.formats.devices.interface import Ticks
 
 Ints = NDArray[np.int64]
 

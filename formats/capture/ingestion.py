@@ -19,8 +19,8 @@ from locatk.formats.artifacts import maps
 from locatk.formats.capture.clocks import ArrivalTimes, DeviceClock
 from locatk.formats.capture.reader_thread import ReceivedData
 from locatk.formats.devices import Device, find_device
-from locatk.formats.devices.decoder import Batch, Counts, Decoder, Options, Stream
 from locatk.formats.devices.identification import MAX_IDENTIFICATION_S, Identifier, Verdict
+from locatk.formats.devices.interface import Batch, Counts, Decoder, Options, Stream
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import frames, messages
 from locatk.formats.sessions.capture_statistics import CaptureStatistics

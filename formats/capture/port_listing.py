@@ -184,7 +184,8 @@ def busy_error(name: str, path: str) -> SourceError:
     ]
     if not users:
         return SourceError(
-            f"{name} is in use by another program",
+            "in use by another program",
+            file=name,
             hint=f"End it: usually {USUAL_USERS}; `sudo lsof {path}` shows it",
         )
     names = " and ".join(
@@ -195,12 +196,12 @@ def busy_error(name: str, path: str) -> SourceError:
         hint = (
             "It closes the port after 30 s; to stop it: sudo systemctl disable --now ModemManager"
         )
-    return SourceError(f"{name} is in use by {names}", hint=hint)
+    return SourceError(f"in use by {names}", file=name, hint=hint)
 
 
 def permission_error(name: str, path: str) -> SourceError:
     """Return the error for a port that this user may not open."""
-    return SourceError(f"no permission to open {name}", hint=_permission(path))
+    return SourceError("no permission to open it", file=name, hint=_permission(path))
 
 
 def is_pty(path: str) -> bool:

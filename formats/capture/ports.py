@@ -88,14 +88,14 @@ def port_of(name: str, *, baud: int, speed: float = 1.0) -> Port:
     if kind == "replay" and colon:
         return ReplayPort(name, speed=speed)
     if kind == "camera" and colon:
-        raise SourceError(f"{name} is a camera, not a serial port")
+        raise SourceError("a camera, not a serial port", file=name)
     if not rest.startswith("//"):
         if not name:
             raise SourceError("the name of the port is empty", hint=LIST_HINT)
         return SerialPort(name, baud=baud)
     if kind not in URLS:
         known = ", ".join(f"{url}://" for url in URLS)
-        raise SourceError(f"unknown kind of port: {kind}://", hint=f"Known kinds: {known}")
+        raise SourceError("unknown kind of port", file=name, hint=f"Known kinds: {known}")
     if kind in ("socket", "rfc2217"):
         host, number = _address(name)
         if kind == "socket":
@@ -164,13 +164,15 @@ class SerialPort:
             return same[0].device
         if similar:
             raise SourceError(
-                f"{self.name} is gone; similar ports: {', '.join(each.device for each in similar)}",
+                f"disconnected; similar ports: {', '.join(each.device for each in similar)}",
+                file=self.name,
                 hint=f"Plug it into its former socket: USB {before.location}",
             )
         other = _find_info(os.path.realpath(self.name), now)
         if other is not None and other.identity is not None:
             raise SourceError(
-                f"{self.name} is another device now ({other.description or other.device})",
+                f"another device now ({other.description or other.device})",
+                file=self.name,
                 hint=f"Plug in {before.description or 'the first one'} again",
             )
         return self.name
@@ -269,20 +271,18 @@ def _explain_error(errors: list[BaseException], name: str, path: str, baud: int)
         matches = difflib.get_close_matches(os.path.basename(path), known, 3, 0.7)
         suggestion = " or ".join(known[each] for each in matches)
         hint = f"{LIST_HINT}; did you mean {suggestion}?" if suggestion else LIST_HINT
-        return SourceError(f"no such port {path}", hint=hint)
+        return SourceError("no such port", file=path, hint=hint)
     if number in (errno.EBUSY, errno.EAGAIN):
         return busy_error(name, path)
     if number in (errno.EACCES, errno.EPERM):
         return permission_error(name, path)
     if number in (errno.ENOTTY, errno.EISDIR):
-        kind = "a folder" if os.path.isdir(path) else "not a serial port"
-        return SourceError(
-            f"{name} is {kind}", hint=f"{LIST_HINT}; replay:FILE.mcap replays a session"
-        )
+        problem = "a folder, not a serial port" if os.path.isdir(path) else "not a serial port"
+        hint = f"{LIST_HINT}; replay:FILE.mcap replays a session"
+        return SourceError(problem, file=name, hint=hint)
     if number in (errno.ENXIO, errno.ENODEV, errno.EIO):
-        return SourceError(
-            f"no device behind {name}", hint=f"Check that it is plugged in. {LIST_HINT}"
-        )
+        hint = f"Check that it is plugged in. {LIST_HINT}"
+        return SourceError("no device behind this port", file=name, hint=hint)
     if number == errno.EINVAL:
         return _baud_error(name, baud)
     return _not_opened(errors, name)
@@ -291,29 +291,30 @@ def _explain_error(errors: list[BaseException], name: str, path: str, baud: int)
 def _not_opened(errors: list[BaseException], name: str, hint: str = LIST_HINT) -> SourceError:
     # Keep the first line, without the internals that pyserial appends.
     text = str(errors[0]).partition("\n")[0].partition(" [")[0].rstrip(": ")
-    return SourceError(f"{name} cannot be opened ({text or type(errors[0]).__name__})", hint=hint)
+    problem = f"cannot be opened ({text or type(errors[0]).__name__})"
+    return SourceError(problem, file=name, hint=hint)
 
 
 def _baud_error(name: str, baud: int, actual: int | None = None) -> SourceError:
-    instead = f"; it uses {actual}" if actual else ""
-    return SourceError(f"{name} does not support {baud} baud{instead}", hint="Give another --baud")
+    instead = f"; the port uses {actual}" if actual else ""
+    problem = f"{baud} baud are not supported{instead}"
+    return SourceError(problem, file=name, hint="Give another --baud")
 
 
 def _network_error(error: BaseException, name: str) -> SourceError:
-    parts = urlsplit(name)
-    address = f"{parts.hostname}:{parts.port}"
     if isinstance(error, socket.gaierror | UnicodeError):
-        return SourceError(f"unknown host {parts.hostname} of {name}", hint="Check its spelling")
-    if isinstance(error, ConnectionRefusedError):
+        problem = f"unknown host {urlsplit(name).hostname}"
+        hint = "Check its spelling"
+    elif isinstance(error, ConnectionRefusedError):
+        problem = "no server at this address"
         hint = "Check that its server is running, and the port number"
-        return SourceError(f"no server at {address}", hint=hint)
-    if isinstance(error, TimeoutError):
+    elif isinstance(error, TimeoutError):
+        problem = "no answer"
         hint = "Check that it is switched on and in this network"
-        return SourceError(f"{address} does not answer", hint=hint)
-    return SourceError(
-        f"{address} cannot be reached ({getattr(error, 'strerror', None) or error})",
-        hint="Check the network connection",
-    )
+    else:
+        problem = f"cannot be reached ({getattr(error, 'strerror', None) or error})"
+        hint = "Check the network connection"
+    return SourceError(problem, file=name, hint=hint)
 
 
 def _address(name: str) -> tuple[str, int]:
@@ -324,9 +325,8 @@ def _address(name: str) -> tuple[str, int]:
         host = number = None
     if not host or not number:
         kind = name.partition(":")[0]
-        raise SourceError(
-            f"{name} has no host and port", hint=f"Example: {kind}://192.168.1.7:4000"
-        )
+        hint = f"Example: {kind}://192.168.1.7:4000"
+        raise SourceError("no host and port", file=name, hint=hint)
     return host, number
 
 

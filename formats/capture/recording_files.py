@@ -388,7 +388,8 @@ def check_idle(path: Path) -> None:
         return
     if busy:
         raise OutputExistsError(
-            f"output {str(path)!r} is being recorded by another program",
+            "being recorded by another program",
+            file=path,
             hint="End that program, or choose another name",
         )
 

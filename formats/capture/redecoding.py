@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from locatk.core.errors import FormatError
 from locatk.formats.capture.ingestion import AUTO, SerialIntake, StampedMessage
 from locatk.formats.capture.reader_thread import ReceivedData
-from locatk.formats.devices.decoder import Options
+from locatk.formats.devices.interface import Options
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, CHANNELS_RECORD, SESSION_RECORD

@@ -56,7 +56,7 @@ class ReplayPort:
     def open(self) -> ReplayLink:
         """Open the session at its beginning; see :class:`.links.Port`."""
         if not self._file:
-            raise SourceError(f"{self.name} has no file name", hint="Example: replay:run.mcap")
+            raise SourceError("no file name", file=self.name, hint="Example: replay:run.mcap")
         try:
             session = Session.open(self._file, damaged_ok=True)
         except LocatkError as error:

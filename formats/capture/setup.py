@@ -28,7 +28,7 @@ from locatk.formats.capture.recording_files import (
 )
 from locatk.formats.capture.status import CaptureStatus, RecordingResult
 from locatk.formats.devices import find_device
-from locatk.formats.devices.decoder import Options
+from locatk.formats.devices.interface import Options
 
 CAMERA = "camera:"
 NAME, CAMERA_NAME = "robot", "camera"

@@ -13,7 +13,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from locatk.core.errors import InputError
-from locatk.formats.devices.decoder import Decoder, Options, Recording, Stream
+from locatk.formats.devices.interface import Decoder, Options, Recording, Stream
 
 ENTRY_POINT_GROUP = "locatk.devices"
 

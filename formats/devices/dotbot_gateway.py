@@ -65,7 +65,7 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import CHANNELS, POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN
-from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Counts, Options, Recording, Stream, Ticks
 
 FLAG = b"\x7e"
 ESCAPE = b"\x7d"

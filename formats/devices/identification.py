@@ -17,7 +17,7 @@ from importlib.metadata import entry_points
 import numpy as np
 
 from locatk.formats.devices import DEVICES, ENTRY_POINT_GROUP, Device
-from locatk.formats.devices.decoder import Batch, Decoder, Options
+from locatk.formats.devices.interface import Batch, Decoder, Options
 
 MAX_IDENTIFICATION_S = 3.0
 """Time after which the caller should :meth:`Identifier.settle`."""

@@ -41,7 +41,7 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import CHANNELS, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN
-from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Counts, Options, Recording, Stream, Ticks
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from locatk.formats.devices.decoder import Batch, Counts, Options
+from locatk.formats.devices.interface import Batch, Counts, Options
 
 
 class RawDecoder:

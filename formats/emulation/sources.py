@@ -12,7 +12,7 @@ from google.protobuf.message import DecodeError
 
 from locatk.core.errors import FormatError, InputError, error_context
 from locatk.formats.devices import Device, find_device
-from locatk.formats.devices.decoder import Recording
+from locatk.formats.devices.interface import Recording
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import field_samples, observations
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD

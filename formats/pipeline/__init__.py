@@ -13,8 +13,8 @@ from locatk.formats.pipeline.batch import (
     plan_outputs,
     solve_batch,
 )
-from locatk.formats.pipeline.locations import find_sessions
 from locatk.formats.pipeline.outcome import Outcome, SolveFailure, SolveReport, summarize
+from locatk.formats.pipeline.session_search import find_sessions
 from locatk.formats.pipeline.solving import SolveJob, default_output, solve_file
 from locatk.formats.pipeline.systems import (
     SYSTEMS,

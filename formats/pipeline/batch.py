@@ -14,7 +14,7 @@ from typing import Any
 
 from locatk.core.errors import InputError, LocatkError, OutputExistsError
 from locatk.formats.files import read_bytes
-from locatk.formats.pipeline import execution, locations, provenance
+from locatk.formats.pipeline import execution, file_access, file_names, provenance
 from locatk.formats.pipeline.outcome import Outcome, SolveFailure
 from locatk.formats.pipeline.solving import SolveJob, default_output, plan_job, run_job
 from locatk.formats.pipeline.systems import SolveRequest
@@ -55,7 +55,7 @@ def plan_outputs(
     """
     if output is None:
         return [default_output(session) for session in sessions]
-    is_url = locations.is_url(output)
+    is_url = file_names.is_url(output)
     is_file = output.endswith(".mcap") if is_url or is_folder else True
     if len(sessions) == 1 and is_file and (is_url or not Path(output).is_dir()):
         return [output]
@@ -63,7 +63,7 @@ def plan_outputs(
         raise OutputConflictError(f"{len(sessions)} sessions need a folder, but -o names a file")
     by_stem: dict[str, str] = {}
     for session in sessions:
-        stem = locations.stem(session)
+        stem = file_names.stem(session)
         if stem in by_stem:
             raise OutputConflictError(
                 f"{by_stem[stem]} and {session} would have the same output: leave out -o, or "
@@ -76,7 +76,7 @@ def plan_outputs(
             raise OutputExistsError(
                 "there are several outputs, but -o is a file", file=folder, hint="Name a folder"
             )
-    return [locations.within(output, f"{stem}.mcap") for stem in by_stem]
+    return [file_names.within(output, f"{stem}.mcap") for stem in by_stem]
 
 
 def check_outputs(
@@ -105,29 +105,29 @@ def check_outputs(
     OutputConflictError
         Two sessions have the same output.
     OutputExistsError, MissingDataError, InputError
-        See :func:`locatk.formats.pipeline.locations.check_writable`; also if an output is one of
+        See :func:`locatk.formats.pipeline.file_access.check_writable`; also if an output is one of
         the inputs.
     """
-    input_keys = {locations.file_key(location) for location in inputs}
-    counts = Counter(locations.file_key(location) for location in outputs)
+    input_keys = {file_names.file_key(location) for location in inputs}
+    counts = Counter(file_names.file_key(location) for location in outputs)
     if any(count > 1 for count in counts.values()):
         raise OutputConflictError("several sessions have the same output")
 
-    is_new_folder = folder is not None and not (locations.is_url(folder) or os.path.isdir(folder))
+    is_new_folder = folder is not None and not (file_names.is_url(folder) or os.path.isdir(folder))
 
     def check(output: str) -> None:
-        if locations.file_key(output) in input_keys:
+        if file_names.file_key(output) in input_keys:
             raise OutputExistsError(
                 "the output is one of the inputs", file=output, hint="Choose another -o"
             )
         if not is_new_folder:
-            locations.check_writable(output, overwrite=overwrite or resume)
+            file_access.check_writable(output, overwrite=overwrite or resume)
 
-    with ThreadPoolExecutor(locations.MAX_REQUESTS) as threads:
+    with ThreadPoolExecutor(file_access.MAX_REQUESTS) as threads:
         list(threads.map(check, outputs))
-    stored = [output for output in outputs if locations.is_url(output)]
+    stored = [output for output in outputs if file_names.is_url(output)]
     for output in {output.rpartition("/")[0]: output for output in stored}.values():
-        locations.check_bucket(output)
+        file_access.check_bucket(output)
     if folder is not None and is_new_folder:
         os.makedirs(folder, exist_ok=True)
 
@@ -198,7 +198,7 @@ def solve_batch(
             pool = execution.dask_cluster(scheduler)
         else:
             ends = (location for job in jobs for location in (job.source, job.target))
-            if any(map(locations.is_url, ends)):
+            if any(map(file_names.is_url, ends)):
                 # The folder is removed with all files that killed processes left in it.
                 scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="locatk-"))
                 jobs = [replace(job, scratch=scratch) for job in jobs]
@@ -219,7 +219,7 @@ def solve_batch(
 
 
 def _remove_partial_output(job: SolveJob) -> None:
-    locations.remove_partial_files(job.target)
+    file_access.remove_partial_files(job.target)
 
 
 def _outcome(result: Any, job: SolveJob) -> Outcome:

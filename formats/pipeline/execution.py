@@ -35,7 +35,7 @@ from typing import Any, TypeVar
 
 from locatk.core.errors import InputError, LocatkError
 from locatk.formats.output import tool_version
-from locatk.formats.pipeline.locations import short_reason
+from locatk.formats.pipeline.file_access import short_reason
 
 Job = TypeVar("Job")
 T = TypeVar("T")

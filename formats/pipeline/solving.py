@@ -17,7 +17,7 @@ from typing import Any
 from locatk.core.errors import InputError, LocatkError, OutputExistsError
 from locatk.core.solution import Solution
 from locatk.formats.artifacts import scene as scene_files
-from locatk.formats.pipeline import execution, locations, provenance
+from locatk.formats.pipeline import execution, file_access, file_names, provenance
 from locatk.formats.pipeline.outcome import (
     Outcome,
     SolveFailure,
@@ -95,8 +95,8 @@ def plan_job(
     return SolveJob(
         session,
         output,
-        locations.absolute(session),
-        locations.absolute(output),
+        file_names.absolute(session),
+        file_names.absolute(output),
         request,
         options_sha256 or provenance.options_digest(request),
         **fields,
@@ -105,7 +105,7 @@ def plan_job(
 
 def default_output(session: str) -> str:
     """Return the location of the solution in the folder of the session."""
-    return locations.sibling(session, f"{locations.stem(session)}-solved.mcap")
+    return file_names.sibling(session, f"{file_names.stem(session)}-solved.mcap")
 
 
 def solve_file(
@@ -196,17 +196,17 @@ def _run_steps(
 ) -> SolveReport:
     """Fetch, solve and write; enter the names of temporary files into ``user_names``."""
     for location in (job.session, job.output):
-        if not locations.is_utf8(location):
+        if not file_names.is_utf8(location):
             raise InputError("the file name is not UTF-8", file=location, hint="Rename the file")
     scratch = job.scratch or execution.worker_folder()
-    path = stack.enter_context(locations.local(job.source, scratch))
+    path = stack.enter_context(file_access.local(job.source, scratch))
     user_names[str(path)] = job.session
     request = _unpack_files(job, scratch, stack, user_names)
     facts = {**provenance.source_facts(path), "options_sha256": job.options_sha256}
 
     def existing_solution() -> tuple[Solution | None, bool]:
         """Return the solution at the target if it has the same origin; is it replaceable?"""
-        with locations.local(job.target, scratch) as old:
+        with file_access.local(job.target, scratch) as old:
             return (
                 provenance.same_solution(old, facts),
                 provenance.is_replaceable(old, path.name),
@@ -214,13 +214,13 @@ def _run_steps(
 
     overwrite, existing, solve_s = job.overwrite, None, None
     # Without --resume, the output exists only if an attempt wrote it whose worker was lost.
-    if locations.exists(job.target) and (job.resume or not overwrite):
+    if file_access.exists(job.target) and (job.resume or not overwrite):
         existing, is_replaceable = existing_solution()
         if existing is None:
             overwrite = overwrite or (job.resume and is_replaceable)
-            locations.check_writable(job.target, overwrite=overwrite)
-    elif not locations.is_url(job.target):  # Its folder may be gone since the batch began.
-        locations.check_writable(job.target, overwrite=overwrite)
+            file_access.check_writable(job.target, overwrite=overwrite)
+    elif not file_names.is_url(job.target):  # Its folder may be gone since the batch began.
+        file_access.check_writable(job.target, overwrite=overwrite)
     if existing is not None:
         solution = existing
     else:
@@ -228,7 +228,7 @@ def _run_steps(
         solution, solve_s = solved.solution, solved.solve_s
         facts["command"] = provenance.command_line(path.name, job.request)
         try:
-            with locations.writing(job.target, scratch, overwrite=overwrite) as target:
+            with file_access.writing(job.target, scratch, overwrite=overwrite) as target:
                 user_names[str(target)] = job.output
                 write_solution(target, solution, source=path, facts=facts, overwrite=overwrite)
         except OutputExistsError:

@@ -10,11 +10,11 @@ from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution, to_json
+from locatk.formats.descriptions import dots, landmarks, polaris
 from locatk.formats.plots.series import pose_span_ns
 from locatk.formats.plots.units import format_number, format_time
 from locatk.formats.report.panels import Panel, Table
 from locatk.formats.report.subject import Subject
-from locatk.formats.sessions import description
 
 MAX_ROWS = 60
 """Number of rows of a table of facts; the rest is counted."""
@@ -92,11 +92,11 @@ def _describe_artifact(solution: Solution) -> dict[str, Any]:
         case Scene() as scene:
             return _describe_scene(scene)
         case Manifest() as manifest:
-            return description.manifest(manifest)
+            return dots.describe_manifest(manifest)
         case Tags() as tags:
-            return description.tags(tags)
+            return polaris.describe_tags(tags)
         case FloorMap() as floor:
-            return description.floor(floor)
+            return landmarks.describe_map(floor)
     return {}
 
 

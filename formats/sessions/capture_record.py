@@ -8,8 +8,9 @@ from collections.abc import Collection
 from dataclasses import fields
 from typing import Any
 
+from locatk.core.errors import LocatkError
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
-from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, Segment
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, DamageError, Segment
 from locatk.formats.sessions.reader import Session
 
 MAX_DESCRIBED_BYTES = 16 << 20
@@ -87,3 +88,12 @@ def rate_hz(session: Session, count: int | None) -> float | None:
     duration = duration_s(session)
     # n samples span n - 1 intervals.
     return (count - 1) / duration if count and count > 1 and duration else None
+
+
+def describe_damage(session: Session, error: LocatkError) -> dict[str, Any]:
+    """Describe the damage of a session that could not be read completely.
+
+    It is recoverable if the MCAP file is damaged, of which `locatk recover` saves the rest.
+    """
+    is_file_damaged = session.damage is not None or isinstance(error.__context__, DamageError)
+    return {"damage": session.damage or error.message, "recoverable": is_file_damaged}

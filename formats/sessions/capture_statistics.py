@@ -13,7 +13,7 @@ class CaptureStatistics:
     Attributes
     ----------
     bytes, frames, bad, lost, skipped, unknown : int
-        Counts of the decoder (:class:`locatk.formats.devices.decoder.Counts`); of a camera, only
+        Counts of the decoder (:class:`locatk.formats.devices.interface.Counts`); of a camera, only
         ``bytes`` and ``frames``.
     gaps : int
         Number of times the connection was lost.

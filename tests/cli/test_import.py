@@ -13,7 +13,7 @@ from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.reader import Session
 

@@ -80,9 +80,10 @@ def _explain_landmark(corner: Point) -> list[Mark]:
     marks += [Line(a, b, 0.25) for a, b in itertools.pairwise(points[:-1])]
     marks += arrow(points[-2], points[-1], 2.0, 0.25)
     lines = (
-        "Bars are counted and read",
+        "Bars are numbered and read",
         "counter-clockwise, from bar 0",
-        "at +x; N: magnetised so, too.",
+        "at +x. N: magnetised",
+        "counter-clockwise, too.",
     )
     below_heading = corner[1] - line_height(LEGEND_POINTS) - 2
     return [*marks, *_notes(lines, (corner[0] + 34.0, below_heading))]
@@ -105,9 +106,9 @@ def _explain_window(window: str, corner: Point) -> list[Mark]:
         marks += arrow(start, end, 1.8, 0.3)
     marks.append(Circle(centres[0], 0.7, 0.3))
     lines = (
-        "A robot that has read these in their",
-        "order, from any side, knows its place",
-        "(locatk map check proves it).",
+        "A robot that reads these cells",
+        "in order, from any side, knows its",
+        "position (locatk map check proves it).",
     )
     return [*marks, *_notes(lines, (corner[0], bottom - 0.8))]
 

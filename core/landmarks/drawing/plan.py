@@ -43,8 +43,9 @@ SCALE_STEPS = (1, 1.25, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 6, 7, 7.5, 8, 9, 10)
 """Leading digits of the denominators of scales."""
 
 _KEY = (
-    "Bars point to their north poles; filled: N (counter-clockwise), hollow: S. In the middle "
-    "the code as in the map's file. Crossed: no landmark. Thick: wall. Circle: the map's origin."
+    "Bars point to their north poles. Filled bars are N (counter-clockwise), hollow bars are S. "
+    "The number in the middle is the code in the map's file. Crossed cells have no landmark, "
+    "thick lines are walls, and the circle is the origin of the map."
 )
 
 

@@ -50,7 +50,7 @@ def bill_pages(
         row = (str(pattern.number), pattern.letters, str(pattern.landmarks), codes)
         flow.add_row(row, PATTERN_COLUMNS_MM)
     flow.add_space(3.0)
-    note = "All bars are alike: a pattern is only how they are laid."
+    note = "All bars are identical. Patterns differ only in the directions of the bars."
     flow.add_paragraph(note, points=TEXT_POINTS)
     return flow.pages()
 
@@ -88,8 +88,8 @@ def installation_steps(floor: FloorMap) -> tuple[str, ...]:
         "whose four arrows are as on the plan.",
         "Strong magnets: keep them from pacemakers, cards and each other; wear eye protection.",
         "Drive over every landmark, record, and run locatk calibrate map SESSION: it finds "
-        "flipped, weak, missing and displaced bars, and writes the map as built, with which to "
-        "solve from then on.",
+        "flipped, weak, missing and displaced bars, and writes the map as built. Use that map from "
+        "then on.",
     ]
     return tuple(steps)
 

@@ -96,7 +96,6 @@ def draw_tag_cards(
     requested: Sequence[tuple[int, TagLayout]],
     paper_mm: Point,
     *,
-    landscape: bool | None = None,
     margin_mm: float = 10.0,
     mirror: bool = False,
 ) -> TagPages:
@@ -109,9 +108,7 @@ def draw_tag_cards(
     requested : sequence of (id, TagLayout)
         Tags in the order of the pages.
     paper_mm : (width, height)
-    landscape : bool, optional
-        Rotate the paper so that its width is the longer (True) or the shorter (False) side. By
-        default the paper is rotated only if that takes fewer pages.
+        The paper is rotated if that takes fewer pages.
     margin_mm : float
     mirror : bool
         Draw the tags as seen from below, for magnets that are inserted from the underside.
@@ -128,7 +125,7 @@ def draw_tag_cards(
     card = _TagCard.for_ids(tags, [tag_id for tag_id, _ in requested], mirror)
     frames = [
         PageFrame(size_mm, margin_mm, TRUE_SIZE_INSTRUCTION, (_LEGEND,), TEXT_POINTS, SPACING_EM)
-        for size_mm in _orientations(paper_mm, landscape)
+        for size_mm in (paper_mm, paper_mm[::-1])
     ]
     grids = [CardGrid.densest(_card_area(frame), card.size_mm, CARD_GAP_MM) for frame in frames]
     choices = [pair for pair in zip(grids, frames, strict=True) if pair[0].cards_per_page]
@@ -152,14 +149,6 @@ def draw_tag_cards(
         placed.append(PlacedTag(tag_id, slot.page, origin))
     pages = number_pages([UnnumberedPage(frame, tuple(page)) for page in groups])
     return TagPages(pages, tuple(placed))
-
-
-def _orientations(paper_mm: Point, landscape: bool | None) -> list[Point]:
-    width, height = paper_mm
-    sizes = [(width, height), (height, width)]
-    if landscape is None:
-        return sizes
-    return [max(sizes) if landscape else min(sizes)]
 
 
 def _card_area(frame: PageFrame) -> Box:

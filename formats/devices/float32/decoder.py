@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.polaris import mlx90393
 from locatk.formats.artifacts import tags
-from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream
 from locatk.formats.devices.float32.frame_matching import (
     GOOD_MEAN_COST,
     LOOKAHEAD_FRAMES,
@@ -49,6 +48,7 @@ from locatk.formats.devices.float32.synchronization import (
     find_run,
     majority_position,
 )
+from locatk.formats.devices.interface import Batch, Counts, Options, Recording, Stream
 
 SEARCH_STEP_BYTES, SEARCH_WINDOW_BYTES, KEPT_BYTES = 432, 3888, 864
 """The search for the start of frames is repeated after so many new bytes, in a window of at most

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.formats.devices.decoder import Batch, Counts
+from locatk.formats.devices.interface import Batch, Counts
 from locatk.formats.devices.lines.columns import ColumnLayout
 from locatk.formats.devices.lines.text import BLANK, parse_number_row, split_cells
 

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.halls import NAMES
-from locatk.formats.devices.decoder import Batch, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Stream, Ticks
 from locatk.formats.tables.quantities import TIME_NAMES, UNITS, ColumnKind, match_column
 
 Array = NDArray[np.float64]

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Counts, Options, Stream, Ticks
 from locatk.formats.devices.lines.blocks import LineBlock, LineRange, LineShape, LineTable
 from locatk.formats.devices.lines.columns import TICK_HZ, interpret_columns
 from locatk.formats.devices.lines.text import (

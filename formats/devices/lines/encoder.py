@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.formats.devices.decoder import Recording
+from locatk.formats.devices.interface import Recording
 
 FIELD_FORMAT = "%.4f"
 """Fields in microtesla, to 0.1 nT."""

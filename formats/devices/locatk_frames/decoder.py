@@ -13,7 +13,7 @@ from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.lighthouse.channels import CHANNELS
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
-from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Counts, Options, Recording, Stream, Ticks
 from locatk.formats.devices.locatk_frames import payloads
 from locatk.formats.devices.locatk_frames.framing import (
     MAX_CONTENT_BYTES,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.formats.devices.decoder import Counts
+from locatk.formats.devices.interface import Counts
 
 Bytes = NDArray[np.uint8]
 Index = NDArray[np.int64]

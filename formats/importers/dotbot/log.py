@@ -43,7 +43,7 @@ from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
-from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.tables.timestamps import parse_iso_time
 
 DEFAULT_DEVICE = "robot"

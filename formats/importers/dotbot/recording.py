@@ -29,7 +29,7 @@ from locatk.formats.importers.dotbot.floor_square import (
     read_calibration,
     read_tracks,
 )
-from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.tables.delimited import read_table
 
 GRID_FRAME = "grid"

@@ -34,6 +34,7 @@ from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts.receiver import dumps_receiver, loads_receiver
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.libsurvive.device import (
     read_receiver,
     serial_number,
@@ -41,7 +42,6 @@ from locatk.formats.importers.libsurvive.device import (
 )
 from locatk.formats.importers.libsurvive.rec_file import RecFile, read_rec_file
 from locatk.formats.importers.libsurvive.sweeps import DeviceSweeps, read_device_sweeps
-from locatk.formats.importers.lighthouse import ImportedSession
 
 FRAME = "libsurvive"
 EXTERNAL = "libsurvive-external"

@@ -31,7 +31,7 @@ from locatk.core.lighthouse.demodulation import (
 from locatk.core.lighthouse.published.light_decoding import decode_recording
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, Edges, StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.saleae.csv_export import read_csv_export
 from locatk.formats.importers.saleae.digital_lines import (
     MIN_RATE_HZ,

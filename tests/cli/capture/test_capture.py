@@ -347,7 +347,7 @@ def test_wrong_usage(
         (["--artifact", "OLD"], "the session contains no artifact"),
         (["--artifact", "UNPLUGGED"], "No such file"),
         (["-o", "THERE"], "exists"),
-        (["-o", "NOFOLDER"], "no folder"),
+        (["-o", "NOFOLDER"], "no such folder"),
         (["-o", "FOLDER", "--overwrite"], "not a regular file"),
         (["--rotate", "10min", "-o", "PARTED"], "parted-002.mcap"),
         (["--reserve", "100000TB"], "of the disk are free"),
@@ -401,8 +401,8 @@ def test_a_port_that_is_waited_for_is_no_warning(locatk: Any, tmp_path: Path) ->
     result = locatk("capture", port, *args)
     assert result.exit_code == 1
     waiting, error = result.stderr.splitlines()
-    assert waiting == f"Waiting for {port}; Ctrl-C ends it."
-    assert error.startswith("Error: no such port")
+    assert waiting == f"Waiting: {port}: no such port; Ctrl-C ends it."
+    assert error.startswith(f"Error: {port}: no such port. Hint: ")
 
 
 def test_what_is_played_is_not_overwritten(locatk: Any, old: Path) -> None:

@@ -249,7 +249,7 @@ def test_info_tells_artifacts(locatk, tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("position_mm", "place_mm"))
     result = locatk("info", path)
     assert result.exit_code == 1
-    assert f"Error: {path}:position_mm: missing key" in result.stderr
+    assert f"Error: {path}: missing key 'position_mm'" in result.stderr
 
 
 def test_info_of_a_damaged_session(locatk, tmp_path: Path) -> None:

@@ -225,15 +225,15 @@ def test_bars_may_touch() -> None:
 @pytest.mark.parametrize(
     ("text", "where", "words"),
     [
-        ("", "format", "missing key"),
+        ("", None, "missing key 'format'"),
         (MAP.replace("landmark-map", "tag") + LANDMARK, "format", "expected 'locatk-landmark-map'"),
         (MAP.replace("version = 1", "version = 2") + LANDMARK, "format_version", "newer"),
-        (MAP, "landmark", "missing"),
-        (LANDMARK, "format", "missing"),
+        (MAP, None, "missing key 'landmark'"),
+        (LANDMARK, None, "missing key 'format'"),
         (MAP.replace('"16"', "16") + LANDMARK, "map.alphabet", "expected a string"),
         (MAP.replace('"16"', '"8"') + LANDMARK, "map.alphabet", "not one of 6, 16, compass"),
         (MAP.replace('"L"', '"2x3"') + LANDMARK, "map.window", "not one of L, I2"),
-        (MAP.replace("pitch_mm = 200", "pitch = 200") + LANDMARK, "map.pitch_mm", "missing"),
+        (MAP.replace("pitch_mm = 200", "pitch = 200") + LANDMARK, "map", "missing key 'pitch_mm'"),
         (MAP.replace("200", "0") + LANDMARK, "map.pitch_mm", "above 0"),
         (MAP.replace("200", "59.9") + LANDMARK, "map.pitch_mm", "overlap, expected at least 60"),
         (MAP.replace('"0f."', '"0g."') + LANDMARK, "map.rows[0]", "'g' in column 1"),
@@ -258,12 +258,12 @@ def test_bars_may_touch() -> None:
         (MAP.replace("[[[0, 1], [0, 0]]]", "true") + LANDMARK, "map.walls", "expected a list"),
         (MAP + "detect = -1" + LANDMARK, "map.detect", "whole number from 0"),
         (MAP + "seed = 1.5" + LANDMARK, "map.seed", "whole number"),
-        (MAP + "window_ = 1" + LANDMARK, "map.window_", "unknown key"),
+        (MAP + "window_ = 1" + LANDMARK, "map", "unknown key 'window_'"),
         (MAP + LANDMARK.replace("1.2", "1200"), "landmark.remanence_t", "above 0, at most 2 in T"),
         (MAP + LANDMARK.replace("= 30", "= 41"), "landmark.radius_mm", "at least 25.5"),
         (MAP + LANDMARK.replace("= 30", "= -1"), "landmark.bar_length_mm", "above 0"),
         (MAP + LANDMARK.replace("= 3.3", "= inf"), "landmark.threshold_mt", "finite"),
-        (MAP + LANDMARK + "hight_mm = 1", "landmark.hight_mm", "unknown key"),
+        (MAP + LANDMARK + "hight_mm = 1", "landmark", "unknown key 'hight_mm'"),
         (MAP + LANDMARK + BUILT + BUILT, "built[1].cell", "twice"),
         (MAP + LANDMARK + BUILT.replace("[1, 2]", "[0, 2]"), "built[0].cell", "no landmark"),
         (
@@ -291,7 +291,7 @@ def test_bars_may_touch() -> None:
     ],
 )
 def test_errors_name_key_and_expected_value(
-    refused: Callable[..., None], text: str, where: str, words: str
+    refused: Callable[..., None], text: str, where: str | None, words: str
 ) -> None:
     refused(maps.MAP, text, where, words)
 
@@ -325,10 +325,10 @@ def test_halls_by_hand() -> None:
         (HALLS.replace("[0, 25]", "[0, 25, 0]"), "position_mm[1]", "list of 2 numbers in mm"),
         (HALLS + "noise_ut = 0", "noise_ut", "above 0"),
         (HALLS + "range_mt = -1", "range_mt", "above 0"),
-        (HALLS + "range_t = 1", "range_t", "unknown key"),
+        (HALLS + "range_t = 1", None, "unknown key 'range_t'"),
     ],
 )
 def test_errors_of_halls_name_key_and_expected_value(
-    refused: Callable[..., None], text: str, where: str, words: str
+    refused: Callable[..., None], text: str, where: str | None, words: str
 ) -> None:
     refused(maps.HALLS, text, where, words)

@@ -75,7 +75,7 @@ def test_the_example_of_the_documentation(root: Path) -> None:
     ("text", "where", "words"),
     [
         (TWO.replace("receiver", "deck"), "format", "expected 'locatk-lighthouse-receiver'"),
-        (HEAD, "position_mm", "missing"),
+        (HEAD, None, "missing key 'position_mm'"),
         (HEAD + "position_mm = []", "position_mm", "1 to 1000 rows of 3 numbers in mm"),
         (HEAD + "position_mm = 3", "position_mm", "1 to 1000 rows of 3 numbers in mm"),
         (
@@ -91,11 +91,11 @@ def test_the_example_of_the_documentation(root: Path) -> None:
         (TWO + "normal = [[0, 0, 0], [0, 1, 1]]", "normal[0]", "length 1"),
         (TWO + "normal = [[0, 1e300, 0], [0, 1, 1]]", "normal[0]", "length 1"),
         (TWO + "name = 3", "name", "a string"),
-        (TWO + "normals = 3", "normals", "unknown key"),
+        (TWO + "normals = 3", None, "unknown key 'normals'"),
     ],
 )
 def test_errors_name_key_and_expected_value(
-    refused: Callable[..., None], text: str, where: str, words: str
+    refused: Callable[..., None], text: str, where: str | None, words: str
 ) -> None:
     refused(receivers.RECEIVER, text, where, words)
 

@@ -236,11 +236,11 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
 @pytest.mark.parametrize(
     ("text", "where", "words"),
     [
-        ("", "format", "missing key"),
+        ("", None, "missing key 'format'"),
         ('format = "other"', "format", "expected 'locatk-lighthouse-scene'"),
-        ('format = "locatk-lighthouse-scene"', "format_version", "missing"),
+        ('format = "locatk-lighthouse-scene"', None, "missing key 'format_version'"),
         (HEAD.replace("1", "2"), "format_version", "newer"),
-        (HEAD + "plannar = true", "plannar", "unknown key"),
+        (HEAD + "plannar = true", None, "unknown key 'plannar'"),
         (HEAD + "planar = 1", "planar", "true or false"),
         (HEAD + 'scale = "metres"', "scale", "not one of markers"),
         (HEAD + "frame = 3", "frame", "a string, not a number"),
@@ -249,10 +249,10 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (HEAD + "floor_z_mm = nan", "floor_z_mm", "finite"),
         (HEAD + "floor_z_mm = 1e999", "floor_z_mm", "finite"),
         (HEAD + "floor_z_mm = 1e999999999999999999999", "floor_z_mm", "finite"),
-        (HEAD + STATION, "stations[0].position_units", "missing"),
+        (HEAD + STATION, "stations[0]", "missing key 'position_units'"),
         (METRIC.replace("channel = 1", "channel = 17"), "stations[0].channel", "1 to 16"),
         (METRIC.replace("channel = 1", "channel = true"), "stations[0].channel", "1 to 16"),
-        (METRIC.replace("channel = 1", "chanel = 1"), "stations[0].channel", "missing"),
+        (METRIC.replace("channel = 1", "chanel = 1"), "stations[0]", "missing key 'channel'"),
         (METRIC.replace(", 2000]", "]"), "stations[0].position_mm", "list of 3 numbers"),
         (
             METRIC.replace("2000", '"2"'),
@@ -263,14 +263,18 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (METRIC.replace("[1, 0, 0]", "[-1, 0, 0]"), "stations[0].rotation", "rotation matrix"),
         (METRIC.replace("[1, 0, 0], ", ""), "stations[0].rotation", "3 rows of 3"),
         (METRIC.replace('"none"', '"maker"'), "stations[0].calibration.source", "factory"),
-        (METRIC.replace('"none"', '"factory"'), "stations[0].calibration.first", "missing"),
+        (METRIC.replace('"none"', '"factory"'), "stations[0].calibration", "missing key 'first'"),
         (METRIC + STATION, "stations[1].channel", "twice"),
         (METRIC.replace("channel = 1", 'channel = 1\nid = "xyz"'), "stations[0].id", "hexa"),
         (CALIBRATIONS.replace("4cc60647", "0x4c"), "calibrations[0].id", "hexa"),
         (CALIBRATIONS.replace('"4cc60647"', "12"), "calibrations[0].id", "a string"),
-        (CALIBRATIONS.replace("source", "sorce"), "calibrations[0].source", "missing"),
-        (CALIBRATIONS.replace('source = "none"', 'model = "x"'), "calibrations[0].source", "miss"),
-        (HEAD + "[[calibrations]]\nchannel = 3", "calibrations[0].source", "missing"),
+        (CALIBRATIONS.replace("source", "sorce"), "calibrations[0]", "missing key 'source'"),
+        (
+            CALIBRATIONS.replace('source = "none"', 'model = "x"'),
+            "calibrations[0]",
+            "missing key 'source'",
+        ),
+        (HEAD + "[[calibrations]]\nchannel = 3", "calibrations[0]", "missing key 'source'"),
         (HEAD + MARKER + MARKER, "markers[1].name", "twice"),
         (HEAD + SIGHTING.replace("22.7", "25.7"), "markers[0].sightings[0].end", "before start"),
         (HEAD + SIGHTING.replace("963Z", "963"), "markers[0].sightings[0].start", "zone"),
@@ -301,7 +305,7 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
     ],
 )
 def test_errors_name_key_and_expected_value(
-    refused: Callable[..., None], text: str, where: str | int, words: str
+    refused: Callable[..., None], text: str, where: str | int | None, words: str
 ) -> None:
     refused(artifacts.SCENE, text, where, words)
 

@@ -169,10 +169,23 @@ def test_errors_have_the_path_unit_and_hint() -> None:
     assert (caught.value.key, caught.value.hint) == ("tags[1].height_mm", "Measure again")
     with pytest.raises(InvalidValueError, match="missing key 'height_mm'") as caught:
         table.parse({"tags": [{"hight_mm": 1}]})
-    assert caught.value.hint == "Is 'hight_mm' meant to be height_mm?"
+    assert (caught.value.key, caught.value.hint) == (
+        "tags[0]", "Is 'hight_mm' meant to be height_mm?",
+    )  # fmt: skip
     with pytest.raises(InvalidValueError, match="unknown key 'hight_mm'") as caught:
         table.parse({"tags": [{"height_mm": 1, "hight_mm": 1}]})
     assert caught.value.hint == "Did you mean height_mm?"
+
+
+def test_a_missing_array_of_tables_gets_its_heading() -> None:
+    with pytest.raises(ArtifactError) as caught:
+        sheets.MANIFEST.loads("""
+            format = "locatk-dot-sheets"
+            format_version = 1
+            codec = "libdots"
+            pitch_mm = 0.5
+        """)
+    assert caught.value.hint == "Write each one under [[sheets]]"
 
 
 @every

@@ -160,23 +160,23 @@ def test_tiles_may_share_their_rims() -> None:
 @pytest.mark.parametrize(
     ("text", "where", "words"),
     [
-        ("", "format", "missing key"),
+        ("", None, "missing key 'format'"),
         (HEAD.replace("dot-sheets", "scene") + SHEET, "format", "expected 'locatk-dot-sheets'"),
         (HEAD.replace("version = 1", "version = 2") + SHEET, "format_version", "newer"),
         (HEAD.replace("libdots", "dots") + SHEET, "codec", "not one of anoto, libdots"),
-        (HEAD.replace("codec", "kodec") + SHEET, "codec", "missing"),
+        (HEAD.replace("codec", "kodec") + SHEET, None, "missing key 'codec'"),
         (HEAD.replace("0.508", "0") + SHEET, "pitch_mm", "above 0"),
         (HEAD.replace("0.508", "-0.508") + SHEET, "pitch_mm", "above 0"),
         (HEAD.replace("0.508", "nan") + SHEET, "pitch_mm", "finite"),
-        (HEAD.replace("pitch_mm", "pitch") + SHEET, "pitch_mm", "missing"),
+        (HEAD.replace("pitch_mm", "pitch") + SHEET, None, "missing key 'pitch_mm'"),
         (HEAD + "dot_mm = 0.6" + SHEET, "dot_mm", "less than the pitch, 0.508 mm"),
         (HEAD + "offset_mm = 0.3" + SHEET, "offset_mm", "less than half the pitch, 0.254 mm"),
         (HEAD + "offset_mm = 0" + SHEET, "offset_mm", "above 0"),
         (HEAD + "dpi = 300.5" + SHEET, "dpi", "whole number"),
         (HEAD + "scale_x = 100.2" + SHEET, "scale_x", "from 0.5 to 2"),
         (HEAD + 'scale_y = "1"' + SHEET, "scale_y", "from 0.5 to 2, not a string"),
-        (HEAD + "scale = [1, 1]" + SHEET, "scale", "unknown key"),
-        (HEAD, "sheets", "missing key"),
+        (HEAD + "scale = [1, 1]" + SHEET, None, "unknown key 'scale'"),
+        (HEAD, None, "missing key 'sheets'"),
         (HEAD + "sheets = []", "sheets", "at least 1"),
         (HEAD + SHEET.replace('"a"', '" "'), "sheets[0].id", "not blank"),
         (HEAD + SHEET.replace('"a"', "1"), "sheets[0].id", "a string"),
@@ -190,10 +190,10 @@ def test_tiles_may_share_their_rims() -> None:
         (HEAD + SHEET.replace("[24, 32]", "[24, 63]"), "sheets[0].section", "from 0 to 62"),
         (HEAD + SHEET.replace("[24, 32]", "[true, 1]"), "sheets[0].section", "whole numbers"),
         (HEAD + SHEET.replace("[210,", "[0,"), "sheets[0].page_mm", "above 0"),
-        (HEAD + SHEET.replace("first_mm", "first"), "sheets[0].first_mm", "missing"),
+        (HEAD + SHEET.replace("first_mm", "first"), "sheets[0]", "missing key 'first_mm'"),
         (HEAD + SHEET + "heading_deg = 5", "sheets[0].heading_deg", "without position_mm"),
         (HEAD + SHEET + "position_mm = [1]", "sheets[0].position_mm", "list of 2"),
-        (HEAD + SHEET + "colour = 3", "sheets[0].colour", "unknown key"),
+        (HEAD + SHEET + "colour = 3", "sheets[0]", "unknown key 'colour'"),
         (
             HEAD + SHEET + OTHER.replace("[400, 3000]", "[399, 3599]"),
             "sheets[1].origin",
@@ -212,7 +212,7 @@ def test_tiles_may_share_their_rims() -> None:
     ],
 )
 def test_errors_name_key_and_expected_value(
-    refused: Callable[..., None], text: str, where: str, words: str
+    refused: Callable[..., None], text: str, where: str | None, words: str
 ) -> None:
     refused(sheets.MANIFEST, text, where, words)
 
@@ -240,16 +240,16 @@ def test_a_camera_by_hand() -> None:
         (CAMERA.replace("188", "0"), "size_px", "from 1 to 65535"),
         (CAMERA.replace("188", "188.0"), "size_px", "whole numbers"),
         (CAMERA.replace("900", "0"), "focal_px", "above 0"),
-        (CAMERA.replace("focal_px", "focal_mm"), "focal_px", "missing"),
+        (CAMERA.replace("focal_px", "focal_mm"), None, "missing key 'focal_px'"),
         (CAMERA.replace("93.5", "188"), "centre_px", "x 188 is outside"),
         (CAMERA.replace("59.5", "-1"), "centre_px", "y -1 is outside"),
         (CAMERA + "radial = -70", "radial", "less than 65.9"),
         (CAMERA + "radial = inf", "radial", "finite"),
-        (CAMERA + "k = 1", "k", "unknown key"),
+        (CAMERA + "k = 1", None, "unknown key 'k'"),
     ],
 )
 def test_errors_of_a_camera_name_key_and_expected_value(
-    refused: Callable[..., None], text: str, where: str, words: str
+    refused: Callable[..., None], text: str, where: str | None, words: str
 ) -> None:
     refused(sheets.CAMERA, text, where, words)
 

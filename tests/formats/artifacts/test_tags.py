@@ -175,7 +175,7 @@ def test_tags_by_hand() -> None:
 @pytest.mark.parametrize(
     ("text", "where", "words"),
     [
-        ("", "format", "missing key"),
+        ("", None, "missing key 'format'"),
         (TAG.replace("locatk-tag", "tag") + MAGNET, "format", "expected 'locatk-tag'"),
         (TAG.replace("version = 1", "version = 2") + MAGNET, "format_version", "newer"),
         (TAG.replace('"mosk"', '"moks"') + MAGNET, "codec", "not one of mosk, redundant"),
@@ -184,12 +184,12 @@ def test_tags_by_hand() -> None:
         (TAG.replace("magnets = 5", "magnets = 2") + MAGNET, "magnets", "from 3 to"),
         (TAG.replace("ations = 8", "ations = 1") + MAGNET, "orientations", "from 2"),
         (TAG.replace("spacing_mm = 40", "spacing_mm = 0") + MAGNET, "spacing_mm", "above 0"),
-        (TAG.replace("clearance_mm", "clearance") + MAGNET, "clearance_mm", "missing"),
-        (TAG, "magnet", "missing"),
+        (TAG.replace("clearance_mm", "clearance") + MAGNET, None, "missing key 'clearance_mm'"),
+        (TAG, None, "missing key 'magnet'"),
         (TAG + MAGNET.replace("= 2", "= 41"), "magnet.diameter_mm", "no more than spacing_mm"),
         (TAG + MAGNET.replace("1.45", "14500"), "magnet.remanence_t", "above 0, at most 2 in T"),
         (TAG + MAGNET.replace("1.45", "nan"), "magnet.remanence_t", "finite"),
-        (TAG + MAGNET + "hight_mm = 1", "magnet.hight_mm", "unknown key"),
+        (TAG + MAGNET + "hight_mm = 1", "magnet", "unknown key 'hight_mm'"),
         (TAG + MAGNET + FAMILY.replace("[3, 7]", "[]"), "family.ids", "one or more whole numbers"),
         (TAG + MAGNET + FAMILY.replace("3,", "3.0,"), "family.ids[0]", "a whole number"),
         (TAG + MAGNET + FAMILY.replace("3,", "true,"), "family.ids[0]", "a whole number"),
@@ -210,7 +210,7 @@ def test_tags_by_hand() -> None:
         ),
         (TAG + MAGNET + BUILT.replace("4.3", '"4"'), "built[0].angle_deg[0]", "not a string"),
         (TAG + MAGNET + SITE.replace("90", "inf"), "site[0].heading_deg", "finite"),
-        (TAG + MAGNET + SITE.replace("x_mm", "x"), "site[0].x_mm", "missing"),
+        (TAG + MAGNET + SITE.replace("x_mm", "x"), "site[0]", "missing key 'x_mm'"),
         (TAG + MAGNET + SITE + SITE, "site[1].id", "twice"),
         (TAG.replace("mosk", "polaris-released").replace("= 8", "= 16") + MAGNET, None, "released"),
     ],
@@ -265,10 +265,10 @@ def test_an_array_by_hand() -> None:
         (ARRAY_TEXT + "range_ut = [1, 1, -1]", "range_ut[2]", "above 0 in uT"),
         (ARRAY_TEXT + "quantum_ut = [1, 1, -1]", "quantum_ut[2]", "of at least 0"),
         (ARRAY_TEXT + "delay_ms = [0, 5, nan]", "delay_ms[2]", "finite"),
-        (ARRAY_TEXT + "noise_nt = [1, 1, 1]", "noise_nt", "unknown key"),
+        (ARRAY_TEXT + "noise_nt = [1, 1, 1]", None, "unknown key 'noise_nt'"),
     ],
 )
 def test_errors_of_an_array_name_key_and_expected_value(
-    refused: Callable[..., None], text: str, where: str, words: str
+    refused: Callable[..., None], text: str, where: str | None, words: str
 ) -> None:
     refused(ARRAY, text, where, words)

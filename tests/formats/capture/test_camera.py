@@ -160,14 +160,14 @@ def refused(place: str) -> SourceError:
 
 def test_a_camera_that_is_not_there() -> None:
     error = refused("73")
-    assert str(error) == "no camera 73"
+    assert str(error) == "camera:73: no such camera"
     assert error.hint
-    assert "no camera /dev/video73" in str(refused("/dev/video73"))
+    assert "camera:/dev/video73: no such camera" in str(refused("/dev/video73"))
 
 
 def test_an_address_where_nobody_is() -> None:
     error = refused("rtsp://127.0.0.1:1/stream")
-    assert str(error) == "no video from rtsp://127.0.0.1:1/stream"
+    assert str(error) == "rtsp://127.0.0.1:1/stream: no video was received"
 
 
 def test_files_that_are_no_videos(tmp_path: Path) -> None:
@@ -206,9 +206,9 @@ for place in sys.argv[1:]:
 def test_a_device_without_rights_or_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     master, slave = os.openpty()
     name = os.ttyname(slave)
-    assert f"camera:{name} is in use by" in str(refused(name))
+    assert f"camera:{name}: in use by" in str(refused(name))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert f"no permission to open camera:{name}" in str(refused(name))
+    assert f"camera:{name}: no permission to open it" in str(refused(name))
     os.close(master)
     os.close(slave)
 
@@ -315,7 +315,7 @@ def test_a_camera_is_unplugged(driver: Callable[[list[bool]], Capture]) -> None:
 
 def test_a_camera_that_gives_nothing(driver: Callable[[list[bool]], Capture]) -> None:
     capture = driver([])
-    assert str(refused("0")) == "camera:0 provides no frame"
+    assert str(refused("0")) == "camera:0: no frame was received"
     assert capture.released
 
 

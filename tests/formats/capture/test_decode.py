@@ -18,7 +18,7 @@ from locatk.formats.capture.reader_thread import ReceivedData
 from locatk.formats.capture.recording_files import LOG_NAME, FileContent, RecordingFiles
 from locatk.formats.capture.redecoding import decode, losses
 from locatk.formats.devices import find_device
-from locatk.formats.devices.decoder import Options, Recording
+from locatk.formats.devices.interface import Options, Recording
 from locatk.formats.schemas.serial_pb2 import Readings, SerialChunk
 from locatk.formats.sessions import messages
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD

@@ -66,7 +66,7 @@ def test_this_program(path: str, tmp_path: Path) -> None:
 @linux
 def test_another_program(path: str, another: int) -> None:
     assert find_port_users([path]) == {path: (PortUser(another, "sleep"),)}
-    assert str(busy_error("robot", path)) == f"robot is in use by sleep (pid {another})"
+    assert str(busy_error("robot", path)) == f"robot: in use by sleep (pid {another})"
 
 
 @linux
@@ -92,7 +92,7 @@ def test_locks_are_told_of_all_users(
 def test_where_nobody_can_be_seen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(holding, "PROC_DIR", tmp_path / "none")
     error = busy_error("/dev/ttyACM0", "/dev/ttyACM0")
-    assert str(error) == "/dev/ttyACM0 is in use by another program"
+    assert str(error) == "/dev/ttyACM0: in use by another program"
     assert error.hint is not None
     assert "ModemManager" in error.hint
     assert "lsof /dev/ttyACM0" in error.hint
@@ -105,7 +105,7 @@ def seen(monkeypatch: pytest.MonkeyPatch, *found: PortUser) -> None:
 def test_the_hint_knows_the_modem_manager(monkeypatch: pytest.MonkeyPatch) -> None:
     seen(monkeypatch, PortUser(9, "ModemManager"))
     error = busy_error("robot", "/dev/ttyACM0")
-    assert str(error) == "robot is in use by ModemManager (pid 9)"
+    assert str(error) == "robot: in use by ModemManager (pid 9)"
     assert "systemctl disable --now ModemManager" in str(error.hint)
 
 
@@ -124,7 +124,7 @@ def test_the_group_of_the_device_is_named(monkeypatch: pytest.MonkeyPatch) -> No
     node(monkeypatch, 0o660, 987)
     monkeypatch.setattr(grp, "getgrgid", lambda gid: SimpleNamespace(gr_name="uucp", gr_mem=[]))
     error = permission_error("robot", "/dev/ttyACM0")
-    assert str(error) == "no permission to open robot"
+    assert str(error) == "robot: no permission to open it"
     assert "sudo usermod -aG uucp $USER" in str(error.hint)
     assert "log in again" in str(error.hint)
 

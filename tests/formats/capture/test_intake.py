@@ -17,7 +17,7 @@ from locatk.formats import devices as wire
 from locatk.formats.capture import ingestion
 from locatk.formats.capture.ingestion import PAUSE_NS, CameraIntake, SerialIntake, StampedMessage
 from locatk.formats.capture.reader_thread import ReceivedData
-from locatk.formats.devices.decoder import Batch, Counts, Options, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Counts, Options, Stream, Ticks
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
 

@@ -151,7 +151,7 @@ def test_unplugged(terminal: Terminal, opened: Opened) -> None:
     link = opened(terminal.path)
     terminal.unplug()
     assert "unplugged" in lost(link)
-    assert str(refused(terminal.path)) == f"no such port {terminal.path}"
+    assert str(refused(terminal.path)) == f"{terminal.path}: no such port"
 
 
 def test_a_link_is_followed_again(
@@ -179,7 +179,7 @@ def test_a_link_is_followed_again(
 def test_one_port_has_one_owner(terminal: Terminal, opened: Opened) -> None:
     link = opened(terminal.path)
     error = refused(terminal.path)
-    assert str(error) == f"{terminal.path} is in use by this program itself"
+    assert str(error) == f"{terminal.path}: in use by this program itself"
     assert error.hint is not None
     link.close()
     opened(terminal.path)
@@ -196,7 +196,7 @@ def test_who_holds_it_is_named(terminal: Terminal) -> None:
         child.stdout.readline()
         error = refused(terminal.path)
         child.kill()
-    assert str(error).startswith(f"{terminal.path} is in use by python")
+    assert str(error).startswith(f"{terminal.path}: in use by python")
     assert f"(pid {child.pid})" in str(error)
 
 
@@ -228,7 +228,7 @@ def test_a_holder_that_takes_no_lock(terminal: Terminal) -> None:
     os.chmod(terminal.path, 0o666)
     number = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
     fcntl.ioctl(number, termios.TIOCEXCL)
-    assert f"{terminal.path} is in use by" in as_another(terminal.path)
+    assert f"{terminal.path}: in use by" in as_another(terminal.path)
     fcntl.ioctl(number, termios.TIOCNXCL)
     assert as_another(terminal.path) == "opened"
     os.close(number)
@@ -243,7 +243,7 @@ def test_closed_to_programs_that_take_no_lock(
     link = opened(terminal.path)
     # The lock alone would say so too; without it there is still TIOCEXCL.
     monkeypatch.setattr("fcntl.flock", lambda *_: None)
-    assert "is in use by" in as_another(terminal.path)
+    assert ": in use by" in as_another(terminal.path)
     link.close()
     assert as_another(terminal.path) == "opened"
 
@@ -267,24 +267,24 @@ def test_no_permission(terminal: Terminal) -> None:
         os.chmod(terminal.path, 0)
         advice = f"sudo chmod a+rw {terminal.path}"
     told = as_another(terminal.path)
-    assert told.startswith(f"no permission to open {terminal.path}; ")
+    assert told.startswith(f"{terminal.path}: no permission to open it; ")
     assert advice in told
 
 
-@pytest.mark.parametrize("kind", ["a folder", "not a serial port"])
+@pytest.mark.parametrize("kind", ["a folder, not a serial port", "not a serial port"])
 def test_not_a_port(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "run.mcap"
-    if kind == "a folder":
+    if kind.startswith("a folder"):
         path.mkdir()
     else:
         path.write_bytes(b"")
     error = refused(str(path))
-    assert str(error) == f"{path} is {kind}"
+    assert str(error) == f"{path}: {kind}"
     assert "replay:" in str(error.hint)
 
 
 def test_a_device_that_is_no_terminal() -> None:
-    assert str(refused("/dev/null")) == "/dev/null is not a serial port"
+    assert str(refused("/dev/null")) == "/dev/null: not a serial port"
 
 
 @pytest.fixture
@@ -299,7 +299,7 @@ def plugged(monkeypatch: pytest.MonkeyPatch) -> list[PortInfo]:
 def test_no_such_port_names_the_nearest(plugged: list[PortInfo], name: str) -> None:
     plugged += [PortInfo("/dev/ttyACM1"), PortInfo("/dev/ttyS0"), PortInfo("/dev/rfcomm0")]
     error = refused(name)
-    assert str(error) == f"no such port {name}"
+    assert str(error) == f"{name}: no such port"
     assert error.hint == "See `locatk capture --list`; did you mean /dev/ttyACM1?"
 
 
@@ -310,7 +310,7 @@ def test_no_such_port_at_all(plugged: list[PortInfo]) -> None:
 def test_the_driver_sets_another_speed(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_actual_baud", lambda number: 9600)
     error = refused(terminal.path)
-    assert str(error) == f"{terminal.path} does not support 115200 baud; it uses 9600"
+    assert str(error) == f"{terminal.path}: 115200 baud are not supported; the port uses 9600"
     assert "--baud" in str(error.hint)
     monkeypatch.setattr(ports, "_actual_baud", lambda number: 117_000)
     port_of(terminal.path, baud=BAUD).open().close()
@@ -326,7 +326,7 @@ def test_the_speed_is_as_set(terminal: Terminal) -> None:
 
 @pytest.mark.parametrize("baud", [2**31, 2**40])
 def test_a_speed_that_no_driver_takes(terminal: Terminal, baud: int) -> None:
-    assert f"does not support {baud} baud" in str(refused(terminal.path, baud=baud))
+    assert f"{baud} baud are not supported" in str(refused(terminal.path, baud=baud))
 
 
 @pytest.mark.parametrize(
@@ -334,14 +334,14 @@ def test_a_speed_that_no_driver_takes(terminal: Terminal, baud: int) -> None:
     [
         (OSError(errno.EIO, "I/O error"), "no device behind"),
         (OSError(errno.ENXIO, "none"), "no device behind"),
-        (OSError(errno.EBUSY, "busy"), "is in use by"),
-        (OSError(errno.EINVAL, "invalid"), "does not support 115200 baud"),
+        (OSError(errno.EBUSY, "busy"), ": in use by"),
+        (OSError(errno.EINVAL, "invalid"), "115200 baud are not supported"),
         (OSError(errno.ENOMEM, "no memory"), "cannot be opened ("),
         (PermissionError(errno.EACCES, "no"), "no permission"),
         (RuntimeError(), "cannot be opened (RuntimeError)"),
         # As serialwin32 says it.
         (serial.SerialException("could not open port: FileNotFoundError(2, 'x')"), "no such port"),
-        (serial.SerialException("could not open port: PermissionError(13, 'x')"), "is in use by"),
+        (serial.SerialException("could not open port: PermissionError(13, 'x')"), ": in use by"),
     ],
 )
 def test_what_a_driver_says(
@@ -362,7 +362,7 @@ def test_an_error_of_before_is_not_blamed() -> None:
         raise OSError(errno.EIO, "I/O error")
     except OSError:
         error = refused("hwgrep://no such port here")
-    assert str(error).startswith("hwgrep://no such port here cannot be opened (no ports found")
+    assert str(error).startswith("hwgrep://no such port here: cannot be opened (no ports found")
 
 
 # The same USB device under another name
@@ -392,7 +392,7 @@ def test_it_comes_back_under_another_name(
     terminal.unplug()
     lost(link)
     plugged.clear()
-    assert str(refused(port)) == f"no such port {terminal.path}"
+    assert str(refused(port)) == f"{terminal.path}: no such port"
     plugged += [device("/dev/none", serial_number="96"), device(another.path, location="1-4")]
     link = opened(port)
     another.send(b"here")
@@ -421,7 +421,7 @@ def test_another_device_is_not_taken_for_it(
     opened(port).close()
     plugged[:] = [device(terminal.path, pid=0x8036, description="Leonardo bootloader")]
     error = refused(port)
-    assert str(error) == f"{terminal.path} is another device now (Leonardo bootloader)"
+    assert str(error) == f"{terminal.path}: another device now (Leonardo bootloader)"
     assert error.hint == "Plug in Uno again"
     plugged[:] = [device(terminal.path)]
     opened(port)
@@ -472,7 +472,7 @@ def test_twins_are_told_apart_by_their_sockets(
     # It is unplugged: its twin is not it.
     plugged[:] = [twin]
     error = refused(port)
-    assert str(error) == f"{terminal.path} is gone; similar ports: /dev/none"
+    assert str(error) == f"{terminal.path}: disconnected; similar ports: /dev/none"
     assert error.hint == "Plug it into its former socket: USB 1-2"
     # It comes back, and the two have changed their names.
     plugged[:] = [adapter(terminal.path, "1-3"), adapter(another.path, "1-2")]
@@ -518,7 +518,7 @@ def test_a_socket(opened: Opened) -> None:
         link.close()
     assert port.describe() == {"port": port.name, "resolved": f"127.0.0.1:{number}"}
     thread.join()
-    assert str(refused(port)) == f"no server at 127.0.0.1:{number}"
+    assert str(refused(port)) == f"{port.name}: no server at this address"
 
 
 def wait_after(connection: socket.socket, data: bytes, over: threading.Event) -> None:
@@ -560,12 +560,14 @@ def test_hosts_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert "unknown host " in str(refused(f"socket://{'x' * 70}:1"))
     fails(socket.gaierror(-2, "Name or service not known"))
-    assert str(refused("socket://robt:1")) == "unknown host robt of socket://robt:1"
-    assert str(refused("rfc2217://robt:1")) == "unknown host robt of rfc2217://robt:1"
+    assert str(refused("socket://robt:1")) == "socket://robt:1: unknown host robt"
+    assert str(refused("rfc2217://robt:1")) == "rfc2217://robt:1: unknown host robt"
     fails(TimeoutError("timed out"))
-    assert str(refused("socket://robot:1")) == "robot:1 does not answer"
+    assert str(refused("socket://robot:1")) == "socket://robot:1: no answer"
     fails(OSError(errno.ENETUNREACH, "Network is unreachable"))
-    assert "robot:1 cannot be reached (Network is unreachable)" in str(refused("socket://robot:1"))
+    assert "socket://robot:1: cannot be reached (Network is unreachable)" in str(
+        refused("socket://robot:1")
+    )
 
 
 class Remote:
@@ -607,7 +609,7 @@ def test_a_remote_port(opened: Opened) -> None:
         assert lost(link) == "closed by the other side"
         link.close()
     thread.join()
-    assert str(refused(port)) == f"no server at 127.0.0.1:{number}"
+    assert str(refused(port)) == f"{port.name}: no server at this address"
     assert port.describe() == {"port": port.name, "resolved": port.name, "baud": "57600"}
 
 

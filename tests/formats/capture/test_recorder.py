@@ -761,7 +761,7 @@ def test_a_part_that_is_there(port: Any, start: Any, tmp_path: Path, number: int
 
 
 def test_no_folder(port: Any, start: Any, tmp_path: Path) -> None:
-    refused(start, LocatkError, "no folder", output=tmp_path / "no" / "run.mcap")
+    refused(start, LocatkError, "no such folder", output=tmp_path / "no" / "run.mcap")
     assert port.asked == 0
 
 

@@ -164,7 +164,7 @@ def test_no_session(tmp_path: Path, content: bytes | None) -> None:
 
 @pytest.mark.parametrize("name", ["replay:", "replay://"])
 def test_no_file(name: str) -> None:
-    with pytest.raises(SourceError, match="has no file name"):
+    with pytest.raises(SourceError, match="no file name"):
         port_of(name, baud=9600).open()
 
 

@@ -16,7 +16,7 @@ from locatk.core.polaris.array import SensorArray, bar
 from locatk.formats.artifacts import tags
 from locatk.formats.capture.clocks import ArrivalTimes
 from locatk.formats.capture.ingestion import MessageEncoder, StampedMessage
-from locatk.formats.devices.decoder import KINDS, Batch, Stream, Ticks
+from locatk.formats.devices.interface import KINDS, Batch, Stream, Ticks
 from locatk.formats.sessions import field_samples, messages, observations
 from locatk.formats.sessions import trajectories as tracks
 from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, Layout

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.formats.devices.decoder import Batch, Options, Recording
 from locatk.formats.devices.dotbot_gateway import (
     MAX_WINDOWS,
     OLD_READINGS,
@@ -29,6 +28,7 @@ from locatk.formats.devices.dotbot_gateway import (
     encode_hdlc,
     robot_address,
 )
+from locatk.formats.devices.interface import Batch, Options, Recording
 from locatk.formats.importers.dotbot.recording import read_dotbot
 
 ROBOT = 0x5037BA3E25BBDA90

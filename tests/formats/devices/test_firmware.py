@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.formats.devices.decoder import Options, Stream, Ticks
+from locatk.formats.devices.interface import Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames import payloads
 from locatk.formats.devices.locatk_frames.decoder import FrameDecoder
 from locatk.formats.devices.locatk_frames.framing import checksum

@@ -17,7 +17,6 @@ from locatk.core.polaris import mlx90393
 from locatk.core.polaris.array import Samples
 from locatk.formats.artifacts.tags import loads_array
 from locatk.formats.devices import find_device
-from locatk.formats.devices.decoder import Batch, Decoder, Options, Recording, Stream
 from locatk.formats.devices.float32.decoder import (
     MagxDecoder,
     PolarisDecoder,
@@ -25,6 +24,7 @@ from locatk.formats.devices.float32.decoder import (
     encode_polaris,
     polaris_artifacts,
 )
+from locatk.formats.devices.interface import Batch, Decoder, Options, Recording, Stream
 from locatk.formats.importers.polaris_csv import read_polaris
 
 COUNT_UT = np.array([0.150, 0.150, 0.242])

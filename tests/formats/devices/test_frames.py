@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.formats.devices import find_device
-from locatk.formats.devices.decoder import Batch, Options, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames import payloads
 from locatk.formats.devices.locatk_frames.decoder import PIECE_BYTES, FrameDecoder
 from locatk.formats.devices.locatk_frames.framing import MAX_WIRE_BYTES

@@ -14,7 +14,7 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats.devices import find_device
-from locatk.formats.devices.decoder import Options, Recording
+from locatk.formats.devices.interface import Options, Recording
 from locatk.formats.devices.locatk_frames.decoder import FrameDecoder
 
 START_NS = 1_700_000_000_123_456_789

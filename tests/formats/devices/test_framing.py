@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.formats.devices.decoder import Counts
+from locatk.formats.devices.interface import Counts
 from locatk.formats.devices.locatk_frames import framing
 from locatk.formats.devices.locatk_frames.framing import (
     MAX_CONTENT_BYTES,

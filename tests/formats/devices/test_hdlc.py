@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.formats.devices.decoder import Counts
 from locatk.formats.devices.dotbot_gateway import (
     ESCAPE,
     FLAG,
@@ -17,6 +16,7 @@ from locatk.formats.devices.dotbot_gateway import (
     decode_hdlc,
     encode_hdlc,
 )
+from locatk.formats.devices.interface import Counts
 
 VECTORS = [
     (b"test", b"~test\x88\x07~"),

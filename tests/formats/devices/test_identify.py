@@ -17,12 +17,12 @@ from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats.devices import DEVICES, Device
 from locatk.formats.devices import identification as identify
-from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream
 from locatk.formats.devices.identification import (
     MAX_BYTES,
     Identifier,
     Verdict,
 )
+from locatk.formats.devices.interface import Batch, Counts, Options, Recording, Stream
 
 START_NS = 1_760_000_000_000_000_000
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.formats.devices.decoder import Batch, Options, Recording
+from locatk.formats.devices.interface import Batch, Options, Recording
 from locatk.formats.devices.lighthouse_deck import (
     FRAME_BYTES,
     MAX_COUNT_DIFFERENCE,

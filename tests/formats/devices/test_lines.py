@@ -19,7 +19,7 @@ from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats.devices import find_device
-from locatk.formats.devices.decoder import Batch, Counts, Options, Recording, Stream, Ticks
+from locatk.formats.devices.interface import Batch, Counts, Options, Recording, Stream, Ticks
 from locatk.formats.devices.lines import decoder as lines
 from locatk.formats.devices.lines.columns import interpret_columns
 from locatk.formats.devices.lines.decoder import MAX_LINE_BYTES, LineDecoder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from locatk.formats.devices import find_device
-from locatk.formats.devices.decoder import Counts, Options
+from locatk.formats.devices.interface import Counts, Options
 
 
 def test_bytes_are_counted_and_nothing_else() -> None:

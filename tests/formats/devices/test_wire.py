@@ -10,7 +10,7 @@ from locatk.core.errors import InputError
 from locatk.formats import devices as wire
 from locatk.formats.capture.ingestion import SerialIntake
 from locatk.formats.capture.reader_thread import ReceivedData
-from locatk.formats.devices.decoder import Options, Recording
+from locatk.formats.devices.interface import Options, Recording
 from locatk.formats.devices.lines.decoder import LineDecoder
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
 

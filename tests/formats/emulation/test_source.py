@@ -16,7 +16,7 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats import devices as wire
-from locatk.formats.devices.decoder import Recording
+from locatk.formats.devices.interface import Recording
 from locatk.formats.emulation.sources import SYSTEMS, select_source, write_simulated_session
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import field_samples, observations

@@ -252,7 +252,7 @@ WRONG = [
     ("[0, 0, 1]]", "[0, 0, 1.0e+300]]", "geos.11.rotation", "rotation"),
     ("[0, 0, 1]]", "[0, 0]]", "geos.11.rotation[2]", "3"),
     ("tilt: -0.047882", "tilt: 47.9", "calibs.3.sweeps[0].tilt", "from -10 to 10"),
-    ("      tilt: -0.047882\n", "", "calibs.3.sweeps[0].tilt", "missing"),
+    ("      tilt: -0.047882\n", "", "calibs.3.sweeps[0]", "missing key 'tilt'"),
     ("uid: 282585023", "uid: 4294967296", "calibs.3.uid", "whole number"),
     ("uid: 282585023", "uid: 1.5", "calibs.3.uid", "whole number"),
     ("    - curve: 0.348877", "      curve: 0.348877", 0, "occurs twice"),

@@ -19,7 +19,7 @@ from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot.recording import read_dotbot
-from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.importers.imported_session import ImportedSession
 
 CORNERS = ("tl", "tr", "br", "bl")
 

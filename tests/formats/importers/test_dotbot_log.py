@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from locatk.core.errors import FormatError, LocatkError, MissingDataError
 from locatk.core.lighthouse import lfsr
 from locatk.formats.importers.dotbot.log import read_dotbot_log
-from locatk.formats.importers.lighthouse import ImportedSession
+from locatk.formats.importers.imported_session import ImportedSession
 
 SOURCE = "f5242ee32b1d3456"
 HEAD = (
@@ -117,8 +117,8 @@ def test_windows_are_read_as_those_of_gateway_frames(read) -> None:
 
 def test_the_gateway_and_its_log_tell_the_same_counts(read) -> None:
     """The same windows through the reader of gateway frames: one convention."""
-    from locatk.formats.devices.decoder import Options
     from locatk.formats.devices.dotbot_gateway import GatewayDecoder, encode_hdlc
+    from locatk.formats.devices.interface import Options
 
     rng = np.random.default_rng(1)
     raw = [(int(p), int(o), int(b)) for p, o, b in zip(

@@ -43,14 +43,15 @@ from locatk.core.lighthouse.recording import Edges, StationReport
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.formats.artifacts import receiver as receivers
 from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.descriptions.lighthouse import describe_recording
 from locatk.formats.exporters.crazyflie import dumps_config
 from locatk.formats.importers.crazyflie import read_config
 from locatk.formats.importers.dotbot.log import read_dotbot_log
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
-from locatk.formats.importers.lighthouse import ImportedSession
 from locatk.formats.importers.saleae.recording import read_capture, read_saleae
-from locatk.formats.sessions import lighthouse_description, observations
+from locatk.formats.sessions import observations
 from locatk.formats.sessions import station_reports as heard
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
@@ -413,7 +414,7 @@ def records(rng: np.random.Generator, folder: Path, further: bool) -> None:
     if further:
         path.write_bytes(damaged(path.read_bytes(), entries, rng))
     session = Session.open(path, damaged_ok=True)
-    info_lighthouse.station_table(lighthouse_description.recording(session)["stations"])
+    info_lighthouse.station_table(describe_recording(session)["stations"])
     observations.read_station_reports(session)
     observations.read_receivers(session)
 

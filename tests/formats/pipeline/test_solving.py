@@ -187,7 +187,7 @@ def test_the_folder_of_outputs_is_created_after_the_checks(tmp_path: Path) -> No
     options = {"overwrite": False, "resume": False}
     with pytest.raises(OutputConflictError):
         check_outputs([outputs[0]] * 2, [], **options, folder=str(folder))
-    with pytest.raises(MissingDataError, match="no folder"):
+    with pytest.raises(MissingDataError, match="no such folder"):
         check_outputs(outputs, [], **options)
     assert list(tmp_path.iterdir()) == []
     check_outputs(outputs, [], **options, folder=str(folder))

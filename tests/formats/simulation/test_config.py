@@ -112,8 +112,8 @@ def test_keys_fields_and_options_are_unique(config: SimulationConfig) -> None:
 @pytest.mark.parametrize(
     ("body", "where", "expected"),
     [
-        ("[robot]\nspeed_mms = 1", "robot.speed_mms", "unknown key 'speed_mms'"),
-        ("[robots]\nspeed_mps = 1", "robots", "unknown key 'robots'"),
+        ("[robot]\nspeed_mms = 1", "robot", "unknown key 'speed_mms'"),
+        ("[robots]\nspeed_mps = 1", "None", "unknown key 'robots'"),
         ("[robot]\nspeed_mps = 0", "robot.speed_mps", "a number above 0"),
         ("[robot]\nspeed_mps = true", "robot.speed_mps", "a number above 0"),
         ('[robot]\nspeed_mps = "fast"', "robot.speed_mps", "a number above 0"),
@@ -129,8 +129,8 @@ def test_keys_fields_and_options_are_unique(config: SimulationConfig) -> None:
         ("[robot]\ncells = [1, 2]", "robot.cells[0]", "a list of 2"),
         ("[robot]\ncells = 1", "robot.cells", "a list"),
         (f"{FLIPPED} = [[1, 2]]", "flipped_bars[0]", "keys cell, bar"),
-        (f"{FLIPPED} = [{{ cell = [1, 2], bars = 1 }}]", "flipped_bars[0].bars", "unknown key"),
-        (f"{FLIPPED} = [{{ cell = [1, 2] }}]", "flipped_bars[0].bar", "missing key 'bar'"),
+        (f"{FLIPPED} = [{{ cell = [1, 2], bars = 1 }}]", "flipped_bars[0]", "unknown key 'bars'"),
+        (f"{FLIPPED} = [{{ cell = [1, 2] }}]", "flipped_bars[0]", "missing key 'bar'"),
         (f"{FLIPPED} = [{{ cell = [1, 2], bar = -1 }}]", "flipped_bars[0].bar", "of at least 0"),
         ("robot = 3", "robot", "expected a table"),
     ],

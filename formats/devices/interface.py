@@ -1,4 +1,4 @@
-"""Contract of a device: bytes to records (decoder), and recordings to bytes (encoder).
+"""Interface of devices: bytes to records (decoder), and recordings to bytes (encoder).
 
 A decoder takes a byte stream in pieces of any size and returns records in batches. The
 records do not depend on how the stream is cut. A decoder has no clock: each record states

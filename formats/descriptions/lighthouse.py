@@ -13,7 +13,7 @@ from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import StationReport
 from locatk.core.lighthouse.scene import Scene
-from locatk.formats.sessions import capture_record, description, observations
+from locatk.formats.sessions import capture_record, observations
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import SOLUTION_FILE
 from locatk.formats.sessions.station_reports import describe_unknown_stations
@@ -23,7 +23,7 @@ T = TypeVar("T")
 CHANNELS = range(1, 17)
 
 
-def recording(session: Session) -> dict[str, Any]:
+def describe_recording(session: Session) -> dict[str, Any]:
     """Describe sweeps, stations and receivers of a session or a solution.
 
     Damaged parts are left out and reported under ``damage``.
@@ -35,7 +35,7 @@ def recording(session: Session) -> dict[str, Any]:
             return read(session)
         except LocatkError as error:
             if not damage:  # The first problem is reported.
-                damage.update(description.damage(session, error))
+                damage.update(capture_record.describe_damage(session, error))
             return None
 
     known = read_or_none(observations.read_scene) or Scene()
@@ -45,9 +45,9 @@ def recording(session: Session) -> dict[str, Any]:
     counts, sweeps = read_or_none(_sweeps) or (None, {})
     return {
         **sweeps,
-        "receivers": [receiver(layout, device) for device, layout in receivers.items()],
+        "receivers": [describe_receiver(layout, device) for device, layout in receivers.items()],
         **damage,
-        **scene(known, counts, reports, detections),
+        **describe_scene(known, counts, reports, detections),
     }
 
 
@@ -82,7 +82,7 @@ def _detections(session: Session) -> list[dict[str, Any]]:
         return []
 
 
-def scene(
+def describe_scene(
     known: Scene,
     counts: Mapping[int, int] | None = None,
     reports: Iterable[StationReport] = (),
@@ -109,7 +109,7 @@ def scene(
     stations = []
     for channel in sorted(channels):
         in_scene = known.station(channel)
-        entry = station(reported.get(channel), channel)
+        entry = describe_station(reported.get(channel), channel)
         calibration = known.calibrations.get(channel) if in_scene is None else in_scene.calibration
         if calibration is not None:
             entry["calibration"] = calibration.source
@@ -135,7 +135,7 @@ def scene(
     }
 
 
-def station(report: StationReport | None, channel: int) -> dict[str, Any]:
+def describe_station(report: StationReport | None, channel: int) -> dict[str, Any]:
     """Describe a station as a recording reports it; a period that is unknown is the nominal one."""
     nominal = int(period_ticks(channel))
     period = None if report is None else report.period_ticks
@@ -159,7 +159,7 @@ def station(report: StationReport | None, channel: int) -> dict[str, Any]:
     return entry
 
 
-def receiver(layout: Receiver, device: str | None = None) -> dict[str, Any]:
+def describe_receiver(layout: Receiver, device: str | None = None) -> dict[str, Any]:
     """Describe the photodiodes of a device; ``size_mm`` is their extent in x, y, z."""
     position = 1e3 * layout.position_m
     return {

@@ -1,0 +1,1 @@
+"""Descriptions of recordings and artifacts as plain values, for JSON and for reports."""
