@@ -107,7 +107,7 @@ SYSTEMS = ("lighthouse", "dots", "polaris", "landmarks")
         "map design --landmark",
         "map check map.toml double.toml",
         "map import map.csv -o imported.toml --overwrite",
-        "simulate landmarks map.toml --landmarks 14 -o new.mcap --overwrite",
+        "simulate landmarks map.toml --landmarks 14 --rate 50 --stop 0 -o new.mcap --overwrite",
         "import landmark-csv drive.csv --map map.toml -o imported.mcap --overwrite",
         "import images frame1.png frame2.png broken.png -o imported.mcap --overwrite",
     ],
