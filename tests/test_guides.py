@@ -567,6 +567,7 @@ def test_a_page_is_read_as_by_its_reader(tmp_path: Path, monkeypatch: pytest.Mon
         ("```sh\nlocatk info nothing.mcap > said.txt\n```", "ended with 1"),
         ("```sh\nfalse | cat\n```", "ended with 1"),
         ("```sh\nbash -c 'exit 3'\n```", "page:1: .3."),
+        ("```sh\nfor k in 3 0; do bash -c 'exit '$k; done\n```", "page:1: .3."),
         ("<!-- status 3 -->\n```sh\ntrue\n```", "page:2: .0."),
         ("<!-- status 3 -->\n\nwords\n\n```sh\nbash -c 'exit 3'\n```", "page:5: .3."),
         ("```sh\nlocatk capture port --device lines -o run.mcap\n```", "ended with 1|failed"),

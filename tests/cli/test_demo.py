@@ -99,6 +99,8 @@ def test_alone_it_leaves_the_report_only(locatk, tmp_path: Path, monkeypatch) ->
     assert row.split()[0] == "polaris"
     assert re.fullmatch(r"Wrote report.html in \d+ s: open it in a browser", wrote)
     assert len(header) <= 80
+    # The second run is refused before any work.
+    monkeypatch.setattr("locatk.cli.demo.command.run_system", None)
     again = locatk("demo", "polaris")
     assert again.exit_code == 1
     assert "report.html" in again.stderr
