@@ -1,15 +1,18 @@
 """Every command that README and docs show is run, in order, as a reader would.
 
 The ```sh blocks of a page are run in one folder, page by page. Plain ``locatk`` lines run in
-this process, which saves a second each; lines with pipes, globs and the like, and those of
-other programs, by bash with a ``locatk`` on the PATH. Each must end with status 0.
+this process, which saves a second each, also with ``> file`` or in a ``for`` loop; lines with
+pipes, globs and the like, and those of other programs, by bash with a ``locatk`` on the PATH.
+Each must end with status 0.
 
 What a reader has and a test machine has not:
 
-- A serial port ``/dev/tty...`` is a pseudo-terminal, on which ``locatk emulate`` is the device
-  of the line's ``--device``; ``camera:0`` is a video of the sheet of the line's ``--artifact``.
-- A recording without ``--duration`` is ended by Ctrl-C; ``locatk emulate``, ``dask scheduler``
-  and ``dask worker`` are other terminals, which run to the page's end.
+- A serial port ``/dev/tty...`` is a pseudo-terminal, on which an emulator is the device of the
+  line's ``--device``; ``camera:0`` is a video of the sheet of the line's ``--artifact``.
+- A recording takes at most :data:`MAX_RECORDING_S`, and without ``--duration``
+  :data:`RECORDING_S`, as if it were ended by Ctrl-C.
+- ``locatk emulate``, ``dask scheduler`` and ``dask worker`` are other terminals, which run to the
+  page's end.
 - ``s3://`` is a server of moto on this machine; a bucket holds the sessions that are in the
   page's folder when it is first named.
 - Files that do not come out of the page's own commands are in :data:`FILES`. Where published
@@ -18,7 +21,6 @@ What a reader has and a test machine has not:
 Comments that readers do not see, on the lines before a block, tell what is not the rule::
 
     <!-- status 3 -->                    of the ```sh block: one of its commands ends with 3
-    <!-- guide: device run.mcap -->      of the ```sh block: what its serial ports send
     <!-- guide: file all.csv -->         the block (of any language) is that file
     <!-- guide: file b.toml after a.toml -->   the same, with a.toml before it
 
@@ -29,19 +31,21 @@ in :data:`EXCEPTIONS`.
 from __future__ import annotations
 
 import fnmatch
+import functools
 import itertools
 import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from click.testing import CliRunner
@@ -57,14 +61,24 @@ EXCEPTIONS = {
 """How a command begins that is not run, and why."""
 
 DEVICES = {"polaris-array": "polaris", "dotbot-gateway": "lighthouse", "locatk": "landmarks"}
-"""``--device`` to what ``locatk emulate`` simulates for it, where the page does not say."""
+"""``--device`` to the system that is simulated for it."""
 
 LIMIT_S = 120.0
-RECORD_S = 2.0
-"""Until Ctrl-C, from the first bytes of the file on."""
+
+RECORDING_S = 1.0
+"""Length of a recording without ``--duration``."""
+
+MAX_RECORDING_S = 3.5
+"""Longest recording: one pass of the simulated robots, which the pages let pass several times."""
 
 SHELL = re.compile(r"[|&;<>$`*?~!]|(?<![\w{])\{")
 """In a line that only a shell understands."""
+
+QUOTED = re.compile(r"""'[^']*'|"[^"$`]*"|\s#.*""")
+"""In a line, but not for the shell."""
+
+LOOP = re.compile(r"for (\w+) in ([\w ]+); do ([^;]+); done")
+REDIRECTION = re.compile(r"\s>\s(\S+)$")
 
 
 # ---- pages
@@ -97,7 +111,7 @@ class Block:
         return found
 
 
-HINT = re.compile(r"<!--\s*(?:guide:\s*)?(status|device|file)\s+(.*?)\s*-->")
+HINT = re.compile(r"<!--\s*(?:guide:\s*)?(status|file)\s+(.*?)\s*-->")
 
 
 def blocks(text: str) -> list[Block]:
@@ -266,7 +280,7 @@ class Reader:
         first = (self.folder / before).read_text(encoding="utf-8") + "\n" if before else ""
         _write(self.folder / name, first + text)
 
-    def type(self, line: str, device: str | None) -> int:
+    def type(self, line: str) -> int:
         """Run a line; its exit status.
 
         Raises
@@ -274,6 +288,9 @@ class Reader:
         AssertionError
             The status is neither 0 nor 3, with what the command said.
         """
+        if loop := LOOP.fullmatch(line):
+            name, values, body = loop.groups()
+            return max(self.type(body.replace(f"${name}", v)) for v in values.split())
         words = shlex.split(line, comments=True)
         self.provide(words)
         if words[0] == "cd":
@@ -290,23 +307,21 @@ class Reader:
         for bucket in re.findall(r"s3://([\w-]+)", line):
             self.store(bucket)
         with ExitStack() as stack:
-            for at, word in enumerate(words):
+            for index, word in enumerate(words):
                 if word.startswith("/dev/tty"):
-                    port = self.folder / Path(word).name
-                    source = device or DEVICES[words[words.index("--device") + 1]]
-                    played = [*shlex.split(source), "--link", str(port), "--loop", "0"]
-                    played += ["--device", words[words.index("--device") + 1]]
-                    stack.enter_context(emulated(played, self.folder))
-                    line = line.replace(word, str(port))
-                    words[at] = str(port)
+                    words[index] = Path(word).name
+                    name = words[words.index("--device") + 1]
+                    stack.enter_context(plugged_in(name, self.folder / words[index]))
                 elif word == "camera:0":
-                    words[at] = _video(self.folder, words)
-                    line = line.replace(word, words[at])
-            if words[:2] == ["locatk", "capture"] and not {"--duration", "--list"} & set(words):
-                status, said = self.interrupted(words)
-            elif words[0] == "locatk" and not SHELL.search(re.sub(r"'[^']*'|\s#.*", "", line)):
-                result = CliRunner().invoke(app, words[1:], prog_name="locatk")
+                    words[index] = _video(self.folder, words)
+            plain = QUOTED.sub("", line)
+            redirected = REDIRECTION.search(plain)
+            if words[0] == "locatk" and not SHELL.search(REDIRECTION.sub("", plain)):
+                words = words[1:-2] if redirected else words[1:]
+                result = CliRunner().invoke(app, shortened(words), prog_name="locatk")
                 status, said = result.exit_code, result.output
+                if redirected:
+                    _write(self.folder / redirected[1], result.stdout)
             else:
                 done = subprocess.run(
                     ["bash", "-euo", "pipefail", "-c", line],
@@ -360,17 +375,53 @@ class Reader:
                 continue
             store.put_file(str(path), f"{bucket}/{path.relative_to(self.folder).as_posix()}")
 
-    def interrupted(self, words: list[str]) -> tuple[int, str]:
-        """A recording that is ended by Ctrl-C, where it does not end by itself."""
-        output = self.folder / words[words.index("-o") + 1]
-        with terminal(words, self.folder) as process:
-            wait_for(output.exists, process)
-            try:
-                said, _ = process.communicate(timeout=RECORD_S)
-            except subprocess.TimeoutExpired:
-                process.send_signal(signal.SIGINT)
-                said, _ = process.communicate(timeout=LIMIT_S)
-        return process.returncode, said
+
+def shortened(words: list[str]) -> list[str]:
+    """The words of a command, where those of a recording end it soon."""
+    if words[0] != "capture" or "--list" in words:
+        return words
+    if "--duration" not in words:
+        return [*words, "--duration", f"{RECORDING_S}s"]
+    after = words.index("--duration") + 1
+    duration_s = min(float(words[after].removesuffix("s")), MAX_RECORDING_S)
+    return [*words[:after], f"{duration_s}s", *words[after + 1 :]]
+
+
+@functools.cache
+def simulated(device: str, folder: TemporaryDirectory[str]) -> Path:
+    """A simulated session of a device, made once."""
+    from locatk.formats.emulation.sources import write_simulated_session
+
+    path = Path(folder.name, f"{device}.mcap")
+    write_simulated_session(DEVICES[device], path)
+    return path
+
+
+@functools.cache
+def shared_folder() -> TemporaryDirectory[str]:
+    """A folder for all pages, which is removed at the end of this process."""
+    return TemporaryDirectory(prefix="locatk-guides-")
+
+
+@contextmanager
+def plugged_in(device: str, link: Path) -> Iterator[None]:
+    """A device that sends a simulated session endlessly, on a port of this process."""
+    from locatk.formats.emulation.byte_stream import RecordedPace, repeat_packets
+    from locatk.formats.emulation.emulator import Emulator
+    from locatk.formats.emulation.pseudo_terminal import PseudoPort
+    from locatk.formats.emulation.sources import select_source
+    from locatk.formats.sessions.reader import Session
+
+    source = Session.open(simulated(device, shared_folder()))
+    packets = select_source(source, device).packets
+    emulator = Emulator(PseudoPort(link), RecordedPace(repeat_packets(packets, 0), 1.0))
+    thread = threading.Thread(target=emulator.run)
+    thread.start()
+    try:
+        yield
+    finally:
+        emulator.stop()
+        thread.join(LIMIT_S)
 
 
 @contextmanager
@@ -435,7 +486,7 @@ def read_page(page: str, text: str, folder: Path, monkeypatch: pytest.MonkeyPatc
             if block.language != "sh":
                 continue
             statuses = [
-                reader.type(line, block.hint("device"))
+                reader.type(line)
                 for line in block.commands()
                 if not line.startswith(tuple(EXCEPTIONS))
             ]
@@ -488,6 +539,7 @@ cat a.txt \\
 printf '%s\n' 'three
 four' > c.txt
 locatk --version && test -s c.txt
+for k in 1 2; do locatk --version > version$k.txt; done
 ```
 
 <!-- status 3 -->
@@ -503,6 +555,7 @@ def test_a_page_is_read_as_by_its_reader(tmp_path: Path, monkeypatch: pytest.Mon
     folder = Path.cwd()
     assert (folder / "count.txt").read_text() == "2\n"
     assert (folder / "c.txt").read_text() == "three\nfour\n"
+    assert (folder / "version2.txt").read_text().startswith("locatk ")
 
 
 @pytest.mark.slow
@@ -514,6 +567,7 @@ def test_a_page_is_read_as_by_its_reader(tmp_path: Path, monkeypatch: pytest.Mon
         ("```sh\nlocatk info nothing.mcap > said.txt\n```", "ended with 1"),
         ("```sh\nfalse | cat\n```", "ended with 1"),
         ("```sh\nbash -c 'exit 3'\n```", "page:1: .3."),
+        ("```sh\nfor k in 3 0; do bash -c 'exit '$k; done\n```", "page:1: .3."),
         ("<!-- status 3 -->\n```sh\ntrue\n```", "page:2: .0."),
         ("<!-- status 3 -->\n\nwords\n\n```sh\nbash -c 'exit 3'\n```", "page:5: .3."),
         ("```sh\nlocatk capture port --device lines -o run.mcap\n```", "ended with 1|failed"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -25,6 +26,18 @@ FORBIDDEN_IN_CORE = {
 def find_modules(root: Path, layer: str) -> list[Path]:
     """Return the Python files of a layer, except generated ones."""
     return [p for p in sorted((root / layer).rglob("*.py")) if not p.name.endswith("_pb2.py")]
+
+
+@functools.cache
+def parse(path: Path) -> ast.Module:
+    """Return the syntax tree of a module; parsing all modules takes seconds."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def names_in(path: Path) -> frozenset[str]:
+    """Return the dotted names in all import statements of a module."""
+    return frozenset(imported_names(ast.walk(parse(path))))
 
 
 def imported_names(nodes: Iterable[ast.AST]) -> set[str]:
@@ -70,7 +83,7 @@ def import_graph(root: Path, layers: Iterable[str] = LAYERS) -> dict[str, set[st
     graph = {}
     for module, path in paths.items():
         imports = set()
-        for name in imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+        for name in names_in(path):
             name = name.removeprefix("locatk.")
             # A name that is not a module is defined in the module before its last dot.
             imports.add(name if name in paths else name.rpartition(".")[0])
@@ -182,7 +195,7 @@ def test_layers_import_only_layers_below(root: Path, layer: str) -> None:
     paths = find_modules(root, layer)
     assert paths
     for path in paths:
-        for name in imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+        for name in names_in(path):
             if name.startswith("locatk."):
                 assert name.split(".")[1] in ALLOWED_IMPORTS[layer], f"{path} imports {name}"
 
@@ -190,12 +203,11 @@ def test_layers_import_only_layers_below(root: Path, layer: str) -> None:
 @pytest.mark.slow
 def test_core_is_pure_computation(root: Path) -> None:
     for path in find_modules(root, "core"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        packages = {name.split(".")[0] for name in imported_names(ast.walk(tree))}
+        packages = {name.split(".")[0] for name in names_in(path)}
         assert not packages & FORBIDDEN_IN_CORE, f"{path} imports {packages & FORBIDDEN_IN_CORE}"
         calls = {
             node.func.id
-            for node in ast.walk(tree)
+            for node in ast.walk(parse(path))
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
         }
         assert not calls & {"open", "print", "input"}, path
@@ -213,17 +225,23 @@ def test_commands_import_little_at_import_time(root: Path) -> None:
     light = {"click", "locatk.cli", *light_modules} | set(sys.stdlib_module_names)
     for module in light_modules:
         path = root / module.removeprefix("locatk.").replace(".", "/")
-        tree = ast.parse(path.with_suffix(".py").read_text(encoding="utf-8"))
-        for name in imported_names(walk_import_time(tree)):
+        for name in imported_names(walk_import_time(parse(path.with_suffix(".py")))):
             is_standard = name.split(".")[0] in sys.stdlib_module_names
             assert is_standard or name.rpartition(".")[0] in light_modules, f"{module}: {name}"
     for path in find_modules(root, "cli"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for name in imported_names(walk_import_time(tree)):
+        for name in imported_names(walk_import_time(parse(path))):
             is_light = name.split(".")[0] in light or any(
                 name == module or name.startswith(module + ".") for module in light
             )
             assert is_light, f"{path} imports {name} at its top"
+
+
+@functools.cache
+def defined_names(path: Path) -> frozenset[str]:
+    """Return the names that a module imports or defines."""
+    return frozenset(name.rpartition(".")[2] for name in names_in(path)) | {
+        getattr(node, "name", getattr(node, "id", "")) for node in ast.walk(parse(path))
+    }
 
 
 @pytest.mark.slow
@@ -233,16 +251,13 @@ def test_imported_names_exist(root: Path) -> None:
     mypy does not check that for packages with ``__getattr__``.
     """
     for path in [p for layer in LAYERS for p in find_modules(root, layer)]:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parse(path)):
             if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("locatk"):
                 continue
             package = root.joinpath(*(node.module or "").split(".")[1:])
             if not (package / "__init__.py").exists():
                 continue
-            init = ast.parse((package / "__init__.py").read_text(encoding="utf-8"))
-            defined = {name.rpartition(".")[2] for name in imported_names(ast.walk(init))} | {
-                getattr(each, "name", getattr(each, "id", "")) for each in ast.walk(init)
-            }
+            defined = defined_names(package / "__init__.py")
             for alias in node.names:
                 is_module = any((package / f"{alias.name}{end}").exists() for end in (".py", ""))
                 is_extension = alias.name == "_kernels"
@@ -267,8 +282,7 @@ def test_no_system_imports_another(root: Path, system: str) -> None:
     paths = sorted((root / "core" / system).rglob("*.py"))
     assert len(paths) > 10
     for path in paths:
-        names = imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        assert not [name for name in names if f"{name}.".startswith(sisters)], path
+        assert not [name for name in names_in(path) if f"{name}.".startswith(sisters)], path
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -277,8 +291,7 @@ def test_simulators_share_no_code_with_solvers(root: Path, system: str) -> None:
     paths = sorted((root / "core" / system / "simulation").glob("*.py"))
     assert len(paths) > 3
     for path in paths:
-        names = imported_names(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        assert not [name for name in names if f"{name}.".startswith(stages)], path
+        assert not [name for name in names_in(path) if f"{name}.".startswith(stages)], path
 
 
 def test_every_package_is_installed(root: Path) -> None:

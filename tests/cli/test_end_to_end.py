@@ -53,11 +53,11 @@ def test_a_scene_of_another_room_is_status_3(locatk, simulated: Path, tmp_path: 
 @pytest.mark.slow
 def test_frames_blurred_by_motion_are_status_3(locatk, tmp_path: Path) -> None:
     frames, out = tmp_path / "frames.mcap", tmp_path / "out.mcap"
-    args = ("--frames", 12, "--motion", 13)
+    args = ("--frames", 4, "--motion", 13)
     assert locatk("simulate", "dots", "-o", frames, *args).exit_code == 0
     result = locatk("solve", frames, "-o", out)
     assert result.exit_code == 3, result.stderr
-    assert "of 12 frames gave no pose" in result.stderr or "no pose for" in result.stderr
+    assert "no pose for camera" in result.stderr
 
 
 def test_same_seed_same_bytes(locatk, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
-from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.figures import Duration, Figure
 
 
 @pytest.fixture(scope="session")
@@ -21,6 +21,17 @@ def run_here() -> Callable[[str], list[float]]:
         module = importlib.import_module(f"locatk.formats.benchmarks.{path[0]}")
         numbers = eval(call.removeprefix(f"{path[0]}."), vars(module))
         return [float(number) for number in numbers]
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def time_once() -> Callable[..., Duration]:
+    """Return a replacement of ``time_call`` that runs the call once, with a fixed duration."""
+
+    def run(call: Callable[[], object], *options: object) -> Duration:
+        call()
+        return Duration(0.5, 1.0)
 
     return run
 

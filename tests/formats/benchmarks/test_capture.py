@@ -20,7 +20,7 @@ def named(figures: Iterable[Figure]) -> dict[str, Figure]:
 
 @pytest.mark.slow
 def test_a_short_soak() -> None:
-    found = named(capture.soak_figures(1.0))
+    found = named(capture.soak_figures(0.4))
     assert found["soak: bytes lost or wrong"].value == 0
     assert found["soak: bad or missing frames"].value == 0
     assert found["soak: one core"].target == 60

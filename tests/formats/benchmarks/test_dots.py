@@ -64,7 +64,7 @@ SPEEDS = {"s", "us", "ms", "1/s", "MB"}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick() -> Any:
+def quick(time_once: Any) -> Any:
     """Use few frames: the code is tested, not the accuracy."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in (
@@ -82,14 +82,20 @@ def quick() -> Any:
             ("RASTER_WINDOWS", 50),
         ):
             patch.setattr(dots_print, name, value)
+        for module in (dots, dots_print):
+            patch.setattr(module, "time_call", time_once)
         patch.delitem(dots_print.PRINT_TARGETS, "A0")
         yield
 
 
 @pytest.fixture(scope="module")
-def rows(by_name: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
+def rows(
+    by_name: Any, run_here: Any, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Figure]:
     """All figures, without the published frame."""
-    return by_name(dots.figures(tmp_path_factory.mktemp("empty")))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timing, "run_single_threaded", run_here)
+        return by_name(dots.figures(tmp_path_factory.mktemp("empty")))
 
 
 @pytest.mark.slow
@@ -224,13 +230,12 @@ def test_a_wrong_print_is_noticed() -> None:
 @pytest.mark.slow
 def test_a_failed_measurement_is_explained() -> None:
     declared = Figure("f", None, "s", "how", 1.0, workload="numpy")
-    figure = timing.measure_single_threaded(declared, "dots.printing.nothing()")
+    figure = timing.measure_single_threaded(declared, "timing.nothing()")
     assert figure.value is None
     assert figure.met is None
     assert "nothing" in figure.how
     with pytest.raises(OSError, match="division"):
-        timing.run_single_threaded("dots.printing.RASTER_WINDOWS / 0")
-    assert timing.run_single_threaded("dots.printing.SHEET_ORIGIN") == list(dots_print.SHEET_ORIGIN)
+        timing.run_single_threaded("timing.SAMPLE_S / 0")
 
 
 @pytest.mark.slow

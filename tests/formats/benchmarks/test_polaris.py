@@ -16,6 +16,7 @@ from locatk.core.polaris.published.ddtw import distances, prepare
 from locatk.core.polaris.results import MagnetDetection, TagDetection
 from locatk.core.polaris.simulation.session import SimulatedSession, SimulationOptions, simulate
 from locatk.core.polaris.tag import Tags, cell_positions, symbol_angles
+from locatk.formats.benchmarks import timing
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.polaris import passes as polaris_passes
 from locatk.formats.benchmarks.polaris import speed as polaris_speed
@@ -73,9 +74,14 @@ TAG = 255183
 
 
 @pytest.fixture(scope="module")
-def rows(by_name: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Figure]:
+def rows(
+    by_name: Any, run_here: Any, time_once: Any, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Figure]:
     """Return all figures of few passes, without the published runs."""
     with pytest.MonkeyPatch.context() as patch:
+        for module in (timing, polaris_speed):
+            patch.setattr(module, "run_single_threaded", run_here)
+        patch.setattr(polaris_speed, "time_call", time_once)
         patch.setattr(polaris_passes, "HEADINGS_DEG", (30,))
         for name in ("HEADING_REPEATS", "RANDOM_DESIGNS", "REPEATED_PASSES"):
             patch.setattr(polaris_passes, name, 1)
