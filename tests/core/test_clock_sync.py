@@ -54,7 +54,7 @@ def sampled(rate: float, start: float, stop: float, seed: int = 5) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_late_by_the_least_delay_after_ten_seconds_and_within_a_ppm_after_a_minute(
     seed: int,
 ) -> None:
@@ -74,7 +74,7 @@ def test_late_by_the_least_delay_after_ten_seconds_and_within_a_ppm_after_a_minu
 
 @pytest.mark.slow
 def test_bursts_and_a_clock_that_warms_up() -> None:
-    seconds = sampled(200, 0, 120)
+    seconds = sampled(100, 0, 80)
     device = seconds * (1 + 50e-6) + 5e-6 * 20 * (1 - np.exp(-seconds / 20))
     arrivals = usb(seconds)
     burst = (seconds % 0.5 < 0.03) & (np.floor(seconds * 2) % 3 != 0)
@@ -87,7 +87,7 @@ def test_bursts_and_a_clock_that_warms_up() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("off", [-0.03, -0.005, 0.005, 0.03])
+@pytest.mark.parametrize("off", [-0.03, 0.03])
 def test_a_resonator_that_is_off_is_learnt(off: float) -> None:
     seconds = sampled(100, 0, 60)
     arrivals = usb(seconds)
@@ -102,7 +102,7 @@ def test_a_resonator_that_is_off_is_learnt(off: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("silence", [0.0, 0.4, 2.0, 30.0, 600.0])
 def test_short_counters_start_again_and_host_time_tells_how_often(silence: float) -> None:
-    seconds = np.concatenate([sampled(200, 0, 20), sampled(200, 20 + silence, 30 + silence)])
+    seconds = np.concatenate([sampled(100, 0, 20), sampled(100, 20 + silence, 30 + silence)])
     arrivals = usb(seconds)
     clock = TickClock(24e6, 24)
     error = error_ms(feed(clock, counter(1.00005 * seconds, 24e6, 24), arrivals), seconds)
@@ -115,7 +115,7 @@ def test_short_counters_start_again_and_host_time_tells_how_often(silence: float
 @pytest.mark.slow
 @pytest.mark.parametrize("bits", [32, 24])
 def test_what_arrives_late_together_is_not_new(bits: int) -> None:
-    seconds = sampled(200, 0, 20)
+    seconds = sampled(100, 0, 20)
     stalled = (seconds > 12) & (seconds < 14)
     arrivals = np.maximum.accumulate(np.where(stalled, 14.0, usb(seconds)))
     clock = TickClock(24e6, bits)
@@ -125,7 +125,7 @@ def test_what_arrives_late_together_is_not_new(bits: int) -> None:
 
 
 def test_a_backlog_in_many_reads_is_late_and_not_new() -> None:
-    seconds = sampled(200, 0, 20)
+    seconds = sampled(100, 0, 20)
     stalled = (seconds > 12) & (seconds < 14)
     backlog = 14 + np.floor((seconds - 12) / 0.3) * 0.002
     arrivals = np.maximum.accumulate(np.where(stalled, backlog, usb(seconds)))
@@ -136,10 +136,12 @@ def test_a_backlog_in_many_reads_is_late_and_not_new() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("hz", "bits"), [(1e6, 64), (1e6, 32), (24e6, 24)])
-@pytest.mark.parametrize("boot", [0.1, 0.33, 0.5])
+@pytest.mark.parametrize(
+    ("hz", "bits", "boot"),
+    [(1e6, 64, 0.33), (1e6, 32, 0.1), (24e6, 24, 0.1), (24e6, 24, 0.33), (24e6, 24, 0.5)],
+)
 def test_a_device_that_restarts_is_noticed(hz: float, bits: int, boot: float) -> None:
-    seconds = np.concatenate([sampled(200, 0, 20), sampled(200, 22, 40)])
+    seconds = np.concatenate([sampled(100, 0, 20), sampled(100, 22, 40)])
     device = np.where(seconds < 21, seconds + 3 * boot, seconds - 22 + boot)
     arrivals = usb(seconds)
     clock = TickClock(hz, bits)
@@ -155,7 +157,7 @@ def test_a_device_that_restarts_is_noticed(hz: float, bits: int, boot: float) ->
 @pytest.mark.slow
 def test_a_clock_that_was_set_ahead_or_stood_still_is_noticed() -> None:
     for step in (-5.0, 3600.0):
-        seconds = np.concatenate([sampled(200, 0, 20), sampled(200, 30, 50)])
+        seconds = np.concatenate([sampled(100, 0, 20), sampled(100, 30, 50)])
         device = seconds + np.where(seconds < 25, 10, 10 + step)
         clock = TickClock(1e6)
         error = error_ms(feed(clock, counter(device, 1e6), usb(seconds)), seconds)
@@ -164,7 +166,7 @@ def test_a_clock_that_was_set_ahead_or_stood_still_is_noticed() -> None:
 
 
 def test_wrong_ticks_are_left_aside() -> None:
-    seconds = sampled(200, 0, 20)
+    seconds = sampled(100, 0, 20)
     ticks, arrivals = counter(seconds, 1e6), usb(seconds)
     rng = np.random.default_rng(1)
     wrong = rng.random(len(seconds)) < 0.05
@@ -191,7 +193,7 @@ def test_many_wrong_ticks_in_one_call() -> None:
 
 @pytest.mark.parametrize("bits", [64, 32])
 def test_a_first_tick_that_is_wrong_does_not_last(bits: int) -> None:
-    seconds = sampled(200, 0, 20)
+    seconds = sampled(100, 0, 20)
     ticks = counter(seconds, 1e6, bits)
     ticks[0] = 3_000_000_000
     clock = TickClock(1e6, bits)
@@ -255,7 +257,7 @@ def test_a_recording_in_one_call_is_as_good() -> None:
 @pytest.mark.slow
 def test_memory_is_bounded() -> None:
     clock = TickClock(1000, 16)
-    for minute in range(20):
+    for minute in range(5):
         ticks = np.arange(minute * 120, (minute + 1) * 120, dtype=np.int64) * 500
         clock.times(ticks & 0xFFFF, EPOCH_NS + ticks * 1_000_000)
     era = clock._era

@@ -15,6 +15,7 @@ Detection of the landmark of one visit:
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -701,21 +702,21 @@ def find_faulty_sensor(
         return None
     unexplained = sorted(unexplained, key=len, reverse=True)[:MAX_CHECKED_VISITS]
 
-    def median_residual(change: SensorChange, traces: Sequence[Trace]) -> float:
-        residuals = []
-        for trace in traces:
-            field = trace.field_t[:, list(change.order)] * change.factor
-            fits = fit_landmarks(replace(trace, field_t=field), geometry, priors, thorough=False)
-            residuals.append(fits[0].residual_sigma if fits else math.inf)
-        return float(np.median(residuals))
+    @functools.cache
+    def residual(change: SensorChange, index: int) -> float:
+        trace = unexplained[index]
+        field = trace.field_t[:, list(change.order)] * change.factor
+        fits = fit_landmarks(replace(trace, field_t=field), geometry, priors, thorough=False)
+        return fits[0].residual_sigma if fits else math.inf
+
+    def median_residual(change: SensorChange) -> float:
+        return float(np.median([residual(change, index) for index in range(len(unexplained))]))
 
     as_given, *others = _sensor_changes(len(names))
-    likely = sorted(others, key=lambda change: median_residual(change, unexplained[:1]))
-    best = min(
-        likely[:MAX_REFINED_CHANGES], key=lambda change: median_residual(change, unexplained)
-    )
-    limit = min(MAX_RESIDUAL_SIGMAS, median_residual(as_given, unexplained) / MIN_RESIDUAL_RATIO)
-    if median_residual(best, unexplained) > limit:
+    likely = sorted(others, key=lambda change: residual(change, 0))
+    best = min(likely[:MAX_REFINED_CHANGES], key=median_residual)
+    limit = min(MAX_RESIDUAL_SIGMAS, median_residual(as_given) / MIN_RESIDUAL_RATIO)
+    if median_residual(best) > limit:
         return None
     if best.order != as_given.order:
         actual = ", ".join(names[best.order.index(k)] for k in as_given.order)

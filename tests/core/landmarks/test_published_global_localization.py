@@ -46,7 +46,7 @@ def test_each_l_of_the_published_map_is_found(data: Path, turn: int) -> None:
     floor = FloorMap(codes)
     rng = np.random.default_rng(turn + 5)
     count = 0
-    while count < 40:
+    while count < 15:
         row, column, q = (int(k) for k in rng.integers([24, 24, 4]))
         observed = drive(codes, row, column, q, turn)
         if observed is None:
@@ -121,7 +121,7 @@ def test_a_robot_finds_itself_on_the_published_map(data: Path) -> None:
     floor = FloorMap(published(data, "or16_L_24x24.txt"))
     localized_count = 0
     for seed in (0, 3, 5, 8):
-        generated = simulate(floor, SimulationOptions(seed=seed))
+        generated = simulate(floor, SimulationOptions(seed=seed, rate_hz=100))
         observed = detect_landmarks(generated.samples[0], generated.odometry[0], floor.geometry)
         read = [one for one in observed if not one.refused]
         drawn = landmark_sequence(read, floor.pitch_m) if len(read) == 3 else None

@@ -89,13 +89,13 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
     # section 5.2.3: less than 1 mm and 1.5 degrees; where nothing is in the field but bars
     # a few percent off and sensors with offsets
     errors = []
-    for run in simulate_passes(24, None, then="spin", aim_m=0.002, seed=9):
+    for run in simulate_passes(18, None, then="spin", aim_m=0.002, seed=9):
         for seen in detect_landmarks(run.samples, run.odometry, GEOMETRY):
             if not seen.refused and not VALLEYS_ALONE & {each.code for each in seen.warnings}:
                 error = off(run, seen)
                 assert error is not None
                 errors.append(error)
-    assert len(errors) > 15
+    assert len(errors) > 11
     error = np.array(errors)
     assert np.hypot(*error[:, :2].T).mean() < 0.001
     assert np.sqrt((error[:, 2] ** 2).mean()) < math.radians(1)
@@ -104,7 +104,7 @@ def test_standing_on_the_bars_is_within_a_millimetre() -> None:
 @pytest.mark.slow
 def test_a_pass_alone_gives_a_centre_only() -> None:
     errors = []
-    for run in simulate_passes(40, code_of("NNNS"), seed=3):
+    for run in simulate_passes(24, code_of("NNNS"), seed=3):
         result = detect_landmarks(run.samples, run.odometry, GEOMETRY)
         assert all(seen.refused == "no_spin" and not seen.hypotheses for seen in result)
         for step, seen in zip(
@@ -123,7 +123,7 @@ def test_a_pass_alone_gives_a_centre_only() -> None:
             errors.append(np.hypot(*(run.odometry.position[at, :2] + path - step.centre_m)))
             assert np.isfinite(step.voted_m).all()
     # the study's 10 mm in the real field (test_published_study.py), and noise
-    assert len(errors) > 28
+    assert len(errors) > 16
     assert 0.006 < np.mean(errors) < 0.013
 
 

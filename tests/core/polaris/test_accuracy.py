@@ -182,7 +182,7 @@ def hand_installed(world: Any) -> HandInstalledTags:
         u = np.linspace(0, 1, 50)
         profile = u + 0.3 / (2 * np.pi) * (np.sin(2 * np.pi * u + k) - np.sin(k))
         course = world.driven(course, 2.6 * u, profile)
-        found = the_tag(solve([world.record([tag], course, seed=k)], TAGS))
+        found = the_tag(solve([world.record([tag], course, rate=50.0, seed=k)], TAGS))
         ids.append(found.tag_id)
         error = pose_errors(world, found, course, tag)
         pose.append(error)
@@ -255,15 +255,15 @@ def test_a_dense_tag_is_read_by_its_grid(world: Any) -> None:
     ("order", "magnets", "p", "spacing"),
     [
         (3, 4, 8, 0.016), (3, 8, 20, 0.016), (3, 5, 16, 0.025), (3, 8, 8, 0.04),
-        (4, 6, 20, 0.020), (4, 13, 16, 0.016), (4, 9, 8, 0.03),
+        (4, 6, 20, 0.020), (4, 9, 8, 0.03),
         (5, 10, 8, 0.016), (5, 13, 20, 0.02), (5, 5, 16, 0.03),
     ],
 )  # fmt: skip
 def test_every_bit_of_other_designs(
     order: int, magnets: int, p: int, spacing: float, world: Any
 ) -> None:
-    """At the paper's noise of 0.5 uT, over a bar that covers the tag. One pass each: of the
-    densest, 13 magnets 16 mm apart, some passes are refused."""
+    """At the paper's noise of 0.5 uT, over a bar that covers the tag. One pass each; a tag
+    of 13 magnets 16 mm apart is read above."""
     rng = np.random.default_rng([order, magnets, p])
     tags = Tags(order=order, magnets=magnets, orientations=p, spacing_m=spacing)
     side = (order - 1) * spacing

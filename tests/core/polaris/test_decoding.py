@@ -396,7 +396,7 @@ def capped(steps: np.ndarray, word, positions: list[int]) -> float:
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=150)
 @given(st.data())
 def test_a_missing_magnet_and_a_misread_one_are_borne(data) -> None:
     tag_id = data.draw(st.integers(0, 63))
