@@ -126,7 +126,7 @@ def test_same_optimum_as_a_general_solver(world: Any) -> None:
 
 @pytest.fixture(scope="module", params=[True, False], ids=["planar", "space"])
 def draws(world: Any, request: pytest.FixtureRequest) -> list[tuple[Array, Array, Array]]:
-    """For each of two stations: principal directions of its error over 300 draws of noise,
+    """For each of two stations: principal directions of its error over 100 draws of noise,
     the standard deviations found along them, and those stated."""
     lamps = world.lamps(1, 2)
     truth = rig_of(lamps, world.curve(20, flat=request.param))
@@ -134,7 +134,7 @@ def draws(world: Any, request: pytest.FixtureRequest) -> list[tuple[Array, Array
     rng = np.random.default_rng(0)
     sigma = 2e-4
     errors, stated = [], []
-    for _ in range(300):
+    for _ in range(100):
         noisy = exact + rng.normal(0, sigma, exact.shape)
         done = adjust_bundle(
             noisy, truth, sigma_rad=sigma, planar=request.param, loss_scale_rad=1e3
@@ -174,7 +174,7 @@ def test_known_points_fix_a_station_without_gauge(world: Any) -> None:
     rng = np.random.default_rng(0)
     sigma = 2e-4
     errors, told = [], []
-    for _ in range(200):
+    for _ in range(100):
         done = adjust_bundle(
             exact + rng.normal(0, sigma, exact.shape),
             truth,

@@ -626,7 +626,7 @@ def test_stored_calibrations(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_damage_of_any_kind_is_an_error_or_a_warning(tmp_path: Path, data: st.DataObject) -> None:
     content = bytearray(Room(seconds=0.3).build().text("0.2 WM0 POSE 1 2 3 1 0 0 0"))
@@ -664,7 +664,7 @@ def test_damage_of_any_kind_is_an_error_or_a_warning(tmp_path: Path, data: st.Da
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     st.lists(
         st.tuples(
