@@ -123,9 +123,9 @@ def on_markers(t: Any) -> Any:
     return np.where((t > 4 * PERIOD_S)[:, None], position_at(t - 4 * PERIOD_S), position)
 
 
-def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
+def marked(world: Any, count: int, seconds: float) -> tuple[Any, Any, tuple[Marker, ...]]:
     lamps = world.lamps(1, 2, 5)
-    sweeps = world.stream(lamps, on_markers, 7.0, sensors=SPAN)
+    sweeps = world.stream(lamps, on_markers, seconds, sensors=SPAN)
     start = int(sweeps.time_ns[0])
     markers = tuple(
         Marker(
@@ -146,7 +146,7 @@ def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
 
 @pytest.mark.slow
 def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> None:
-    lamps, sweeps, markers = marked(world, 4)
+    lamps, sweeps, markers = marked(world, 4, 6.0)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     scene = solution.artifact
     assert (scene.scale, scene.frame) == ("markers", "floor")
@@ -167,7 +167,7 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> No
 
 @pytest.mark.slow
 def test_two_markers_determine_no_frame(world: Any) -> None:
-    _, sweeps, markers = marked(world, 2)
+    _, sweeps, markers = marked(world, 2, 2.5)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     assert solution.artifact.scale == "device"
     assert {"too_few_markers", "device_scale"} <= codes(solution)
@@ -175,7 +175,7 @@ def test_two_markers_determine_no_frame(world: Any) -> None:
 
 @pytest.mark.slow
 def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
-    _, sweeps, markers = marked(world, 4)
+    _, sweeps, markers = marked(world, 4, 4.0)
     wrong = replace(markers[3], position=markers[3].position + [0.15, 0.0, 0.0])
     solution = solve(sweeps, Scene(markers=(*markers[:3], wrong)), receivers={"robot": RIGID})
     assert "marker_misfit" in codes(solution)

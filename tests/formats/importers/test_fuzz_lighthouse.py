@@ -55,7 +55,7 @@ from locatk.formats.sessions import station_reports as heard
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
-SECONDS = float(os.environ.get("LOCATK_FUZZ_SECONDS", "5"))
+SECONDS = float(os.environ.get("LOCATK_FUZZ_SECONDS", "2"))
 SEED, FIRST = (int(n) for n in os.environ.get("LOCATK_FUZZ_START", "8:0").split(":"))
 
 HANGS_S = 60

@@ -28,6 +28,7 @@ from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.rec_file import read_rec_file
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.libsurvive.sweeps import assign_planes, read_device_sweeps
+from locatk.formats.importers.lighthouse import ImportedSession
 
 PUBLISHED = "lighthouse/libsurvive/tracker-cal-attempt.rec.gz"
 
@@ -715,9 +716,16 @@ def published(data: Path) -> Path:
     return file
 
 
+@pytest.fixture(scope="module")
+def imported(published: Path) -> ImportedSession:
+    return read_libsurvive([published], stations=True)
+
+
 @pytest.mark.slow
-def test_published_calibrations_are_those_that_libsurvive_stored(published: Path) -> None:
-    session = read_libsurvive([published])
+def test_published_calibrations_are_those_that_libsurvive_stored(
+    published: Path, imported: ImportedSession
+) -> None:
+    session = imported
     stored = read_stored_calibrations(published.with_name(published.name + ".json"))
     assert session.lost is None
     assert session.warnings == []
@@ -759,8 +767,10 @@ def test_published_angles_are_libsurvives_but_for_the_noise_of_single_syncs(
 
 
 @pytest.mark.slow
-def test_published_poses_photodiodes_and_stations_are_of_one_frame(published: Path) -> None:
-    session = read_libsurvive([published], stations=True)
+def test_published_poses_photodiodes_and_stations_are_of_one_frame(
+    imported: ImportedSession,
+) -> None:
+    session = imported
     assert session.scene is not None
     (truth,) = session.truth
     rotation = matrix_from_quaternion(np.median(truth.quaternion, axis=0))
