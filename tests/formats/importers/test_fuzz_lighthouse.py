@@ -657,7 +657,7 @@ def bombs() -> dict[str, bytes]:
         "line.csv": b"Time [s],A\n" + b"0" * (32 << 20),
         "sweeps.gz": squeezed(recording(), b"1.1 WM0 W 1 1 1 0\n", 128),
         "names.gz": squeezed(b"", b"".join(b"1 n%d POSE 1 1 1 1 1 1 1\n" % k for k in range(9000)),
-                             5),
+                             1),
         "line.gz": squeezed(b"0.1 OPTION v i 100\n", b"x", 128),
         "line.log": LOGS[0] + b"poly=1 lfsr_index=" + b"9" * (32 << 20),
         "deep.log": b'{"lfsr_index": ' + deep + b"\n",
