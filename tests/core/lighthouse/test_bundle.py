@@ -20,6 +20,7 @@ from locatk.core.lighthouse.calibration import (
     TILT,
     Calibration,
 )
+from locatk.core.lighthouse.scene import bundle_adjustment
 from locatk.core.lighthouse.scene.bundle_adjustment import BundleState, adjust_bundle
 
 Array = NDArray[np.float64]
@@ -122,6 +123,19 @@ def test_same_optimum_as_a_general_solver(world: Any) -> None:
     )
     assert gap(ours.state, best) < 2e-4
     np.testing.assert_allclose(ours.residuals.ravel() / sigma, theirs.fun, atol=5e-3)
+
+
+@pytest.mark.parametrize("dims", [2, 3])
+def test_gauge_directions_contain_motions_of_everything(world: Any, dims: int) -> None:
+    positions = np.stack([lamp.position for lamp in world.lamps(1, 2, 5)])
+    directions = bundle_adjustment._gauge_directions(positions, dims)
+    assert directions.shape == (30, {2: 4, 3: 7}[dims])
+    for axis in np.eye(3)[{2: [2], 3: [0, 1, 2]}[dims]]:
+        rotation = np.zeros((3, 10))
+        rotation[:, bundle_adjustment.POSITION] = np.cross(axis, positions)
+        rotation[:, bundle_adjustment.ROTATION] = axis
+        inside = directions @ (directions.T @ rotation.ravel())
+        np.testing.assert_allclose(inside, rotation.ravel(), atol=1e-12)
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["planar", "space"])
