@@ -316,15 +316,13 @@ def search_position(
     candidates = np.sort(candidates, axis=1)
     is_repeated = candidates[:, 1:] == candidates[:, :-1]
     phases = following_phases(candidates, length, codec)
-    # One of the 63 shifts at a time, which limits the memory to (n, candidates, length) scores.
-    window = np.arange(n)[:, None, None]
-    joint = np.stack(
-        [
-            scores[window, np.arange(length), (phases + shift) % MAIN_SEQUENCE_LENGTH].sum(axis=2)
-            for shift in range(MAIN_SEQUENCE_LENGTH)
-        ],
-        axis=2,
-    ).astype(np.float64)
+    # The scores of all shifts from each phase on are contiguous in a doubled row of scores.
+    doubled = np.concatenate([scores, scores[..., :-1]], axis=2)
+    shifted = np.lib.stride_tricks.sliding_window_view(doubled, MAIN_SEQUENCE_LENGTH, axis=2)
+    window = np.arange(n)[:, None]
+    joint = np.zeros((*candidates.shape, MAIN_SEQUENCE_LENGTH))
+    for column in range(length):
+        joint += shifted[window, column, phases[..., column]]
     joint[:, 1:][is_repeated] = -np.inf
     log_likelihood = 0.5 * joint.reshape(n, -1)
     best = log_likelihood.argmax(axis=1)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import rotation_exp
+from locatk.core.geometry import rotation_exp, skew
 from locatk.core.least_squares import Indices, SchurEquations, SchurStep, cauchy_loss, minimize
 from locatk.core.lighthouse.calibration import (
     GENERIC_CALIBRATION,
@@ -254,23 +254,19 @@ def _gauge_directions(positions: Array, dims: int) -> Array:
     They are translation, rotation and scale of everything; in a plane (``dims`` 2) translation in
     x and y, rotation about z, and scale. There are none (g = 0) if the points are known.
     """
-    s = len(positions)
-    motions = []
-    for axis in range(dims):
-        translation = np.zeros((s, STATION_PARAMETERS))
-        translation[:, axis] = 1.0
-        motions.append(translation)
-    for axis in {0: (), 2: (2,), 3: (0, 1, 2)}[dims]:
-        rotation = np.zeros((s, STATION_PARAMETERS))
-        rotation[:, POSITION] = np.cross(np.eye(3)[axis], positions)
-        rotation[:, ROTATION] = np.eye(3)[axis]
-        motions.append(rotation)
-    if not motions:
-        return np.zeros((s * STATION_PARAMETERS, 0))
-    scale = np.zeros((s, STATION_PARAMETERS))
-    scale[:, POSITION] = positions
-    motions.append(scale)
-    return np.linalg.qr(np.stack([motion.ravel() for motion in motions], axis=1))[0]
+    unknowns = len(positions) * STATION_PARAMETERS
+    if not dims:
+        return np.zeros((unknowns, 0))
+    axes = np.eye(3)
+    translation, rotation = axes[:dims], axes[{2: [2], 3: [0, 1, 2]}[dims]]
+    count = len(translation) + len(rotation) + 1
+    motions = np.zeros((count, len(positions), STATION_PARAMETERS))
+    motions[: len(translation), :, POSITION] = translation[:, None]
+    rotations = motions[len(translation) : -1]
+    rotations[..., POSITION] = positions @ -skew(rotation)  # the axis times the position
+    rotations[..., ROTATION] = rotation[:, None]
+    motions[-1, :, POSITION] = positions
+    return np.linalg.qr(motions.reshape(-1, unknowns).T)[0]
 
 
 # ---- unknowns of stations, common to all adjustments

@@ -63,7 +63,8 @@ MAX_CHANNELS = 16
 MAX_POSE_VALUE = 1e9
 """Larger values of a pose are damaged."""
 
-_TIME = rb"^(\d{1,9}(?:\.\d{1,9})?) "
+# Each line with the line feed before it: a literal is found faster than `^`.
+_TIME = rb"\n(\d{1,9}(?:\.\d{1,9})?) "
 _NAME = rb"([^\s]{1,32}) "
 _END = rb"[ \t\r]*$"
 _SYNC = re.compile(_TIME + _NAME + rb"Y (\d{1,2}) (\d{1,10}) ([01]) \d{1,3}" + _END, re.M)
@@ -75,9 +76,9 @@ _ANGLE = re.compile(
     + _END,
     re.M,
 )
-_IS_ANGLE = re.compile(rb"^[^\s]{1,24} [^\s]{1,32} B ", re.M)
+_IS_ANGLE = re.compile(rb"\n[^\s]{1,24} [^\s]{1,32} B ", re.M)
 _OTHER = re.compile(
-    rb"^([-+0-9.e]{1,24}) (?![^\s]{1,32} [YWB] )([^\s]{1,64}) ([^\s]{1,32})([^\n]*)$", re.M
+    rb"\n([-+0-9.e]{1,24}) (?![^\s]{1,32} [YWB] )([^\s]{1,64}) ([^\s]{1,32})([^\n]*)$", re.M
 )
 _POSES = (b"POSE", b"EXTERNAL_POSE", b"LH_POSE")
 _NAMELESS = (b"OPTION", b"INFO", b"SPHERE", b"EXTERNAL_TO_WORLD", b"LH_UP")
@@ -283,6 +284,7 @@ class ColumnCollector:
     def add(self, block: bytes) -> None:
         """Add whole lines."""
         lines = block.count(b"\n")
+        block = b"\n" + block
         known = 0
         for kind, pattern in (("Y", _SYNC), ("W", _SWEEP), ("B", _ANGLE)):
             if kind == "B" and not self.angles:

@@ -88,14 +88,18 @@ class Shot:
         rng = np.random.default_rng(self.seed)
         times = 4 if max(self.size) < 400 else 2
         fine = max(math.ceil(self.pitch * times), 40)
-        raster = self._print(fine, rng)
         width, height = self.size
-        x, y = ((np.arange(n * times) + 0.5) / times - 0.5 for n in (width, height))
-        east, south = self._on_paper(*np.meshgrid(x.astype(np.float32), y.astype(np.float32)))
-        to_raster = [
-            ((where + (self.at[axis] - self.corner[axis] + 1)) * fine - 0.5).astype(np.float32)
-            for axis, where in enumerate((east, south))
-        ]
+        x, y = ((np.arange(n * times, dtype=np.float32) + 0.5) / times - 0.5 for n in self.size)
+        on_paper = self._on_paper(x[None], y[:, None])
+        # In pitches from the corner.
+        column, row = (
+            where + float(at - corner)
+            for where, at, corner in zip(on_paper, self.at, self.corner, strict=True)
+        )
+        raster = self._print(
+            fine, rng, self._visible(column[::times, ::times], row[::times, ::times])
+        )
+        to_raster = [(where + 1) * fine - 0.5 for where in (column, row)]
         seen = cv2.remap(
             raster, *to_raster, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
         )
@@ -120,7 +124,16 @@ class Shot:
         grey += rng.normal(0, self.noise, grey.shape) if self.noise else 0
         return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
-    def _print(self, fine: int, rng: np.random.Generator) -> Image:
+    def _visible(self, column: Array, row: Array) -> NDArray[np.bool_]:
+        """Places next to those that the pixels see."""
+        count = 2 * self.reach + 1
+        seen = np.zeros((count, count), np.uint8)
+        nearest = (np.rint(row).astype(int), np.rint(column).astype(int))
+        inside = np.all([(k >= 0) & (k < count) for k in nearest], axis=0)
+        seen[nearest[0][inside], nearest[1][inside]] = 1
+        return cv2.dilate(seen, np.ones((3, 3), np.uint8)) > 0
+
+    def _print(self, fine: int, rng: np.random.Generator, visible: NDArray[np.bool_]) -> Image:
         """Ink (255) on paper (0), a margin of one pitch about the places."""
         count = 2 * self.reach + 1
         symbols = self.symbols
@@ -141,7 +154,7 @@ class Shot:
             at = (round((x * fine - 0.5) * 16), round((y * fine - 0.5) * 16))
             cv2.circle(raster, at, radius, 255, -1, cv2.LINE_AA, 4)
 
-        for row, column in np.argwhere((symbols < 4) & ~gone).tolist():
+        for row, column in np.argwhere((symbols < 4) & ~gone & visible).tolist():
             if column + self.corner[0] - self.at[0] > self.rim:
                 continue
             aside = ASIDE[int(symbols[row, column])]
@@ -163,7 +176,9 @@ class Shot:
     def _tilted(self, px: Array, py: Array) -> tuple[Array, Array]:
         """Where rays through the pixels meet the paper, in pitches along two axes on it."""
         x, y = px - self.middle[0], py - self.middle[1]
-        bend = 1 / (1 + self.radial * (x * x + y * y)) / self.focal
+        bend = 1 / self.focal
+        if self.radial:
+            bend = bend / (1 + self.radial * (x * x + y * y))
         x, y = x * bend, y * bend  # the rays are (x, y, 1)
         lean = (math.cos(self.towards) * self.tilt, math.sin(self.towards) * self.tilt, 0.0)
         a, b, n = cv2.Rodrigues(np.array(lean))[0].T.tolist()  # two axes on the paper, its normal

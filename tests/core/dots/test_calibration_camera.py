@@ -56,6 +56,11 @@ def upright() -> simulate.SimulatedSession:
     return simulated(seed=1)
 
 
+@pytest.fixture(scope="module")
+def upright_report(upright: simulate.SimulatedSession) -> CameraReport:
+    return calibrate(upright.frames, MANIFEST)
+
+
 def check_lens(report: CameraReport, camera: Camera = TRUTH) -> None:
     assert report.camera.size == camera.size
     assert report.camera.centre_px == pytest.approx(camera.centre_px, abs=0.2)
@@ -169,7 +174,7 @@ def test_the_simulators_camera_comes_back(tilted: simulate.SimulatedSession) -> 
 
 @pytest.mark.slow
 def test_a_camera_of_opencv_comes_back() -> None:
-    report = calibrate(drawn(25, division(TRUTH.radial_px)), MANIFEST)
+    report = calibrate(drawn(16, division(TRUTH.radial_px)), MANIFEST)
     check_lens(report)
     assert report.camera.focal_px == pytest.approx(360.0, rel=0.02)
     assert report.rms_px < 0.1 < report.rms_before_px
@@ -179,7 +184,7 @@ def test_a_camera_of_opencv_comes_back() -> None:
 @pytest.mark.parametrize("strength", [-0.4, 0.3])
 def test_a_lens_of_another_model(strength: float) -> None:
     """Its centre is where it is, whatever polynomial bends it about that."""
-    report = calibrate(drawn(25, polynomial(strength, 0.1, 360.0)), MANIFEST)
+    report = calibrate(drawn(16, polynomial(strength, 0.1, 360.0)), MANIFEST)
     assert report.camera.centre_px == pytest.approx(TRUTH.centre_px, abs=0.5)
     assert report.camera.focal_px == pytest.approx(360.0, rel=0.03)
     assert report.camera.radial == pytest.approx(strength, rel=0.15)
@@ -210,8 +215,10 @@ def test_a_strong_lens(corner: float) -> None:
     assert report.used == 12
 
 
-def test_poses_are_of_the_centre_that_is_calibrated(upright: simulate.SimulatedSession) -> None:
-    report = calibrate(upright.frames, MANIFEST)
+def test_poses_are_of_the_centre_that_is_calibrated(
+    upright: simulate.SimulatedSession, upright_report: CameraReport
+) -> None:
+    report = upright_report
 
     def rms_mm(camera: Camera | None) -> float:
         solution = solve([upright.frames], MANIFEST, SolveOptions(camera=camera))
@@ -230,9 +237,9 @@ def test_poses_are_of_the_centre_that_is_calibrated(upright: simulate.SimulatedS
 
 
 def test_untilted_frames_tell_the_lens_but_not_the_focal_length(
-    upright: simulate.SimulatedSession,
+    upright_report: CameraReport,
 ) -> None:
-    report = calibrate(upright.frames, MANIFEST)
+    report = upright_report
     check_lens(report)
     assert (report.focal_from, report.centre_from) == ("usual", "frames")
     assert math.isnan(report.sigma_focal_px)
@@ -292,7 +299,7 @@ def test_without_bend_and_tilt_the_centre_is_the_middle() -> None:
 
 @pytest.mark.slow
 def test_a_scale_that_was_not_measured_is_told_and_does_no_harm() -> None:
-    session = simulated(25, printer_scale=(1.003, 0.999), tilt_rad=math.radians(10))
+    session = simulated(16, printer_scale=(1.003, 0.999), tilt_rad=math.radians(10))
     report = calibrate(session.frames, MANIFEST)
     check_lens(report)
     assert report.camera.focal_px == pytest.approx(TRUTH.focal_px, rel=0.01)
@@ -316,7 +323,7 @@ def test_dots_stand_where_the_manifest_has_them() -> None:
 
 @pytest.mark.slow
 def test_a_rolling_shutter_is_no_tilt() -> None:
-    report = calibrate(drawn(20, division(TRUTH.radial_px), skew=0.02), MANIFEST)
+    report = calibrate(drawn(14, division(TRUTH.radial_px), skew=0.02), MANIFEST)
     assert report.focal_from == "usual"
     assert "the shutter may be a rolling one" in report.notes[0]
     assert report.rms_px < 0.1

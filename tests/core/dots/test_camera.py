@@ -21,7 +21,7 @@ def cameras(draw: st.DrawFn) -> Camera:
 
 @pytest.mark.slow
 @given(cameras(), st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_distort_undoes_undistort(camera: Camera, where: list[tuple[float, float]]) -> None:
     points = np.array(where)
     offset = points - camera.centre_px
@@ -35,7 +35,7 @@ def test_distort_undoes_undistort(camera: Camera, where: list[tuple[float, float
 
 @pytest.mark.slow
 @given(cameras(), st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=8))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_undistort_undoes_distort(camera: Camera, where: list[tuple[float, float]]) -> None:
     points = np.array(where)
     offset = points - camera.centre_px

@@ -42,8 +42,8 @@ def mixed(world: Any) -> tuple[Any, Any, Scene]:
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(200, flat=False))
     scene = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square))).artifact
-    rigid = world.stream(lamps, position_at, 4.0, sensors=SPAN)
-    single = world.stream(lamps, position_at, 4.0, seed=2)
+    rigid = world.stream(lamps, position_at, 2.0, sensors=SPAN)
+    single = world.stream(lamps, position_at, 2.0, seed=2)
     single = replace(single, device=np.ones(len(single), np.int32))
     both = world.join(rigid, single)
     return replace(both, devices=("rigid", "single")), lamps, scene
@@ -110,7 +110,7 @@ def test_the_papers_method_warns_that_it_ignores_receivers(world: Any) -> None:
 
 
 POSITIONS = np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.2], [-0.5, -0.5, 0.0], [0.5, -0.5, 0.1]])
-REST_S, PERIOD_S = 1.5, 2.0
+REST_S, PERIOD_S = 0.7, 1.0
 
 
 def on_markers(t: Any) -> Any:
@@ -123,9 +123,9 @@ def on_markers(t: Any) -> Any:
     return np.where((t > 4 * PERIOD_S)[:, None], position_at(t - 4 * PERIOD_S), position)
 
 
-def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
+def marked(world: Any, count: int, seconds: float) -> tuple[Any, Any, tuple[Marker, ...]]:
     lamps = world.lamps(1, 2, 5)
-    sweeps = world.stream(lamps, on_markers, 14.0, sensors=SPAN)
+    sweeps = world.stream(lamps, on_markers, seconds, sensors=SPAN)
     start = int(sweeps.time_ns[0])
     markers = tuple(
         Marker(
@@ -134,8 +134,8 @@ def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
             (
                 MarkerVisit(
                     "robot",
-                    start + round((PERIOD_S * k + 0.2) * 1e9),
-                    start + round((PERIOD_S * k + 1.3) * 1e9),
+                    start + round((PERIOD_S * k + 0.1) * 1e9),
+                    start + round((PERIOD_S * k + 0.6) * 1e9),
                 ),
             ),
         )
@@ -146,7 +146,7 @@ def marked(world: Any, count: int) -> tuple[Any, Any, tuple[Marker, ...]]:
 
 @pytest.mark.slow
 def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> None:
-    lamps, sweeps, markers = marked(world, 4)
+    lamps, sweeps, markers = marked(world, 4, 6.0)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     scene = solution.artifact
     assert (scene.scale, scene.frame) == ("markers", "floor")
@@ -167,7 +167,7 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> No
 
 @pytest.mark.slow
 def test_two_markers_determine_no_frame(world: Any) -> None:
-    _, sweeps, markers = marked(world, 2)
+    _, sweeps, markers = marked(world, 2, 2.5)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     assert solution.artifact.scale == "device"
     assert {"too_few_markers", "device_scale"} <= codes(solution)
@@ -175,7 +175,7 @@ def test_two_markers_determine_no_frame(world: Any) -> None:
 
 @pytest.mark.slow
 def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
-    _, sweeps, markers = marked(world, 4)
+    _, sweeps, markers = marked(world, 4, 4.0)
     wrong = replace(markers[3], position=markers[3].position + [0.15, 0.0, 0.0])
     solution = solve(sweeps, Scene(markers=(*markers[:3], wrong)), receivers={"robot": RIGID})
     assert "marker_misfit" in codes(solution)
@@ -184,7 +184,7 @@ def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
 @pytest.mark.slow
 def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps, position_at, 6.0, sensors=SPAN)
+    sweeps = world.stream(lamps, position_at, 3.0, sensors=SPAN)
     checks = facts_of(solve(sweeps, scene, receivers={"robot": RIGID}))["verification"]
     assert checks["held_out"]
     assert [check["channel"] for check in checks["stations"]] == [1, 2, 5]
@@ -197,7 +197,7 @@ def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> 
 @pytest.mark.slow
 def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps, position_at, 6.0, sensors=SPAN)
+    sweeps = world.stream(lamps, position_at, 3.0, sensors=SPAN)
     first, second, third = scene.stations
     moved = replace(second, position=second.position + [0.0, 0.0, 0.08])
     solution = solve(
@@ -212,7 +212,7 @@ def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: A
 @pytest.mark.slow
 def test_one_station_has_no_other_to_be_verified_against(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps[:1], position_at, 4.0, sensors=SPAN)
+    sweeps = world.stream(lamps[:1], position_at, 2.0, sensors=SPAN)
     solution = solve(sweeps, scene, receivers={"robot": RIGID})
     assert "verification" not in facts_of(solution)
     assert "verification_rad" not in detections_of(solution)[0]

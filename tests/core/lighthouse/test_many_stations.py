@@ -109,8 +109,8 @@ def test_three_stations_of_which_no_place_sees_all(world: Any, flat: bool) -> No
 @pytest.mark.parametrize("flat", [True, False])
 def test_four_stations_in_pairs_only(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2, 5, 16)
-    points = world.curve(300, flat=flat)
-    angles = np.full((300, 4, 2), np.nan)
+    points = world.curve(180, flat=flat)
+    angles = np.full((180, 4, 2), np.nan)
     every = seen_by(lamps, points)
     for k, pair in enumerate([(0, 1), (1, 2), (2, 3), (0, 3), (0, 2), (1, 3)]):
         angles[k::6, pair] = every[k::6, pair]
@@ -164,13 +164,14 @@ def test_of_two_islands_the_larger_is_solved(world: Any, flat: bool) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flat", [True, False])
-@pytest.mark.parametrize(("number", "length"), [(6, 9.0), (16, 24.0)])
+@pytest.mark.parametrize(
+    ("number", "length", "flat"), [(6, 9.0, True), (6, 9.0, False), (16, 24.0, False)]
+)
 def test_a_hall_of_stations_of_which_three_see_a_place(
     world: Any, number: int, length: float, flat: bool
 ) -> None:
     lamps = hall(world, number, length)
-    points = along(60 * number, length, flat)
+    points = along(40 * number, length, flat)
     found = run(nearest(lamps, points, seen_by(lamps, points), 3))
     assert found.planar is flat
     assert found.stations == tuple(range(number))

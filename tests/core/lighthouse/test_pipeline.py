@@ -60,7 +60,7 @@ def factory(channel: int, number: int) -> tuple[int, ...]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate_hz", "resolution_hz"),
-    [(24e6, None), (32e6, None), (40e6, None), (100e6, None), (1e9, 5e8), (1e9, 24e6)],
+    [(24e6, None), (40e6, None), (1e9, 5e8), (1e9, 24e6)],
 )
 def test_all_at_once(light: Any, rate_hz: float, resolution_hz: float | None) -> None:
     path = light.Receiving(
@@ -152,7 +152,7 @@ def test_a_station_that_says_another_channel(light: Any) -> None:
 @pytest.mark.slow
 def test_missed_sweeps_are_counted(light: Any) -> None:
     path = light.Receiving(spoiled=0.1, rim_s=1e-6)
-    lines, passed = light.of([light.Sender(2)], 20.0, path, sensors=2)
+    lines, passed = light.of([light.Sender(2)], 10.0, path, sensors=2)
     (station,) = demodulate_recording(lines).stations
     assert station.missed == pytest.approx(passed.spoiled.sum(), rel=0.03)
     assert station.decode_rate == pytest.approx(0.9, abs=0.015)
@@ -185,12 +185,12 @@ def test_motion_capture_is_dropped(light: Any) -> None:
 
 @pytest.mark.slow
 def test_light_that_does_not_end(light: Any) -> None:
-    # Half a second without a gap, right behind a sweep, is one burst.
-    (line,), passed = light.of([light.Sender(3)], 1.0)
+    # A tenth of a second without a gap, right behind a sweep, is one burst.
+    (line,), passed = light.of([light.Sender(3)], 0.7)
     last = line.tick[np.searchsorted(line.tick, 0.4 * 40e6) - 1] + 80
-    tick = np.union1d(line.tick, last + 9 * np.arange(2_200_000))
+    tick = np.union1d(line.tick, last + 9 * np.arange(440_000))
     got = demodulate_recording([replace(line, tick=tick)])
-    left = passed.time_s[(passed.time_s < 0.3999) | (passed.time_s > 0.9)]
+    left = passed.time_s[(passed.time_s < 0.3999) | (passed.time_s > 0.5)]
     assert len(left) - 4 <= len(got.sweeps) <= len(left) + 2
 
 

@@ -134,7 +134,7 @@ def test_grid_from_few_places(grid: Grid, places: int, paper_mm: float) -> None:
     rng = np.random.default_rng(0)
     _, place = np.unique(grid.truth, axis=0, return_inverse=True)
     errors = []
-    for _ in range(8):
+    for _ in range(4):
         chosen = rng.choice(140, places, replace=False)
         rows = np.array([rng.choice(np.flatnonzero(place == k)) for k in chosen])
         index = (rows[:, None] * 4 + np.arange(4)).ravel()

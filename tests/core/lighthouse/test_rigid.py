@@ -160,11 +160,11 @@ def normalized_error(solution: Solution, motion: Motion) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("planes_known", [True, False])
 def test_a_moving_tracker_is_tracked(planes_known: bool) -> None:
-    sweeps = record(ROOM, TRACKER, carried, 2.0, planes_known=planes_known)
+    sweeps = record(ROOM, TRACKER, carried, 1.2, planes_known=planes_known)
     solution = solve_devices(sweeps, {"device": TRACKER}, Scene(ROOM, frame="room"))
     (track,) = solution.trajectories
     assert (track.device, track.frame) == ("device", "room")
-    assert len(track) >= 98
+    assert len(track) >= 56
     assert np.all(np.diff(track.time_ns) > 0)
     off = errors(solution, carried)
     # In one rotation it moves 10 mm and turns 2 degrees.
@@ -185,7 +185,7 @@ def test_one_station_determines_the_pose_of_a_non_coplanar_device() -> None:
 
 @pytest.mark.slow
 def test_the_scene_is_estimated_from_the_device_alone() -> None:
-    sweeps = record(ROOM, TRACKER, carried, 6.0)
+    sweeps = record(ROOM, TRACKER, carried, 3.0)
     known = {s.channel: s.calibration for s in ROOM}
     solution = solve_devices(sweeps, {"device": TRACKER}, Scene(calibrations=known, ids={4: 77}))
     scene = solution.artifact
@@ -200,12 +200,12 @@ def test_the_scene_is_estimated_from_the_device_alone() -> None:
         if found.channel != 1:
             off = np.r_[found.position - place, turn]
             assert off @ np.linalg.solve(found.covariance, off) < 40
-    assert len(solution.trajectories[0]) > 290
+    assert len(solution.trajectories[0]) > 145
 
 
 @pytest.mark.slow
 def test_without_calibration_the_trajectory_is_right_after_a_rigid_transform() -> None:
-    sweeps = record(ROOM, TRACKER, carried, 6.0)
+    sweeps = record(ROOM, TRACKER, carried, 3.0)
     solution = solve_devices(sweeps, {"device": TRACKER})
     track = solution.trajectories[0]
     truth, rotation = carried((track.time_ns - START_NS) * 1e-9)
@@ -270,13 +270,13 @@ def test_a_deck_at_rest_does_not_determine_a_scene() -> None:
 
 @pytest.mark.slow
 def test_outliers_are_rejected_and_counted() -> None:
-    sweeps = record(ROOM, TRACKER, carried, 2.0)
+    sweeps = record(ROOM, TRACKER, carried, 1.2)
     rng = np.random.default_rng(1)
     wrong = rng.random(len(sweeps)) < 0.1
     count = np.where(wrong, sweeps.count + rng.normal(0, 4000, len(sweeps)), sweeps.count)
     solution = solve_devices(replace(sweeps, count=count), {"device": TRACKER}, Scene(ROOM))
     off = errors(solution, carried)
-    assert len(off) >= 95
+    assert len(off) >= 55
     assert np.percentile(np.linalg.norm(off[:, :3], axis=1), 95) < 0.5e-3
     left_out = sum(
         solution.rejected.get(r, 0) for r in ("sweep_contradicts_pose", "count_above_period")
@@ -287,7 +287,7 @@ def test_outliers_are_rejected_and_counted() -> None:
 @pytest.mark.slow
 def test_a_moved_station_is_reported() -> None:
     moved = replace(ROOM[2], position=ROOM[2].position + [0.3, 0.0, 0.0])
-    sweeps = record((*ROOM[:2], moved), TRACKER, carried, 2.0)
+    sweeps = record((*ROOM[:2], moved), TRACKER, carried, 1.2)
     solution = solve_devices(sweeps, {"device": TRACKER}, Scene(ROOM))
     off = errors(solution, carried)
     assert np.percentile(np.linalg.norm(off[:, :3], axis=1), 95) < 1e-3
@@ -360,7 +360,7 @@ def test_the_poses_of_a_recorded_tracker_agree_with_libsurvive(data: Path) -> No
     truth = session.truth[0]
     # Ten seconds after its first poses, when libsurvive had settled.
     since = session.sweeps.time_ns - truth.time_ns[0]
-    chosen = (since > 12_000_000_000) & (since < 15_000_000_000)
+    chosen = (since > 12_000_000_000) & (since < 13_500_000_000)
     sweeps = Sweeps(
         session.sweeps.devices,
         *(
@@ -372,7 +372,7 @@ def test_the_poses_of_a_recorded_tracker_agree_with_libsurvive(data: Path) -> No
     )  # fmt: skip
     solution = solve_devices(sweeps, session.receivers, session.scene)
     (track,) = solution.trajectories
-    assert len(track) > 145
+    assert len(track) > 70
     at = np.searchsorted(truth.time_ns, track.time_ns)
     away = np.linalg.norm(track.position - truth.position[at], axis=1)
     turned = np.swapaxes(matrix_from_quaternion(truth.quaternion[at]), 1, 2)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.dots.codec import SECTION_LENGTH
@@ -55,6 +55,7 @@ AREAS = st.builds(
 
 
 @pytest.mark.slow
+@settings(max_examples=40, deadline=None)
 @given(st.lists(AREAS, max_size=5))
 def test_any_areas_come_back(tmp_path_factory: pytest.TempPathFactory, areas: list[Area]) -> None:
     path = tmp_path_factory.mktemp("ledger") / LEDGER_FILE

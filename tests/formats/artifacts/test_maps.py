@@ -102,7 +102,7 @@ def floors(draw: st.DrawFn) -> FloorMap:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(floors())
 def test_every_map_comes_back_to_the_last_bit(floor: FloorMap) -> None:
     text = dumps_map(floor)
@@ -133,7 +133,7 @@ def sensors(draw: st.DrawFn) -> HallSensors:
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(sensors())
 def test_all_halls_come_back_to_the_last_bit(halls: HallSensors) -> None:
     text = dumps_halls(halls)

@@ -46,7 +46,7 @@ def same(one: Receiver, other: Receiver) -> bool:
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(receiver())
 def test_every_receiver_comes_back_to_the_last_bit(found: Receiver) -> None:
     text = dumps_receiver(found)
@@ -101,7 +101,7 @@ def test_errors_name_key_and_expected_value(
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_damaged_text_is_refused_or_read(data: st.DataObject) -> None:
     text = bytearray(dumps_receiver(DECK).encode())

@@ -100,7 +100,7 @@ def plain(value: object) -> object:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(scenes())
 def test_every_scene_comes_back_to_the_last_bit(scene: Scene) -> None:
     text = dumps_scene(scene)

@@ -88,7 +88,7 @@ def cameras(draw: st.DrawFn) -> Camera:
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(manifests())
 def test_every_manifest_comes_back_to_the_last_bit(manifest: Manifest) -> None:
     text = dumps_manifest(manifest)
@@ -97,7 +97,7 @@ def test_every_manifest_comes_back_to_the_last_bit(manifest: Manifest) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(cameras())
 def test_every_camera_comes_back_to_the_last_bit(camera: Camera) -> None:
     text = dumps_camera(camera)
@@ -256,7 +256,7 @@ def test_errors_of_a_camera_name_key_and_expected_value(
 
 @pytest.mark.slow
 @given(cameras())
-@settings(deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_valid_cameras_are_invertible_in_the_whole_frame(camera: Camera) -> None:
     """The check of `radial` ensures this."""
     read = loads_camera(dumps_camera(camera))

@@ -86,7 +86,7 @@ def tag_sets(draw: st.DrawFn) -> Tags:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(tag_sets())
 def test_all_tags_come_back_to_the_last_bit(tags: Tags) -> None:
     text = dumps_tags(tags)
@@ -111,7 +111,7 @@ def sensor_arrays(draw: st.DrawFn) -> SensorArray:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(sensor_arrays())
 def test_every_array_comes_back_to_the_last_bit(array: SensorArray) -> None:
     text = dumps_array(array)
@@ -122,7 +122,7 @@ def test_every_array_comes_back_to_the_last_bit(array: SensorArray) -> None:
 
 
 @pytest.mark.slow
-@settings(deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.floats(-7, 7), st.decimals(-360, 360, places=2))
 def test_degrees_keep_their_digits(angle: float, degrees: Decimal) -> None:
     tags = Tags(site={0: PlanarPose(0.0, 0.0, angle)})

@@ -58,7 +58,7 @@ def back_from_lif(floor: FloorMap) -> FloorMap:
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(placed_floors())
 def test_a_map_as_designed_comes_back(floor: FloorMap) -> None:
     for back in (back_from_csv(floor), back_from_lif(floor)):
@@ -70,7 +70,7 @@ def test_a_map_as_designed_comes_back(floor: FloorMap) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(placed_floors(), st.data())
 def test_landmarks_as_built_keep_their_positions(floor: FloorMap, data: st.DataObject) -> None:
     """Which part of a place is the grid's cannot be known; the places are the same."""

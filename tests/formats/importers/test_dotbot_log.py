@@ -288,7 +288,7 @@ WHOLE = (
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=90)
 @given(st.data())
 def test_damaged_logs_give_an_error_or_sweeps(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -56,7 +56,7 @@ from locatk.formats.sessions import station_reports as heard
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
-SECONDS = float(os.environ.get("LOCATK_FUZZ_SECONDS", "5"))
+SECONDS = float(os.environ.get("LOCATK_FUZZ_SECONDS", "2"))
 SEED, FIRST = (int(n) for n in os.environ.get("LOCATK_FUZZ_START", "8:0").split(":"))
 
 HANGS_S = 60
@@ -658,7 +658,7 @@ def bombs() -> dict[str, bytes]:
         "line.csv": b"Time [s],A\n" + b"0" * (32 << 20),
         "sweeps.gz": squeezed(recording(), b"1.1 WM0 W 1 1 1 0\n", 128),
         "names.gz": squeezed(b"", b"".join(b"1 n%d POSE 1 1 1 1 1 1 1\n" % k for k in range(9000)),
-                             5),
+                             1),
         "line.gz": squeezed(b"0.1 OPTION v i 100\n", b"x", 128),
         "line.log": LOGS[0] + b"poly=1 lfsr_index=" + b"9" * (32 << 20),
         "deep.log": b'{"lfsr_index": ' + deep + b"\n",

@@ -28,6 +28,7 @@ from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.rec_file import read_rec_file
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.libsurvive.sweeps import assign_planes, read_device_sweeps
+from locatk.formats.importers.lighthouse import ImportedSession
 
 PUBLISHED = "lighthouse/libsurvive/tracker-cal-attempt.rec.gz"
 
@@ -626,7 +627,7 @@ def test_stored_calibrations(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_damage_of_any_kind_is_an_error_or_a_warning(tmp_path: Path, data: st.DataObject) -> None:
     content = bytearray(Room(seconds=0.3).build().text("0.2 WM0 POSE 1 2 3 1 0 0 0"))
@@ -664,7 +665,7 @@ def test_damage_of_any_kind_is_an_error_or_a_warning(tmp_path: Path, data: st.Da
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     st.lists(
         st.tuples(
@@ -715,9 +716,16 @@ def published(data: Path) -> Path:
     return file
 
 
+@pytest.fixture(scope="module")
+def imported(published: Path) -> ImportedSession:
+    return read_libsurvive([published], stations=True)
+
+
 @pytest.mark.slow
-def test_published_calibrations_are_those_that_libsurvive_stored(published: Path) -> None:
-    session = read_libsurvive([published])
+def test_published_calibrations_are_those_that_libsurvive_stored(
+    published: Path, imported: ImportedSession
+) -> None:
+    session = imported
     stored = read_stored_calibrations(published.with_name(published.name + ".json"))
     assert session.lost is None
     assert session.warnings == []
@@ -759,8 +767,10 @@ def test_published_angles_are_libsurvives_but_for_the_noise_of_single_syncs(
 
 
 @pytest.mark.slow
-def test_published_poses_photodiodes_and_stations_are_of_one_frame(published: Path) -> None:
-    session = read_libsurvive([published], stations=True)
+def test_published_poses_photodiodes_and_stations_are_of_one_frame(
+    imported: ImportedSession,
+) -> None:
+    session = imported
     assert session.scene is not None
     (truth,) = session.truth
     rotation = matrix_from_quaternion(np.median(truth.quaternion, axis=0))

@@ -159,7 +159,7 @@ def lines(draw: st.DrawFn) -> tuple[list[int], list[int]]:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(lines(), st.integers(0, 1), st.sampled_from([1, 40, 1 << 17]))
 def test_every_edge_arrives_also_on_the_border_of_chunks(
     tmp_path_factory: pytest.TempPathFactory,
@@ -417,7 +417,7 @@ FEW_EXPORTED = export([tick / RATE for tick in light(2, 20)], span=(0, 1))
 
 
 @pytest.mark.slow
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=90, deadline=None)
 @given(st.data())
 def test_damage_raises_nothing_but_what_it_should(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

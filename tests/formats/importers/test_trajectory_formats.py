@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError, OutputExistsError
@@ -45,6 +45,7 @@ def poses(draw: st.DrawFn, names: st.SearchStrategy[str] = NAMES) -> Trajectory:
 
 
 @pytest.mark.slow
+@settings(max_examples=30, deadline=None)
 @given(st.lists(poses(), max_size=3, unique_by=lambda p: p.device).filter(len))
 def test_csv_round_trip(tmp_path_factory: pytest.TempPathFactory, written: list) -> None:
     file = tmp_path_factory.mktemp("csv") / "poses.csv"
@@ -59,6 +60,7 @@ def test_csv_round_trip(tmp_path_factory: pytest.TempPathFactory, written: list)
 
 
 @pytest.mark.slow
+@settings(max_examples=30, deadline=None)
 @given(poses())
 def test_tum_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Trajectory) -> None:
     file = tmp_path_factory.mktemp("tum") / "poses.tum"
@@ -71,6 +73,7 @@ def test_tum_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Traje
 
 
 @pytest.mark.slow
+@settings(max_examples=30, deadline=None)
 @given(poses())
 def test_kitti_round_trip(tmp_path_factory: pytest.TempPathFactory, written: Trajectory) -> None:
     file = tmp_path_factory.mktemp("kitti") / "poses.txt"
