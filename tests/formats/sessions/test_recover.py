@@ -31,7 +31,7 @@ from locatk.formats.sessions.recovery import recover as recovery
 from locatk.formats.sessions.recovery.recover import Recovered, Rewriter, recover
 
 START_NS = 1_700_000_000_000_000_000
-CHUNKS = 24
+CHUNKS = 14
 READ = 700
 """Bytes of one message of raw bytes; ten of them a chunk."""
 
@@ -261,7 +261,7 @@ def test_random_flips(good: Whole, tmp_path: Path, seed: int) -> None:
         assert result.chunks >= CHUNKS - 1
         assert result.ended
     for _ in range(6):
-        check(good, flipped(good.data, noise, 20), tmp_path, one=False)
+        check(good, flipped(good.data, noise, 12), tmp_path, one=False)
 
 
 @pytest.mark.slow
