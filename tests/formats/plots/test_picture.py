@@ -133,6 +133,7 @@ def test_nothing_is_left_behind_when_drawing_fails(
 
 def test_no_module_imports_pyplot(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    monkeypatch.delattr(mpl, "pyplot", raising=False)
     modules = [
         module.name for module in pkgutil.iter_modules(plots.__path__, "locatk.formats.plots.")
     ]
