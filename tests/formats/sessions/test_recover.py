@@ -276,7 +276,7 @@ def test_random_flips_of_frames_and_heads(good: Whole, tmp_path: Path, seed: int
         result = check(good, flipped(good.data, noise, 1, places), tmp_path)
         assert result is not None
         assert result.chunks >= CHUNKS - 1
-    for _ in range(4):  # the summary and the footer
+    for _ in range(8):  # the summary and the footer
         places = range(good.chunks[-1][1], len(good.data))
         result = check(good, flipped(good.data, noise, 1, places), tmp_path)
         assert result is not None
