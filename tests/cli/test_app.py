@@ -40,25 +40,21 @@ def every_command(command: click.Command = app, path: tuple[str, ...] = ()) -> I
 
 
 @pytest.mark.parametrize("path", [path for path, _ in every_command()], ids=" ".join)
-def test_every_help_has_examples_that_parse(locatk: Run, path: tuple[str, ...]) -> None:
+def test_every_help_has_valid_examples(
+    locatk: Run, path: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each example of each help names commands and options that exist."""
     result = locatk(*path, "--help")
     assert result.exit_code == 0
     assert "Examples:" in result.stdout
-    examples = [line.strip() for line in result.stdout.split("Examples:")[1].splitlines()]
+    text = result.stdout.split("Examples:")[1].replace("\\\n", " ")
+    examples = [line.strip() for line in text.splitlines()]
     examples = [line for line in examples if line.startswith("locatk ")]
     assert examples
     assert any(line.startswith("locatk " + " ".join(path)) for line in examples)
-
-
-@pytest.mark.parametrize("path", [path for path, _ in every_command()], ids=" ".join)
-def test_examples_are_valid_usage(path: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each example of each help names commands and options that exist."""
     monkeypatch.setattr(Path, "exists", lambda self, **_: True)
     monkeypatch.delenv("LOCATK_DATA", raising=False)
-    text = CliRunner().invoke(app, [*path, "--help"]).stdout
-    for line in text.split("Examples:")[1].replace("\\\n", " ").splitlines():
-        if not line.strip().startswith("locatk "):
-            continue
+    for line in examples:
         args = shlex.split(line)[1:]
         if ">" in args:  # The shell redirects the output.
             args = args[: args.index(">")]
@@ -88,13 +84,9 @@ def context_of(path: str, command: click.Command) -> click.Context:
 
 
 @pytest.mark.parametrize(("path", "command"), LEAVES, ids=[path for path, _ in LEAVES])
-def test_help_fits_80_columns(path: str, command: click.Command) -> None:
-    text = command.get_help(context_of(path, command))
-    assert [line for line in text.splitlines() if len(line) > 80] == []
-
-
-@pytest.mark.parametrize(("path", "command"), LEAVES, ids=[path for path, _ in LEAVES])
-def test_every_option_has_help_and_a_section(path: str, command: click.Command) -> None:
+def test_every_option_has_a_section_and_help_of_80_columns(
+    path: str, command: click.Command
+) -> None:
     assert isinstance(command, Command)
     context = context_of(path, command)
     parameters = [p for p in command.get_params(context) if isinstance(p, click.Option)]
@@ -106,6 +98,7 @@ def test_every_option_has_help_and_a_section(path: str, command: click.Command) 
     assert len(own) <= MAX_UNDIVIDED_OPTIONS or len(sections) > 1
     assert {command.section_of(parameter) for parameter in general} == {"Options"}
     text = command.get_help(context)
+    assert [line for line in text.splitlines() if len(line) > 80] == []
     titles = [line[:-1] for line in text.splitlines() if line.endswith(":") and line[0] != " "]
     assert {title for title in titles if title != "General"} == set(sections)
     assert text.count("\nGeneral:\n") == 1
@@ -130,18 +123,16 @@ def test_an_option_has_the_same_words_everywhere(option: str) -> None:
     assert exceptions <= set(texts)
 
 
-TABLES = [
-    (name, module, short)
-    for table in (COMMANDS, calibrate.COMMANDS)
-    for name, (module, short) in table.items()
-]
-
-
-@pytest.mark.parametrize(("name", "module", "short"), TABLES, ids=[row[0] for row in TABLES])
-def test_table_agrees_with_commands(name: str, module: str, short: str) -> None:
-    command = importlib.import_module(module).command
-    assert command.short_help == short
-    assert name in (command.name, module.rsplit(".", 1)[-1].rstrip("_"), module.split(".")[2])
+def test_tables_agree_with_commands() -> None:
+    for table in (COMMANDS, calibrate.COMMANDS):
+        for name, (module, short) in table.items():
+            command = importlib.import_module(module).command
+            assert command.short_help == short, name
+            assert name in (
+                command.name,
+                module.rsplit(".", 1)[-1].rstrip("_"),
+                module.split(".")[2],
+            )
 
 
 @pytest.mark.slow

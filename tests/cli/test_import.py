@@ -283,20 +283,3 @@ def test_a_crazyflie_config_becomes_a_scene(locatk, tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert result.stderr.startswith("Error: ")
     assert artifacts.read_scene(out).station(1) is not None
-
-
-@pytest.mark.slow
-def test_published_recording_of_libsurvive(locatk, data: Path, tmp_path: Path) -> None:
-    source = data / "lighthouse" / "libsurvive" / "tracker-cal-attempt.rec.gz"
-    out = tmp_path / "run.mcap"
-    result = locatk("import", "libsurvive", source, "-o", out, "--json")
-    assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
-    assert [station["calibration"] for station in answer["stations"]] == ["factory"] * 4
-    assert all(abs(station["ppm"]) < 10 for station in answer["stations"])
-    told = json.loads(locatk("info", out, "--json").stdout)
-    assert [station["id"] for station in told["stations"]] == [
-        int(station["id"], 16) for station in answer["stations"]
-    ]
-    [receiver] = told["receivers"]
-    assert (receiver["device"], receiver["sensors"]) == ("WM0", 22)

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 
+from locatk.cli.app import app
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation import session as simulate
 from locatk.core.landmarks.simulation.floor import install_landmarks
@@ -55,6 +57,14 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
+def calibration(runs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
+    """Result and output of `locatk calibrate map` of these recordings."""
+    out = tmp_path_factory.mktemp("calibration") / "built.toml"
+    arguments = ["calibrate", "map", *map(str, runs), "-o", str(out)]
+    return CliRunner().invoke(app, arguments), out
+
+
+@pytest.fixture(scope="module")
 def other(tmp_path_factory: pytest.TempPathFactory) -> SimulatedSession:
     """A drive over three of them, one with a flipped bar: by the map as designed, nowhere."""
     return drive(((0, 0), (0, 1), (1, 1)), 9)
@@ -67,9 +77,8 @@ def sound() -> SimulatedSession:
 
 
 @pytest.mark.slow
-def test_sessions_in_a_map_as_built_out(locatk, runs: list[Path], tmp_path: Path) -> None:
-    out = tmp_path / "built.toml"
-    result = locatk("calibrate", "map", *runs, "-o", out)
+def test_sessions_in_a_map_as_built_out(calibration: tuple[Result, Path]) -> None:
+    result, out = calibration
     assert result.exit_code == 0, result.stderr
     floor = maps.read_map(out)
     assert maps.dumps_map(replace(floor, built={})) == maps.dumps_map(FLOOR)
@@ -124,10 +133,9 @@ def test_json_is_all_that_is_on_stdout(locatk, runs: list[Path], tmp_path: Path)
 
 @pytest.mark.slow
 def test_later_sessions_are_solved_with_it(
-    locatk, runs: list[Path], other: SimulatedSession, tmp_path: Path
+    locatk, calibration: tuple[Result, Path], other: SimulatedSession, tmp_path: Path
 ) -> None:
-    out, later = tmp_path / "built.toml", write(tmp_path / "later.mcap", other)
-    assert locatk("calibrate", "map", *runs, "-o", out).exit_code == 0
+    (_, out), later = calibration, write(tmp_path / "later.mcap", other)
     assert locatk("solve", later, "-o", tmp_path / "a.mcap").exit_code == 3
     result = locatk("solve", later, "-o", tmp_path / "b.mcap", "--artifact", out, "--json")
     cells = [seen["cell"] for seen in json.loads(result.stdout)["sessions"][0]["detections"]]

@@ -92,10 +92,10 @@ def test_megabytes_a_second(line: Any, process: Any, tmp_path: Path, raw_bytes: 
     capture = process("capture", port.path, "--device", "raw", "-o", path, "--json")
     capture.until("Recording")
     with sending(port, 3e6) as sent:
-        capture.until("\n0:02  ")
+        capture.until("\n0:01  ")
     assert capture.stop() == 0
     kept = raw_bytes(path)
-    assert len(kept) > 3_000_000
+    assert len(kept) > 1_500_000
     assert kept == bytes(sent)
     report = json.loads(capture.stdout)
     assert report["bytes"] == len(sent)
@@ -112,7 +112,7 @@ def test_killed_it_loses_half_a_second(
     line: Any, process: Any, tmp_path: Path, raw_bytes: Any, locatk: Any
 ) -> None:
     """At random instants; the first at once, when nothing was flushed yet."""
-    delays = [0.0, *np.random.default_rng().uniform(0.05, 0.9, 4)]
+    delays = [0.0, *np.random.default_rng().uniform([0.05, 0.5], [0.5, 0.9])]
     ports = [line(f"port{number}") for number in range(len(delays))]
     paths = [tmp_path / f"run{number}.mcap" for number in range(len(delays))]
     captures = [
@@ -149,16 +149,15 @@ def test_killed_it_loses_half_a_second(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_finish_the_file(
-    line: Any, process: Any, tmp_path: Path, raw_bytes: Any, number: signal.Signals
+def test_termination_finishes_the_file(
+    line: Any, process: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
     port, path = line(), tmp_path / "run.mcap"
     capture = process("capture", port.path, "--device", "raw", "-o", path)
     capture.until("Recording")
     with sending(port, 50e3) as sent:
         time.sleep(0.3)
-        capture.signal(number)
+        capture.signal(signal.SIGTERM)
         assert capture.end() == 0
     assert Session.open(path).damage is None
     kept = raw_bytes(path)
@@ -201,6 +200,7 @@ def test_doubled_signals(
     assert bytes(sent).startswith(raw_bytes(path))
     assert facts(path)["ended"] == "stopped"
     assert "stopped" in capture.stdout
+    assert "Traceback" not in capture.stderr
 
 
 HANG = """
@@ -370,7 +370,7 @@ def test_who_holds_the_port_is_said(line: Any, process: Any, tmp_path: Path) -> 
 @pytest.mark.slow
 def test_a_disk_that_fills(line: Any, process: Any, small_disk: Path, raw_bytes: Any) -> None:
     port, path = line(), small_disk / "run.mcap"
-    given = ("--device", "raw", "-o", path, "--reserve", "1.5MB", "--json")
+    given = ("--device", "raw", "-o", path, "--reserve", "2MB", "--json")
     capture = process("capture", port.path, *given)
     capture.until("Recording")
     with sending(port, 1.2e6) as sent:

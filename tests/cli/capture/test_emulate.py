@@ -209,7 +209,7 @@ def test_errors_are_one_line(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_signals_end_it_cleanly(run: Path, number: signal.Signals) -> None:
     """Also for a device that sends for ever; the totals are told nevertheless."""
     command = [sys.executable, "-m", "locatk.cli", "emulate", str(run), "--json", "--loop", "0"]

@@ -29,7 +29,7 @@ def session(folder: Path) -> Path:
 
     path = folder / "deck.mcap"
     words = ["simulate", "lighthouse", "-o", str(path), "--3d", "--receiver", "deck"]
-    done = CliRunner().invoke(app, [*words, "--duration", "24", "--noise-udeg", "6600"])
+    done = CliRunner().invoke(app, [*words, "--duration", "14", "--noise-udeg", "6600"])
     assert done.exit_code == 0, done.output
     return path
 
@@ -40,7 +40,7 @@ def test_poses_are_full_and_in_the_frame_of_the_markers(
 ) -> None:
     solved = folder / "solved.mcap"
     answer = json.loads(locatk("solve", session, "-o", solved, "--json").stdout)["sessions"][0]
-    assert answer["poses"] > 500
+    assert answer["poses"] > 250
     for row in answer["detections"]:
         assert row["verification_m"] < 0.01
     shown = locatk("info", solved).stdout

@@ -116,9 +116,11 @@ def holds(path: Path, wanted: SimulatedSession) -> Session:
 @pytest.mark.slow
 def test_a_session_holds_samples_map_odometry_and_truth(locatk, floor: Path) -> None:
     out = floor.with_name("run.mcap")
-    result = locatk("simulate", "landmarks", floor, "-o", out, "--seed", 3, "--json")
+    result = locatk(
+        "simulate", "landmarks", floor, "-o", out, "--seed", 3, "--landmarks", 4, "--json"
+    )
     assert result.exit_code == 0, result.stderr
-    wanted = simulate(FloorMap(CODES), SimulationOptions(seed=3))
+    wanted = simulate(FloorMap(CODES), SimulationOptions(seed=3, landmarks=4))
     session = holds(out, wanted)
     told = json.loads(result.stdout)
     visits = told.pop("visits")

@@ -523,7 +523,13 @@ def test_published_tracker_whole_and_cut(locatk, data: Path, tmp_path: Path) -> 
     told = answer(locatk("import", "libsurvive", source, "-o", run, "--json"))
     assert [station["channel"] for station in told["stations"]] == [1, 4, 8, 12]
     assert {station["calibration"] for station in told["stations"]} == {"factory"}
+    assert all(abs(station["ppm"]) < 10 for station in told["stations"])
     assert told["truth_poses"] > 7000
+    shown = json.loads(locatk("info", run, "--json").stdout)
+    ids = [int(station["id"], 16) for station in told["stations"]]
+    assert [station["id"] for station in shown["stations"]] == ids
+    [receiver] = shown["receivers"]
+    assert (receiver["device"], receiver["sensors"]) == ("WM0", 22)
     part.write_bytes(source.read_bytes()[:1_000_000])
     cut = tmp_path / "cut.mcap"
     result = locatk("import", "libsurvive", part, "-o", cut, "--json")

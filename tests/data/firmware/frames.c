@@ -202,10 +202,10 @@ int main(int count, char **arguments)
         writers[n].node = (uint8_t)n;
         greet(&writers[n]);
     }
-    for (n = 0; n < 3000; n++) any(&writers[below(NODES)]);
+    for (n = 0; n < 1500; n++) any(&writers[below(NODES)]);
     /* Every length of content around 254, 256, 508 and the longest. */
     for (length = 0; length < 530; length++)
-        for (n = 0; n < 4; n++) text(&writers[1], length);
+        for (n = 0; n < 2; n++) text(&writers[1], length);
     for (length = LOCATK_LONGEST_PAYLOAD - 20; length < LOCATK_LONGEST_PAYLOAD + 3; length++)
         for (n = 0; n < 4; n++) text(&writers[0], length - 1);
     for (n = 0; n < NODES; n++) greet(&writers[n]);

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from locatk.formats.capture import ports, recorder
+from locatk.formats.capture import ports, reader_thread, recorder
 from locatk.formats.capture import setup as session
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns
 from locatk.formats.capture.recorder import Limits
@@ -189,7 +189,8 @@ def start(
     """``start("raw", duration_s=1, name="red")`` records the port to ``run.mcap``; the names of
     limits are theirs, all others those of what is wanted. Nothing may be left afterwards."""
     monkeypatch.setattr(ports, "port_of", lambda *args, **more: port)
-    monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.05)  # instead of a second
+    monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.02)  # instead of a second
+    monkeypatch.setattr(reader_thread, "BACKOFF_S", (0.01, 0.02))
     before = _left()
     running: list[Running] = []
 

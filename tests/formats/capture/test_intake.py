@@ -175,7 +175,7 @@ def test_raw_bytes_come_first_then_records() -> None:
     assert intake.declared == [(RAW, SerialChunk)]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.binary(max_size=60).map(lambda d: d.replace(b"!", b".")), cut=st.data())
 def test_how_it_was_read_changes_no_record(data: bytes, cut: st.DataObject) -> None:
     places = sorted(cut.draw(st.sets(st.integers(1, max(1, len(data) - 1)), max_size=8)))

@@ -136,21 +136,21 @@ def test_a_disk_that_is_slow_costs_no_byte(
     real = LiveFile.write
 
     def slow(self: LiveFile, data: bytes) -> int:
-        time.sleep(0.03)
+        time.sleep(0.015)
         return real(self, data)
 
     monkeypatch.setattr(LiveFile, "write", slow)
     monkeypatch.setattr(
-        session, "PortReader", lambda *args: PortReader(*args, max_waiting_bytes=50_000)
+        session, "PortReader", lambda *args: PortReader(*args, max_waiting_bytes=20_000)
     )
-    sent = pieces(200, size=1000)
+    sent = pieces(80, size=1000)
     running = start(flush_s=0.02)
     port.send(*sent)
     port.settle()
     running.until_said("the disk is slower than the port")
     recorded = running.end()
     assert raw_bytes(*recorded.paths) == b"".join(sent)
-    assert 0 < recorded.totals.high_water_bytes <= 51_000
+    assert 0 < recorded.totals.high_water_bytes <= 21_000
 
 
 def test_a_disk_that_hangs_does_not_stop_the_reading(
@@ -216,7 +216,6 @@ def test_whatever_comes_together(
         return real(self, data)
 
     monkeypatch.setattr(LiveFile, "write", sometimes_slow)
-    monkeypatch.setattr(receiver, "BACKOFF_S", (0.001, 0.01))
     most = chance.choice([2_000, 1 << 20])
     monkeypatch.setattr(
         session, "PortReader", lambda *args: PortReader(*args, max_waiting_bytes=most)
@@ -226,7 +225,7 @@ def test_whatever_comes_together(
     sent = bytearray()
     gaps = 0
     opened = [0]
-    for _ in range(60):
+    for _ in range(40):
         act = chance.random()
         if act < 0.1:
             port.refusals = [SourceError("not there")] * chance.randint(0, 2)
@@ -304,13 +303,13 @@ def test_a_device_that_does_not_come_back(port: Any, start: Any, raw_bytes: Any)
 
 @pytest.mark.slow
 def test_a_silence_while_it_is_away_is_no_second_warning(port: Any, start: Any) -> None:
-    running = start(silence_s=0.3)
+    running = start(silence_s=0.1)
     port.refusals = [SourceError("not there") for _ in range(10_000)]
     port.lose()
     running.until_said("connection lost")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 10)
-    assert running.shown[-1].away_s > 0.3
+    assert running.shown[-1].away_s > 0.1
     recorded = running.end()
     assert recorded.totals.silences == 0
     assert recorded.totals.gaps == 1
@@ -374,7 +373,7 @@ def test_a_driver_that_hangs_does_not_hold_the_file(
 
 @pytest.mark.slow
 def test_silence_is_told_once_until_something_comes(port: Any, start: Any, log_lines: Any) -> None:
-    running = start(silence_s=0.2)
+    running = start(silence_s=0.1)
     running.until_said("no data received for 0 s")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 8)
@@ -401,12 +400,12 @@ def test_a_disk_that_was_slow_is_no_silence(
             go_on.wait(20)
         return real(self, data)
 
-    running = start(silence_s=0.3, flush_s=0.01)
+    running = start(silence_s=0.15, flush_s=0.01)
     monkeypatch.setattr(recorder, "STATUS_INTERVAL_S", 0.0)  # looked at in the very turn
     monkeypatch.setattr(LiveFile, "write", stall)
     port.send(os.urandom(5000))
     assert stalled.wait(10)
-    for _ in range(40):  # longer than the silence that is allowed
+    for _ in range(20):  # longer than the silence that is allowed
         port.send(b"x" * 10)
         port.settle()
         time.sleep(0.01)
@@ -416,7 +415,7 @@ def test_a_disk_that_was_slow_is_no_silence(
     recorded = running.end()
     assert running.said == []
     assert recorded.totals.silences == 0
-    assert recorded.totals.bytes == 5400
+    assert recorded.totals.bytes == 5200
 
 
 @pytest.mark.slow
@@ -513,7 +512,12 @@ def test_it_ends_at_the_size(port: Any, start: Any, raw_bytes: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", [{"max_bytes": 1_000_000}, {"rotate_bytes": 1_000_000}])
 def test_sizes_hold_for_what_comes_at_once(
-    port: Any, start: Any, raw_bytes: Any, monkeypatch: pytest.MonkeyPatch, limits: Any
+    port: Any,
+    start: Any,
+    raw_bytes: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    limits: Any,
 ) -> None:
     """3 MB a turn, and the line goes on: no hole, and not much more than was asked for."""
     monkeypatch.setattr(recorder, "WRITE_INTERVAL_S", 0.3)
@@ -533,7 +537,9 @@ def test_sizes_hold_for_what_comes_at_once(
         running.stop.set()
         assert recorded.ended == "max-size"
     else:
-        time.sleep(0.8)
+        until = time.monotonic() + 10
+        while time.monotonic() < until and len(list(tmp_path.iterdir())) < 3:
+            time.sleep(0.01)
         recorded = running.end()
         assert len(recorded.paths) > 2
     kept = raw_bytes(*recorded.paths)
@@ -554,12 +560,12 @@ def check_parts(paths: list[Path]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("limits", [{"rotate_s": 0.05}, {"rotate_bytes": 8_000, "flush_s": 0.01}])
+@pytest.mark.parametrize("limits", [{"rotate_s": 0.03}, {"rotate_bytes": 8_000, "flush_s": 0.01}])
 def test_parts_hold_every_byte_once(
     port: Any, start: Any, raw_bytes: Any, limits: dict[str, float]
 ) -> None:
     running = start(note="of all", **limits)
-    sent = pieces(150, size=500)
+    sent = pieces(80, size=500)
     for piece in sent:
         port.send(piece)
         time.sleep(0.002)
@@ -569,7 +575,7 @@ def test_parts_hold_every_byte_once(
     assert raw_bytes(*recorded.paths) == b"".join(sent)
     check_parts(recorded.paths)
     counted = [Session.open(path).metadata()["capture"]["bytes"] for path in recorded.paths]
-    assert sum(map(int, counted)) == recorded.totals.bytes == 75_000
+    assert sum(map(int, counted)) == recorded.totals.bytes == 40_000
     assert recorded.file_bytes == sum(path.stat().st_size for path in recorded.paths)
     ended = [Session.open(path).metadata()["capture"]["ended"] for path in recorded.paths]
     assert ended[-1] == "stopped"
@@ -578,7 +584,7 @@ def test_parts_hold_every_byte_once(
 
 @pytest.mark.slow
 def test_a_part_ends_in_a_gap(port: Any, start: Any, raw_bytes: Any) -> None:
-    running = start(note="of all", rotate_s=0.1)
+    running = start(note="of all", rotate_s=0.05)
     first, second = pieces(5), pieces(5)
     port.send(*first)
     port.refusals = [SourceError("not there") for _ in range(3)]
@@ -598,10 +604,10 @@ def test_a_part_ends_in_a_gap(port: Any, start: Any, raw_bytes: Any) -> None:
 
 @pytest.mark.slow
 def test_the_next_part_cannot_be_begun(port: Any, start: Any, raw_bytes: Any) -> None:
-    running = start(rotate_s=0.3)
+    running = start(rotate_s=0.15)
     parts.part_path(running.wanted.output, 2).write_bytes(b"somebody else's")
     port.send(b"kept")
-    time.sleep(0.5)  # longer than a part
+    time.sleep(0.25)  # longer than a part
     port.send(b"not")
     recorded = running.result()
     assert recorded.failed

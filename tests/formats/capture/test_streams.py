@@ -137,7 +137,7 @@ def test_empty_batches_are_nothing() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     steps=st.lists(
         st.lists(st.integers(0, 2).map(lambda k: k * 5), min_size=1, max_size=6),

@@ -333,7 +333,7 @@ def clean_rows() -> dict[Any, set[Any]]:
 
 
 @given(st.lists(st.tuples(st.integers(0, len(MIXED) - 1), st.integers(0, 7)), max_size=3))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_flipped_bits_make_no_wrong_record(flips: list[tuple[int, int]]) -> None:
     data = bytearray(MIXED)
     for place, bit in flips:

@@ -161,11 +161,11 @@ def test_axes_are_the_arrays() -> None:
 def test_any_start_is_right_where_the_line_pauses(published: list[np.ndarray]) -> None:
     for k, values in enumerate(published):
         data, true = to_bytes(values), tesla(values)
-        for start in (9 * k + 1, 108 * k + 12):
-            decoder, batches = decode(data[start:], starts(len(data), 108, start))
-            np.testing.assert_array_equal(fields(batches), true[-(-start // 108) :])
-            assert decoder.remarks == []
-            assert (decoder.counts.bad, decoder.counts.skipped) == (0, 0)
+        start = 108 * k + 12 if k % 2 else 9 * k + 1
+        decoder, batches = decode(data[start:], starts(len(data), 108, start))
+        np.testing.assert_array_equal(fields(batches), true[-(-start // 108) :])
+        assert decoder.remarks == []
+        assert (decoder.counts.bad, decoder.counts.skipped) == (0, 0)
 
 
 def test_three_sensors_are_told_from_nine(published: list[np.ndarray]) -> None:
@@ -345,7 +345,7 @@ def test_flipped_bits_become_no_number_where_they_can_be_noticed(
 ) -> None:
     rng = np.random.default_rng(3)
     missed = 0
-    for k in range(60):
+    for k in range(30):
         values = published[k % len(published)][:150]
         data = bytearray(to_bytes(values))
         at = int(rng.integers(40 * 108, len(data) - 3 * 108))
@@ -359,7 +359,7 @@ def test_flipped_bits_become_no_number_where_they_can_be_noticed(
         assert np.isnan(found[row]).sum() <= 1
         missed += bool(np.nanmax(np.abs(found[row] - true[row])) > 1e-9)
         assert (decoder.counts.bad, decoder.counts.skipped) == (0, 0)
-    assert missed <= 0.08 * 60
+    assert missed <= 0.08 * 30
 
 
 def test_a_single_value_that_cannot_be_is_left_out() -> None:
@@ -526,7 +526,7 @@ def test_short_streams(n: int) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.data())
 def test_any_split_gives_the_same(draw: st.DataObject) -> None:
     kind = draw.draw(st.sampled_from(sorted(KINDS)))
@@ -567,7 +567,7 @@ def test_any_split_gives_the_same(draw: st.DataObject) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.binary(max_size=400), st.integers(0, 40), st.booleans())
 def test_any_bytes_are_taken(garbage: bytes, repeat: int, silent: bool) -> None:
     for make in (PolarisDecoder, MagxDecoder):

@@ -167,7 +167,7 @@ def test_clean_frames_are_sure_soon(name: str) -> None:
 @pytest.mark.parametrize("name", SENDERS)
 def test_pieces_do_not_matter(name: str) -> None:
     for what, pieces in sent(name):
-        for size in (20, 4096, 1 << 20):
+        for size in (20, 1 << 20):
             assert listen(cut(pieces, size)[:1000]).device == name, (what, size)
 
 

@@ -229,7 +229,7 @@ QUIET = 20 * FRAME_BYTES
 
 @pytest.mark.slow
 @given(st.lists(st.integers(QUIET, len(CLEAN) - 1), min_size=1, max_size=8), st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_lost_and_added_bytes_make_no_wrong_sweep(places: list[int], draw: st.DataObject) -> None:
     data = bytearray(CLEAN)
     for place in sorted(places, reverse=True):
@@ -263,7 +263,7 @@ def near(got: dict[str, NDArray[Any]], *, sensors: bool = True) -> bool:
 
 @pytest.mark.slow
 @given(st.lists(st.integers(QUIET * 8, len(CLEAN) * 8 - 1), min_size=1, max_size=8, unique=True))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_flipped_bits_make_no_wrong_sweep(bits: list[int]) -> None:
     data = bytearray(CLEAN)
     for bit in bits:

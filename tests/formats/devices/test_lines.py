@@ -607,7 +607,7 @@ TEXT = st.lists(
 
 
 @pytest.mark.slow
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     data=TEXT,
     cuts=st.lists(st.integers(0, 600), max_size=20),
@@ -635,7 +635,7 @@ def test_any_pieces_give_the_same(data: bytes, cuts: list[int], named: bool, pie
     assert whole.counts.skipped <= len(data)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.binary(max_size=3000))
 def test_noise_does_no_harm(data: bytes) -> None:
     _, batches = decode(data)

@@ -325,7 +325,7 @@ NOTHING = Maker().written(b"")
 
 @pytest.mark.slow
 @settings(
-    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.lists(COLOURS, max_size=12))
 def test_any_order_of_colours_looks_the_same(tmp_path: Path, operators: list[str]) -> None:

@@ -266,7 +266,7 @@ def test_large_plans_are_cut_into_pages_that_hold_each_cell_once() -> None:
         for mark in group.marks
     )
     assert seen == floor.codes.size
-    said = text_of(render_pages(pages, "t"), 0)
+    said = text_of(render_pages(pages[:1], "t"), 0)
     assert "c1r1" in said
     corner = text_of(render_pages(pages[1:2], "t"), 0)
     assert "rows" in corner
@@ -480,10 +480,7 @@ def test_words_are_not_drawn_over(part: str, size: tuple[float, float]) -> None:
 @pytest.mark.parametrize(
     ("shape", "part"),
     [
-        *(
-            ((rows, columns), "plan")
-            for rows, columns in ((1, 1), (7, 7), (24, 24), (1, 30), (30, 1))
-        ),
+        *(((rows, columns), "plan") for rows, columns in ((1, 1), (1, 30), (30, 1))),
         *(((20, 20), part) for part in PACK_PARTS),
         ((60, 60), "plan"),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import struct
@@ -106,21 +105,72 @@ def subject(name: str = "red", n: int = 200) -> Subject:
     return Subject(name, solution, facts, truth=(truth,), evaluation=evaluation)
 
 
+@dataclass(frozen=True)
+class Page(Opened):
+    """An opened report: its source and a screenshot of it."""
+
+    source: str
+    screenshot: Path
+
+
 @pytest.fixture(scope="module")
-def page(browser: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Opened]:
+def page(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Page:
     """A report of two subjects, the second with a name that would run a script; opened once."""
     folder = tmp_path_factory.mktemp("browser")
-    path = folder / "report.html"
+    path, picture = folder / "report.html", folder / "page.png"
     write_report(path, [subject(), subject(EVIL)])
-    return path.read_text(encoding="utf-8"), opened(browser, path, folder / "profile")
+    shown = opened(browser, path, folder / "profile", f"--screenshot={picture}")
+    return Page(**vars(shown), source=path.read_text(encoding="utf-8"), screenshot=picture)
 
 
-def test_all_figures_are_drawn(page: tuple[str, Opened]) -> None:
-    source, shown = page
-    wanted = source.count('<div class="figure"')
+@pytest.fixture(scope="module")
+def frames(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    """Three variants of a report in frames of one page, which shows what their scripts report.
+
+    ``narrow`` reports its sizes when all is drawn; its window is as wide as a phone. A script and
+    a picture were added to ``blocked`` and to ``allowed``, which lacks the policy.
+    """
+    folder = tmp_path_factory.mktemp("frames")
+    path = folder / "report.html"
+    write_report(path, [subject()])
+    report = path.read_text(encoding="utf-8")
+    measure = """<script>
+        new MutationObserver(function () {
+          const root = document.documentElement, figure = document.querySelector(".figure");
+          const sizes = [root.clientWidth, root.scrollWidth, figure.clientHeight];
+          parent.postMessage("narrow: " + root.dataset.drawn + " " + sizes.join(" "), "*");
+        }).observe(document.documentElement, {attributeFilter: ["data-drawn"]});
+        </script>"""
+    no_figures = re.sub(r'<div class="wide">.*?</script>', "", report, flags=re.DOTALL)
+    bad = (
+        "<script>parent.postMessage('NAME ran', '*')</script>"
+        "<img src=http://example.invalid/NAME.png onerror=\"parent.postMessage('NAME ran', '*')\">"
+    )
+    variants = {
+        "narrow": _without_policy(report).replace("<main>", f"{measure}<main>"),
+        "blocked": no_figures.replace("</main>", f"{bad}</main>"),
+        "allowed": _without_policy(no_figures).replace("</main>", f"{bad}</main>"),
+    }
+    show = "addEventListener('message', event => document.body.append(`[${event.data}]`))"
+    page = f"<script>{show}</script>"
+    for name, text in variants.items():
+        (folder / f"{name}.html").write_text(text.replace("NAME", name), encoding="utf-8")
+        page += f'<iframe src="{name}.html" style="width:390px"></iframe>'
+    (folder / "frames.html").write_text(page)
+    return opened(browser, folder / "frames.html", folder / "profile")
+
+
+def _without_policy(page: str) -> str:
+    changed, count = re.subn(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
+    assert count == 1
+    return changed
+
+
+def test_all_figures_are_drawn(page: Page) -> None:
+    wanted = page.source.count('<div class="figure"')
     assert wanted >= 14
-    assert f'data-drawn="{wanted}"' in shown.dom
-    figures = re.split(r'<div class="figure', shown.dom)[1:]
+    assert f'data-drawn="{wanted}"' in page.dom
+    figures = re.split(r'<div class="figure', page.dom)[1:]
     assert len(figures) == wanted
     for figure in figures:
         size = re.search(r'<svg class="main-svg"[^>]*width="(\d+)" height="(\d+)"', figure)
@@ -137,76 +187,55 @@ def test_all_figures_are_drawn(page: tuple[str, Opened]) -> None:
         assert drawn, figure[:300]
 
 
-def test_the_console_has_no_errors(page: tuple[str, Opened]) -> None:
-    assert page[1].console == []
+def test_the_console_has_no_errors(page: Page) -> None:
+    assert page.console == []
 
 
-def test_nothing_is_loaded(page: tuple[str, Opened]) -> None:
+def test_nothing_is_loaded(page: Page) -> None:
     # The browser's own services may try; the page and what it names may not.
-    asked = [url for url in page[1].requests if "example.invalid" in url or "plot" in url]
+    asked = [url for url in page.requests if "example.invalid" in url or "plot" in url]
     assert asked == []
 
 
-def test_names_of_devices_run_nothing(page: tuple[str, Opened]) -> None:
-    dom = page[1].dom
+def test_names_of_devices_run_nothing(page: Page) -> None:
+    dom = page.dom
     assert not re.search(r"<img[^>]*example\.invalid", dom)
     assert not re.search(r"<script>alert", dom)
     assert "&lt;/script&gt;" in dom  # it is shown as it is
 
 
-def test_the_policy_blocks_injected_scripts_and_pictures(browser: str, tmp_path: Path) -> None:
+def test_the_policy_blocks_injected_scripts_and_pictures(frames: Opened) -> None:
     """A script and a picture that get into the page nevertheless neither run nor load."""
-    path = tmp_path / "report.html"
-    write_report(path, [subject()])
-    text = path.read_text(encoding="utf-8")
-    bad = "<script>document.title = 'bad'</script><img src=http://example.invalid/x.png onerror=a>"
-    path.write_text(text.replace("</main>", f"{bad}</main>"), encoding="utf-8")
-    shown = opened(browser, path, tmp_path / "profile")
-    assert "<title>bad" not in shown.dom
-    assert any("Content Security Policy" in line for line in shown.console)
-    assert not any("example.invalid" in url for url in shown.requests)
-    assert json.dumps("s1") in shown.dom  # and the page is there
+    assert "[blocked ran]" not in frames.dom
+    assert not any("example.invalid/blocked.png" in url for url in frames.requests)
+    refused = [line for line in frames.console if "Content Security Policy" in line]
+    assert all("blocked.html" in line for line in refused)
+    assert any("script" in line for line in refused)
+    assert any("example.invalid/blocked.png" in line for line in refused)
     # Without the policy both would: the log tells what is asked for.
-    path.write_text(path.read_text(encoding="utf-8").replace("Content-Security-Policy", "none"))
-    shown = opened(browser, path, tmp_path / "other")
-    assert "<title>bad" in shown.dom
-    assert any("example.invalid" in url for url in shown.requests)
+    assert "[allowed ran]" in frames.dom
+    assert any("example.invalid/allowed.png" in url for url in frames.requests)
 
 
-def test_the_page_is_not_blank(browser: str, tmp_path: Path) -> None:
+def test_the_page_is_not_blank(page: Page) -> None:
     """Colours of all parts are in a picture of the page: it is not blank."""
     cv2 = pytest.importorskip("cv2")
-    path, picture = tmp_path / "report.html", tmp_path / "page.png"
-    write_report(path, [subject()])
-    opened(browser, path, tmp_path / "profile", f"--screenshot={picture}")
-    data = picture.read_bytes()
+    data = page.screenshot.read_bytes()
     assert struct.unpack(">II", data[16:24])[0] == 1200
-    image = cv2.imread(str(picture)).reshape(-1, 3).astype(int)
+    image = cv2.imread(str(page.screenshot)).reshape(-1, 3).astype(np.int16)
     blue = np.abs(image - [0xB2, 0x72, 0x00]).max(axis=1) < 12  # of the path; cv2 has b, g, r
     grey = np.abs(image - 0xBF).max(axis=1) < 6  # of the truth
     assert blue.sum() > 500
     assert grey.sum() > 20
 
 
-def test_a_narrow_window_shows_all(browser: str, tmp_path: Path) -> None:
+def test_a_narrow_window_shows_all(frames: Opened) -> None:
     """As on a phone: legends go above, maps get lower, and rows of diagrams can be scrolled."""
-    path = tmp_path / "report.html"
-    write_report(path, [subject()])
-    frame = tmp_path / "frame.html"
-    frame.write_text(f'<iframe src="{path.as_uri()}" style="width:390px;height:9000px"></iframe>')
-    script = (
-        "<script>const f = document.documentElement.clientWidth;"
-        "document.title = f + ' ' + document.documentElement.scrollWidth;</script>"
-    )
-    text = path.read_text(encoding="utf-8")
-    text = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)
-    path.write_text(text.replace("</body>", f"{script}</body>"), encoding="utf-8")
-    picture = tmp_path / "page.png"
-    shown = opened(browser, frame, tmp_path / "profile", f"--screenshot={picture}")
-    assert shown.console == []
-    narrow = opened(browser, path, tmp_path / "other", "--window-size=500,3000").dom
-    heights = [int(h) for h in re.findall(r'class="figure[^>]*height: (\d+)px', narrow)]
-    assert heights[0] < 500  # the map, 640 in a wide window
-    (wide, all_of_it) = map(int, re.findall(r"<title>(\d+) (\d+)</title>", narrow)[0])
-    assert wide <= 600
-    assert all_of_it == wide  # nothing sticks out at the side
+    assert not any("narrow.html" in line for line in frames.console)
+    reported = re.findall(r"\[narrow: (\d+) (\d+) (\d+) (\d+)\]", frames.dom)
+    assert len(reported) == 1
+    drawn, width, whole_width, map_height = map(int, reported[0])
+    assert drawn >= 7
+    assert width == 390
+    assert whole_width == width  # nothing sticks out at the side
+    assert map_height < 500  # 640 in a wide window

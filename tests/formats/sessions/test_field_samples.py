@@ -113,7 +113,7 @@ def case(request: pytest.FixtureRequest) -> SensorCase:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     kind=st.sampled_from(sorted(CASES)),
     n=st.integers(1, 2500),
@@ -229,7 +229,7 @@ def test_saturated_fields_stay_saturated(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(range_mt=st.floats(1, 200))
 def test_saturated_fields_of_any_range_stay_saturated(
     tmp_path_factory: pytest.TempPathFactory, range_mt: float

@@ -169,7 +169,7 @@ def test_equal_frames_give_equal_bytes(tmp_path: Path) -> None:
 # ---- the camera for viewers
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.floats(-0.95, 0.95), st.floats(100, 3000), st.floats(60, 127), st.floats(40, 79))
 def test_the_camera_model_for_viewers_is_accurate_or_left_out(
     bend: float, focal: float, x: float, y: float

@@ -142,7 +142,7 @@ def test_batches_are_bounded_in_time_and_number() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(data=st.data(), n=st.integers(1, 60), batch_ns=st.integers(1, 10**10))
 def test_sweeps_of_any_values_are_restored(data: st.DataObject, n: int, batch_ns: int) -> None:
     def draw(dtype: type, elements: st.SearchStrategy[int | float]) -> np.ndarray:
@@ -167,7 +167,7 @@ def test_sweeps_of_any_values_are_restored(data: st.DataObject, n: int, batch_ns
         assert rows(observations.read_sweeps(Session.open(path))) == rows(sweeps)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     st.integers(0, 5).flatmap(
         lambda n: st.tuples(
@@ -217,7 +217,7 @@ def test_every_encoding_of_protobuf_is_read(values: tuple[list[int], ...]) -> No
     assert batches.columns["count"].tolist() == [0.5] * n * len(forms)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.binary(max_size=200))
 def test_garbage_is_a_batch_or_an_error(payload: bytes) -> None:
     try:
@@ -228,7 +228,7 @@ def test_garbage_is_a_batch_or_an_error(payload: bytes) -> None:
     assert lengths == {int(batches.counts[0])}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 7))
 def test_a_flipped_bit_of_a_batch_is_a_batch_or_an_error(place: int, bit: int) -> None:
     payload = bytearray(next(observations.sweep_messages(make_sweeps(50)))[2].SerializeToString())

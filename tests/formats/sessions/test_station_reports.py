@@ -61,7 +61,7 @@ def write(
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(heard)
 def test_station_reports_are_restored(
     tmp_path_factory: pytest.TempPathFactory, found: tuple[StationReport, ...]
@@ -148,7 +148,7 @@ def test_a_damaged_record_is_named(
 
 
 @pytest.mark.slow
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     st.dictionaries(
         st.sampled_from(["station-1", "station-16", "station-x"]) | st.text(max_size=4),

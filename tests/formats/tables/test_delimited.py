@@ -32,7 +32,7 @@ def by_cell(text: str, separator: str) -> list[list[float]] | None:
 @pytest.mark.slow
 @pytest.mark.parametrize("with_arrow", [False, True])
 @pytest.mark.parametrize("separator", [",", " "])
-@settings(deadline=None)  # pyarrow is imported in the first example
+@settings(max_examples=50, deadline=None)  # pyarrow is imported in the first example
 @given(rows=st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1, max_size=5))
 @example(rows=[("+1", "2", "3")])
 @example(rows=[("1e400", "2", "3")])
