@@ -43,7 +43,7 @@ def test_every_system_is_better_than_its_published_algorithm(demo) -> None:
 
 
 @pytest.mark.slow
-def test_keep_leaves_what_it_names(demo) -> None:
+def test_keep_retains_the_named_folder(demo) -> None:
     folder, result = demo
     answer = json.loads(result.stdout)
     named = {answer["report"], *(entry["path"] for entry in answer["files"])}
@@ -54,7 +54,7 @@ def test_keep_leaves_what_it_names(demo) -> None:
 
 
 @pytest.mark.slow
-def test_what_to_try_next_works(demo, locatk, tmp_path: Path, monkeypatch) -> None:
+def test_the_suggested_commands_work(demo, locatk, tmp_path: Path, monkeypatch) -> None:
     _, result = demo
     monkeypatch.chdir(tmp_path)
     commands = [
@@ -69,7 +69,7 @@ def test_what_to_try_next_works(demo, locatk, tmp_path: Path, monkeypatch) -> No
 
 
 @pytest.mark.slow
-def test_the_report_tells_of_all_systems(demo) -> None:
+def test_the_report_covers_all_systems(demo) -> None:
     folder, _ = demo
     text = (folder / "report.html").read_text(encoding="utf-8")
     for system in SYSTEMS:

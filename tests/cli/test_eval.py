@@ -93,7 +93,7 @@ def answer(locatk, *words: object) -> dict:
     return dict(json.loads(result.stdout))
 
 
-def test_json_says_all(locatk, run: Path, found: Path) -> None:
+def test_json_is_complete(locatk, run: Path, found: Path) -> None:
     said = answer(locatk, found, "--truth", run)
     assert said["version"] == 1
     assert (said["n"], said["match"], said["align"]) == (N, "interpolate", "none")
@@ -112,7 +112,7 @@ def test_json_says_all(locatk, run: Path, found: Path) -> None:
     assert said["devices"]["red"]["ape"] == said["ape"]
 
 
-def test_text_says_it_in_words(locatk, run: Path, found: Path, tmp_path: Path) -> None:
+def test_text_summarizes_the_errors(locatk, run: Path, found: Path, tmp_path: Path) -> None:
     text = locatk("eval", found, "--truth", run, "--delta", "0.5m", "--full").stdout
     for line in (
         "RPE: between poses at a distance of 0.5m",
@@ -157,7 +157,9 @@ def test_points_have_no_rotation(locatk, tmp_path: Path) -> None:
     assert "[deg]" not in full + locatk("eval", found, "--truth", run).stdout
 
 
-def test_one_device_of_another_name_is_told(locatk, run: Path, found: Path, tmp_path: Path) -> None:
+def test_a_single_device_with_another_name_is_reported(
+    locatk, run: Path, found: Path, tmp_path: Path
+) -> None:
     assert "compared" not in locatk("eval", found, "--truth", run).stderr
     other = solution(tmp_path / "other.mcap", replace(solved(), device="robot"))
     done = locatk("eval", other, "--truth", run)
@@ -326,9 +328,7 @@ def test_the_longest_gap_is_chosen(locatk, found: Path, tmp_path: Path) -> None:
     assert bridged["coverage"]["share"] == 1.0
 
 
-def test_a_single_pose_and_what_comes_late_are_said_in_words(
-    locatk, run: Path, tmp_path: Path
-) -> None:
+def test_a_single_pose_and_a_late_start_are_reported(locatk, run: Path, tmp_path: Path) -> None:
     one, late = tmp_path / "one.csv", tmp_path / "late.csv"
     write_csv(one, [solved().select(np.arange(N) == 5)])
     assert "The only pose with truth has an error of" in locatk("eval", one, "--truth", run).stdout

@@ -72,7 +72,7 @@ def test_one_file_holds_all_devices(locatk, two: Path, tmp_path: Path, kind: str
     assert out.read_bytes() == before
 
 
-def test_kitti_keeps_the_times_beside_the_matrices(locatk, solved: Path, tmp_path: Path) -> None:
+def test_kitti_writes_times_to_a_second_file(locatk, solved: Path, tmp_path: Path) -> None:
     out = tmp_path / "poses.txt"
     result = locatk("export", solved, "--format", "kitti", "-o", out)
     assert result.exit_code == 0, result.stderr
@@ -154,7 +154,7 @@ def test_stdout_gets_the_same_text_as_a_file(locatk, two: Path, tmp_path: Path) 
     assert not Path("-").exists()
 
 
-def test_the_bag_knows_where_it_comes_from(locatk, solved: Path, tmp_path: Path) -> None:
+def test_the_bag_names_its_source(locatk, solved: Path, tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
     out = tmp_path / "poses.mcap"
@@ -175,7 +175,7 @@ def test_the_bag_knows_where_it_comes_from(locatk, solved: Path, tmp_path: Path)
     assert "does not end in .mcap" in other.stderr
 
 
-def test_what_does_not_go_is_said_in_one_line(locatk, solved: Path, tmp_path: Path) -> None:
+def test_refused_exports_are_one_line(locatk, solved: Path, tmp_path: Path) -> None:
     out = tmp_path / "poses.csv"
     unknown = locatk("export", solved, "--format", "csv", "--device", "blue", "-o", out)
     assert unknown.exit_code == 1
@@ -201,7 +201,7 @@ def test_parquet_without_pyarrow(
     assert result.stderr.count("\n") == 1
 
 
-def test_poses_that_are_no_numbers_are_left_out_and_told(locatk, solved: Path) -> None:
+def test_non_finite_poses_are_omitted_and_reported(locatk, solved: Path) -> None:
     some = solved.with_name("some.mcap")
 
     def spoil(rows: slice) -> None:
@@ -270,7 +270,7 @@ def test_stations_for_a_crazyflie(
     assert (station.channel, station.position.tolist()) == (3, [0, 1, 2])
 
 
-def test_what_a_crazyflie_cannot_have(
+def test_contents_that_a_crazyflie_cannot_hold(
     locatk, solved: Path, session: Path, scene: Scene, tmp_path: Path
 ) -> None:
     out, file = tmp_path / "a.yaml", tmp_path / "scene.toml"

@@ -103,7 +103,7 @@ def test_published_tracks(locatk, data: Path, tmp_path: Path) -> None:
 # ---- Lighthouse from others, with a reader that needs no file
 
 
-def heard_stations() -> tuple[StationReport, ...]:
+def received_stations() -> tuple[StationReport, ...]:
     calibration = Calibration(np.full((2, 7), 0.01), "factory")
     return (
         StationReport(1, 0x4CC60647, 958985.25, 40, 2, calibration, 11, 1),
@@ -135,7 +135,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
             truth=[],
             facts={"format": "test"},
             warnings=["the end is cut off"],
-            stations=heard_stations(),
+            stations=received_stations(),
             receivers={"wand": DECK},
             lost=getattr(request, "param", None),
         )
@@ -157,7 +157,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
         (["dotbot-log"], {}),
     ],
 )
-def test_a_reader_gets_what_was_given(
+def test_a_reader_gets_the_given_options(
     locatk, tmp_path: Path, asked: list[Any], arguments: list[str], named: dict[str, Any]
 ) -> None:
     source = table(tmp_path / "source", "x")
@@ -166,7 +166,7 @@ def test_a_reader_gets_what_was_given(
     assert asked == [([source], named)]
 
 
-def test_what_was_heard_goes_into_the_session(locatk, tmp_path: Path, asked: list[Any]) -> None:
+def test_station_reports_are_imported(locatk, tmp_path: Path, asked: list[Any]) -> None:
     source, out = table(tmp_path / "take.sal", "x"), tmp_path / "run.mcap"
     result = locatk("import", "saleae", source, "-o", out)
     assert result.exit_code == 0, result.stderr
@@ -215,7 +215,7 @@ def test_stations_in_json(locatk, tmp_path: Path, asked: list[Any]) -> None:
 
 
 @pytest.mark.parametrize("asked", ["2 s at the end"], indirect=True)
-def test_what_is_lost_is_told_by_the_exit_status(locatk, tmp_path: Path, asked: list[Any]) -> None:
+def test_losses_give_exit_status_3(locatk, tmp_path: Path, asked: list[Any]) -> None:
     source, out = table(tmp_path / "take.sal", "x"), tmp_path / "run.mcap"
     result = locatk("import", "libsurvive", source, "-o", out)
     assert result.exit_code == 3

@@ -63,7 +63,7 @@ def test_info_of_a_scene(locatk, scene, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
-def test_info_of_a_cut_session_says_so(locatk, session: Path, share: float) -> None:
+def test_info_reports_a_truncated_session(locatk, session: Path, share: float) -> None:
     whole = session.read_bytes()
     session.write_bytes(whole[: int(share * len(whole))])
     result = locatk("info", session, "--json")
@@ -121,7 +121,7 @@ def test_eval_offset(locatk, solved: Path, session: Path) -> None:
         assert locatk("eval", solved, "--truth", session, "--offset", bad).exit_code == 2
 
 
-def test_eval_refuses_what_cannot_be_compared(
+def test_eval_refuses_incomparable_files(
     locatk, record, solved: Path, session: Path, tmp_path
 ) -> None:
     two = record(tmp_path / "two.mcap", ("green", "blue"))

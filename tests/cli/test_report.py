@@ -129,7 +129,9 @@ def test_other_kinds_of_files_are_refused(
     assert ".html, .png, .pdf, .svg" in done.stderr
 
 
-def test_what_is_no_solution_is_one_line(session: Path, locatk: Locatk, tmp_path: Path) -> None:
+def test_files_other_than_solutions_are_one_line(
+    session: Path, locatk: Locatk, tmp_path: Path
+) -> None:
     for wrong in (session, tmp_path / "nowhere.mcap"):
         done = locatk("report", wrong, "-o", tmp_path / "r.html")
         assert done.exit_code == 1
@@ -157,7 +159,7 @@ def test_the_session_can_be_in_another_folder(
 
 
 @pytest.mark.slow
-def test_sessions_belong_to_solutions_by_name(
+def test_sessions_are_assigned_to_solutions_by_name(
     solution: Path, session: Path, record: Record, locatk: Locatk, tmp_path: Path
 ) -> None:
     (tmp_path / "far").mkdir()

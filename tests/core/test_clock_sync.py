@@ -101,7 +101,7 @@ def test_a_resonator_that_is_off_is_learnt(off: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("silence", [0.0, 0.4, 2.0, 30.0, 600.0])
-def test_short_counters_start_again_and_host_time_tells_how_often(silence: float) -> None:
+def test_wraps_of_short_counters_are_counted_by_host_time(silence: float) -> None:
     seconds = np.concatenate([sampled(100, 0, 20), sampled(100, 20 + silence, 30 + silence)])
     arrivals = usb(seconds)
     clock = TickClock(24e6, 24)
@@ -114,7 +114,7 @@ def test_short_counters_start_again_and_host_time_tells_how_often(silence: float
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bits", [32, 24])
-def test_what_arrives_late_together_is_not_new(bits: int) -> None:
+def test_samples_that_arrive_late_together_are_no_restart(bits: int) -> None:
     seconds = sampled(100, 0, 20)
     stalled = (seconds > 12) & (seconds < 14)
     arrivals = np.maximum.accumulate(np.where(stalled, 14.0, usb(seconds)))

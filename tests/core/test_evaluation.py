@@ -131,7 +131,7 @@ def test_relative_errors_do_not_change_with_a_rigid_motion(motion: Similarity, d
 
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from(ALIGNMENTS))
-def test_equal_stamps_match_alike_both_ways(seed: int, align: str) -> None:
+def test_equal_stamps_match_symmetrically(seed: int, align: str) -> None:
     one = evaluate_pair(noisy(seed), TRUTH, align=align)
     other = evaluate_pair(noisy(seed), TRUTH, align=align, match="nearest")
     np.testing.assert_array_equal(one.errors, other.errors)
@@ -183,7 +183,7 @@ def test_orientations_between_stamps_are_on_the_great_circle() -> None:
     assert quaternion_angle(difference).max() < 1e-7
 
 
-def test_rotation_is_told_only_where_it_was_observed() -> None:
+def test_rotation_errors_are_given_only_if_observed() -> None:
     known = np.tile(np.eye(6) * 1e-4, (len(TIME), 1, 1))
     point = known.copy()
     point[:, 3:, :], point[:, :, 3:] = np.nan, np.nan
@@ -230,7 +230,7 @@ def test_no_deltas(text: str) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(1, 60), st.floats(0.1, 3), st.booleans())
-def test_pairs_are_at_least_so_far_apart(frames: int, metres: float, all_pairs: bool) -> None:
+def test_pairs_have_the_minimum_distance(frames: int, metres: float, all_pairs: bool) -> None:
     found = evaluate_pair(
         noisy(), TRUTH, delta=Delta.parse(f"{frames}f"), all_pairs=all_pairs
     ).relative
@@ -375,7 +375,7 @@ def test_nees_of_what_is_known_against_a_plain_inverse(seed: int, known: set[int
     assert dof.tolist() == [len(known)] * 5
 
 
-def test_nees_leaves_out_what_is_fixed_or_told_by_the_rest() -> None:
+def test_nees_omits_fixed_and_dependent_axes() -> None:
     covariance = np.full((3, 6, 6), np.nan)
     covariance[:, :3, :3] = np.diag([1e-4, 4e-4, 0.0])
     covariance[1, :2, :2] = [[1e-4, 2e-4], [2e-4, 4e-4]]  # y is twice x
@@ -399,7 +399,7 @@ def test_quantiles_that_are_written_down() -> None:
             assert found == pytest.approx(stats.chi2.ppf(tail, dof) / dof, rel=close)
 
 
-def test_a_few_poses_far_off_are_told_apart() -> None:
+def test_a_few_outlying_poses_are_distinguished() -> None:
     estimate, truth = drawn(1.0)
     position = estimate.position.copy()
     position[::500] += 5.0

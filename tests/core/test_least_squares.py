@@ -356,7 +356,7 @@ class Valley:
         return state + np.array([0.0, step[0, 0]])
 
 
-def test_inner_iterations_shorten_the_way_through_a_valley() -> None:
+def test_inner_iterations_need_fewer_steps_in_a_valley() -> None:
     start = np.array([-1.9, 2.0])
     plain = minimize(Valley(), start, min_gain=1e-12, max_iterations=100)
     inner = minimize(Valley(), start, min_gain=1e-12, inner_iterations_after=0)

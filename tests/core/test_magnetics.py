@@ -52,7 +52,7 @@ def test_shapes_broadcast() -> None:
     np.testing.assert_allclose(field[5, 2], dipole_field(offsets[5, 2], moments[2]))
 
 
-def test_at_the_dipole_itself_nothing_is_finite_and_nobody_warns() -> None:
+def test_at_the_dipole_the_field_is_not_finite_without_a_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not np.isfinite(dipole_tensor(np.zeros(3))).any()

@@ -128,7 +128,7 @@ def test_planar_alignments_do_not_shift_along_z_nor_unmirror() -> None:
 
 @pytest.mark.parametrize("offset", [-0.3181, 0.0, 0.047, 0.9])
 @pytest.mark.parametrize("align", ["none", "sim2", "se3"])
-def test_offset_is_found_on_what_is_held_out(offset: float, align: str) -> None:
+def test_offset_is_estimated_on_the_held_out_part(offset: float, align: str) -> None:
     rng = np.random.default_rng(3)
     time = np.arange(2, 38, 0.1)
     # An estimate stamped t shows where the robot was at t + offset.
@@ -201,7 +201,7 @@ def test_several_devices_share_one_alignment_and_offset() -> None:
     assert evaluate_pair(pairs[1][0], moved, align="sim2", offset_s=0.25).mae < 1e-3
 
 
-def test_what_it_says_is_json_with_units() -> None:
+def test_the_result_is_json_with_units() -> None:
     found = evaluate_pair(TRUTH, TRUTH, align="se3", offset_s=0.001)
     said = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert said["offset_source"] == "given"
@@ -232,7 +232,7 @@ def test_stamps_become_the_seconds_that_a_reader_of_text_gets() -> None:
 
 
 @pytest.mark.parametrize("factor", [1e200, 1e-200])
-def test_positions_whose_squares_run_over(factor: float) -> None:
+def test_positions_with_overflowing_squares(factor: float) -> None:
     strange = replace(TRUTH, position=factor * TRUTH.position)
     with pytest.raises((InputError, DegenerateError), match=r"not numbers|coincide"):
         evaluate_pair(strange, TRUTH, align="sim3")

@@ -10,7 +10,7 @@ from locatk.core.units import metres, mm_text
 
 
 @given(st.integers(-(10**9), 10**9))
-def test_what_is_written_in_tenths_of_a_mm_comes_back(tenths: int) -> None:
+def test_tenths_of_a_mm_are_read_back(tenths: int) -> None:
     value = metres(tenths / 10)
     assert value == tenths / 10_000
     assert float(mm_text(value)) == tenths / 10

@@ -121,7 +121,7 @@ def test_the_totals_of_the_json_are_in_the_metadata(capture: Any, tmp_path: Path
     assert known["samples:/readings/robot"] == "60"
 
 
-def test_quiet_says_nothing_but_the_result(capture: Any) -> None:
+def test_quiet_prints_only_the_result(capture: Any) -> None:
     result = capture("-q")
     assert result.exit_code == 0
     assert result.stderr == ""
@@ -164,7 +164,7 @@ def test_raw_is_kept_as_it_is(capture: Any, tmp_path: Path, raw_bytes: Any) -> N
     assert raw_bytes(tmp_path / "run.mcap") == TEXT
 
 
-def test_auto_finds_out(locatk: Any, old: Path, tmp_path: Path, raw_bytes: Any) -> None:
+def test_auto_identifies_the_device(locatk: Any, old: Path, tmp_path: Path, raw_bytes: Any) -> None:
     """And has every record from the first byte on."""
     path = tmp_path / "run.mcap"
     result = locatk("capture", f"replay:{old}", "--speed", 0, "-o", path, "--json")
@@ -208,7 +208,7 @@ def test_a_port_that_is_silent(
     assert len(live) == 1
 
 
-def test_bad_frames_are_told_by_the_status(capture: Any, old: Path, tmp_path: Path) -> None:
+def test_bad_frames_give_status_3(capture: Any, old: Path, tmp_path: Path) -> None:
     changed = TEXT.replace(b"400,1600\n", b"400,\x81\x9200\n").replace(b"90,81\n", b"9\x80,81\n")
     recording(old.with_name("new.mcap"), changed).replace(old)
     result = capture("--json")
@@ -218,7 +218,7 @@ def test_bad_frames_are_told_by_the_status(capture: Any, old: Path, tmp_path: Pa
     assert Session.open(tmp_path / "run.mcap").damage is None
 
 
-def test_the_wrong_device_is_told_by_the_status(capture: Any, tmp_path: Path) -> None:
+def test_a_wrong_device_gives_status_3(capture: Any, tmp_path: Path) -> None:
     result = capture("--json", device="locatk")
     assert result.exit_code == 3
     assert f"no frame of locatk in {len(TEXT)} bytes" in result.stderr
@@ -408,7 +408,7 @@ def test_a_port_that_is_waited_for_is_no_warning(locatk: Any, tmp_path: Path) ->
     assert error.startswith(f"Error: {port}: no such port. Hint: ")
 
 
-def test_what_is_played_is_not_overwritten(locatk: Any, old: Path) -> None:
+def test_the_replayed_session_is_not_overwritten(locatk: Any, old: Path) -> None:
     before = old.read_bytes()
     result = locatk("capture", f"replay:{old}", "-o", old, "--overwrite")
     assert result.exit_code == 1
@@ -422,7 +422,7 @@ def test_a_camera_is_no_serial_device(locatk: Any, tmp_path: Path) -> None:
     assert "a camera is not a lines" in result.stderr
 
 
-def test_the_end_of_a_damaged_source_is_told(
+def test_the_end_of_a_damaged_source_is_reported(
     locatk: Any, old: Path, tmp_path: Path, raw_bytes: Any
 ) -> None:
     data = old.read_bytes()
@@ -524,7 +524,7 @@ def test_on_a_terminal_the_line_stays_one(
     assert text.endswith("\r")
 
 
-def test_who_listens_may_go(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_may_disconnect(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[str] = []
 
     def broken(*_: object, **__: object) -> None:

@@ -351,7 +351,7 @@ def test_a_port_that_is_not_there_yet_can_be_waited_for(
 
 
 @pytest.mark.slow
-def test_who_holds_the_port_is_said(line: Any, process: Any, tmp_path: Path) -> None:
+def test_the_user_of_the_port_is_named(line: Any, process: Any, tmp_path: Path) -> None:
     port = line()
     capture = process("capture", port.path, "--device", "raw", "-o", tmp_path / "run.mcap")
     capture.until("Recording")
@@ -434,7 +434,7 @@ def solved(locatk: Any, path: Path, *given: object) -> tuple[dict[str, Any], Sol
 
 
 @pytest.mark.slow
-def test_tags_are_found_in_what_was_captured(captured: Path, locatk: Any) -> None:
+def test_captured_tags_are_detected(captured: Path, locatk: Any) -> None:
     want, _ = solved(locatk, captured / "polaris.mcap")
     got, _ = solved(locatk, captured / "polaris-captured.mcap")
     assert (got["system"], got["poses"]) == ("polaris", want["poses"])
@@ -449,7 +449,7 @@ def test_tags_are_found_in_what_was_captured(captured: Path, locatk: Any) -> Non
 
 
 @pytest.mark.slow
-def test_landmarks_are_found_in_what_was_captured(captured: Path, locatk: Any) -> None:
+def test_captured_landmarks_are_detected(captured: Path, locatk: Any) -> None:
     want, _ = solved(locatk, captured / "landmarks.mcap")
     got, _ = solved(locatk, captured / "landmarks-captured.mcap")
     ((expected,), (found,)) = (want["detections"], got["detections"])
@@ -467,7 +467,7 @@ def test_landmarks_are_found_in_what_was_captured(captured: Path, locatk: Any) -
 
 
 @pytest.mark.slow
-def test_lighthouse_is_solved_of_what_was_captured(captured: Path, locatk: Any) -> None:
+def test_a_captured_lighthouse_session_is_solved(captured: Path, locatk: Any) -> None:
     _, reference = solved(locatk, captured / "lighthouse.mcap")
     scene = captured / "scene.toml"
     scene.write_text(dumps_scene(reference.artifact))
@@ -491,7 +491,7 @@ def test_lighthouse_is_solved_of_what_was_captured(captured: Path, locatk: Any) 
 
 
 @pytest.mark.slow
-def test_what_was_captured_can_be_sent_again(
+def test_a_captured_session_can_be_emulated(
     captured: Path, process: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
     """The bytes of a recording through another port give the same bytes and records."""

@@ -60,13 +60,13 @@ def test_one_json_object(locatk: Any, old: Path, tmp_path: Path) -> None:
     assert isinstance(report["remarks"], list)
 
 
-def test_what_the_recording_says(locatk: Any, tmp_path: Path) -> None:
+def test_the_recorded_device_is_the_default(locatk: Any, tmp_path: Path) -> None:
     old = recording(tmp_path / "old.mcap", device="lines")
     result = locatk("decode", old, "-o", tmp_path / "again.mcap", "--json")
     assert json.loads(result.stdout)["devices"][0]["device"] == "lines"
 
 
-def test_found_out(locatk: Any, old: Path, tmp_path: Path) -> None:
+def test_the_device_is_identified(locatk: Any, old: Path, tmp_path: Path) -> None:
     result = locatk("decode", old, "--device", "auto", "-o", tmp_path / "again.mcap", "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
@@ -92,7 +92,7 @@ def test_an_artifact(locatk: Any, old: Path, tmp_path: Path) -> None:
     assert Session.open(path).attachment("tag.toml") == tag.read_bytes()
 
 
-def test_bad_frames_are_told_by_the_status(locatk: Any, tmp_path: Path) -> None:
+def test_bad_frames_give_status_3(locatk: Any, tmp_path: Path) -> None:
     data = TEXT.replace(b"40,1600\n", b"40,\x81\x9200\n").replace(b"9,81\n", b"\x80,81\n")
     old = recording(tmp_path / "old.mcap", data)
     result = locatk("decode", old, "--device", "lines", "-o", tmp_path / "again.mcap")
@@ -101,7 +101,7 @@ def test_bad_frames_are_told_by_the_status(locatk: Any, tmp_path: Path) -> None:
     assert Session.open(tmp_path / "again.mcap").damage is None
 
 
-def test_what_the_port_had_lost_is_not_told_again_by_the_status(locatk: Any, old: Path) -> None:
+def test_losses_of_the_port_do_not_repeat_in_the_status(locatk: Any, old: Path) -> None:
     """Two gaps are in the metadata; the decoding itself lost nothing."""
     assert locatk("decode", old, "-o", old.with_name("again.mcap")).exit_code == 0
 

@@ -84,7 +84,7 @@ def test_the_path_is_all_that_is_printed(locatk: Callable, run: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_json_tells_the_port_and_then_what_became_of_the_bytes(
+def test_json_has_the_port_then_the_byte_counts(
     locatk: Callable, run: Path, tmp_path: Path
 ) -> None:
     link = tmp_path / "port"

@@ -59,7 +59,7 @@ def test_info_shows_the_photodiodes(locatk: Run, session: Path) -> None:
     assert "30 x 15 x 0" in locatk("info", session).stdout
 
 
-def test_a_file_says_where_photodiodes_sit(locatk: Run, folder: Path) -> None:
+def test_a_file_gives_the_positions_of_photodiodes(locatk: Run, folder: Path) -> None:
     receiver = folder / "receiver.toml"
     receiver.write_text(
         'format = "locatk-lighthouse-receiver"\nformat_version = 1\n'
@@ -80,7 +80,7 @@ def test_a_receiver_that_is_not_there(locatk: Run, folder: Path) -> None:
     assert not (folder / "x.mcap").exists()
 
 
-def test_photodiodes_are_where_the_robot_carries_them() -> None:
+def test_sweeps_follow_the_positions_of_photodiodes() -> None:
     """The sweeps of two photodiodes of a rotation differ as their places do."""
     made = simulate(
         SimulationOptions(receiver=DECK, report_hz=120.0, duration_s=20.0, noise_rad=0.0)

@@ -51,7 +51,7 @@ def damage(path: Path, *, share: float = 0.4) -> Path:
     return path
 
 
-def test_a_whole_file(locatk, chunked: Path, tmp_path: Path) -> None:
+def test_a_complete_file(locatk, chunked: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     result = locatk("recover", chunked, "-o", out)
     assert result.exit_code == 0, result.stderr
@@ -86,7 +86,7 @@ def test_json(locatk, chunked: Path, tmp_path: Path) -> None:
     assert len(list(Session.open(out).messages())) == answer["messages"]
 
 
-def test_what_was_lost_is_one_line(locatk, chunked: Path, tmp_path: Path) -> None:
+def test_losses_are_one_line(locatk, chunked: Path, tmp_path: Path) -> None:
     result = locatk("recover", damage(chunked), "-o", tmp_path / "out.mcap")
     assert result.exit_code == 3
     assert result.stderr.startswith(f"Incomplete: {chunked}: lost ")
@@ -162,7 +162,7 @@ def test_info_points_to_recover(locatk, chunked: Path) -> None:
     assert sum(stream["messages"] for stream in answer["streams"]) > 0
 
 
-def test_info_tells_what_can_be_recovered(locatk, chunked: Path, tmp_path: Path) -> None:
+def test_info_reports_recoverable_damage(locatk, chunked: Path, tmp_path: Path) -> None:
     """Behind the damage, too; what info says of the damaged file it says of the saved one."""
     data = bytearray(chunked.read_bytes())
     data[Session.open(chunked).index.segments[2].offset + 3] ^= 0xFF  # a length

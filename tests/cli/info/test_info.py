@@ -104,7 +104,7 @@ def test_capture_for_people(locatk, tmp_path: Path) -> None:
     assert text.count("third lap") == 1
 
 
-def test_a_recording_that_lost_nothing_says_so(locatk, tmp_path: Path) -> None:
+def test_a_recording_without_losses_reports_none(locatk, tmp_path: Path) -> None:
     path = live(tmp_path / "run.mcap", {"bytes": "1000", "frames": "10", "bad": "0"})
     text = locatk("info", path).stdout
     assert "losses:    none" in text

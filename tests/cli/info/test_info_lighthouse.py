@@ -62,7 +62,7 @@ def lines(locatk: Any, path: Path, header: str) -> list[str]:
     return [" ".join(line.split()) for table in tables for line in table.splitlines()]
 
 
-def test_stations_as_they_were_heard(locatk, write, tmp_path: Path) -> None:
+def test_stations_as_received(locatk, write, tmp_path: Path) -> None:
     path = write(tmp_path / "1.mcap", stations=HEARD, scene=KNOWN)
     answer = facts(locatk, path)
     assert answer["scale"] == "device"
@@ -111,7 +111,7 @@ def test_all_but_one_decoded_is_not_all(locatk, write, tmp_path: Path) -> None:
     assert " 99.9 % " in locatk("info", path).stdout
 
 
-def test_where_nothing_was_heard_there_are_no_columns_for_it(locatk, session: Path) -> None:
+def test_columns_without_data_are_left_out(locatk, session: Path) -> None:
     assert lines(locatk, session, "channel") == [
         "channel id period sweeps calibration",
         "1 - 959000 40 -",
@@ -137,7 +137,7 @@ def test_another_station_than_that_of_the_scene(locatk, write, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("placed", [True, False])
-def test_a_solution_tells_what_it_used(locatk, tmp_path: Path, placed: bool) -> None:
+def test_a_solution_lists_its_inputs(locatk, tmp_path: Path, placed: bool) -> None:
     """The paper's method has no stations in its scene."""
     path = tmp_path / "solved.mcap"
     used = StationDetection(0, 9, None, 959000, "factory", sweeps=np.int64(38), rejected=2)
@@ -202,7 +202,7 @@ def test_a_receiver_as_a_file(locatk, tmp_path: Path) -> None:
     assert lines(locatk, path, "receiver ")[1:] == ["- lighthouse-deck 4 30 x 15 x 0 known"]
 
 
-def test_places_without_scale_are_no_metres(locatk, tmp_path: Path) -> None:
+def test_positions_without_scale_have_no_metres(locatk, tmp_path: Path) -> None:
     path = tmp_path / "scene.toml"
     artifacts.write_scene(path, replace(KNOWN, scale="unit"))
     assert lines(locatk, path, "channel")[0].endswith("position [units]")
@@ -216,7 +216,7 @@ def test_a_scene_with_calibrations_only(locatk, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["station", "scene.toml", "receiver.toml"])
-def test_what_is_damaged_hides_nothing_else(
+def test_damage_hides_no_other_contents(
     locatk, write, tmp_path: Path, session: Path, what: str
 ) -> None:
     from locatk.formats.schemas.lighthouse_pb2 import LighthouseSweep

@@ -122,7 +122,7 @@ def test_same_map_same_bytes(locatk, map_file: Path, tmp_path: Path) -> None:
         (["--bom", "same"], 1, "one file"),
     ],
 )
-def test_what_is_asked_wrongly_is_told(
+def test_wrong_arguments_are_reported(
     locatk, map_file: Path, tmp_path: Path, more: list[object], status: int, said: str
 ) -> None:
     out = tmp_path / "a.pdf"
@@ -150,7 +150,7 @@ def test_nothing_is_replaced_unasked(locatk, map_file: Path, tmp_path: Path) -> 
     assert map_file.read_bytes() == before
 
 
-def test_maps_that_cannot_be_laid_are_named(locatk, tmp_path: Path) -> None:
+def test_maps_that_cannot_be_built_are_named(locatk, tmp_path: Path) -> None:
     missing = locatk("print", "landmarks", tmp_path / "none.toml", "-o", tmp_path / "a.pdf")
     assert missing.exit_code == 1
     assert "none.toml" in missing.stderr

@@ -155,7 +155,7 @@ def test_the_ledger_may_be_named_by_the_environment(
     assert names(tmp_path / "out") == ["a.toml", "a.txt"]
 
 
-def test_tiles_lie_on_one_floor(locatk, tmp_path: Path) -> None:
+def test_tiles_form_one_floor(locatk, tmp_path: Path) -> None:
     out = tmp_path / "floor.pdf"
     result = locatk("print", "pattern", "-o", out, "--size", "A5", "--tiles", "3x2", "--json")
     assert result.exit_code == 0, result.stderr
@@ -167,7 +167,7 @@ def test_tiles_lie_on_one_floor(locatk, tmp_path: Path) -> None:
         assert [area.id for area in book.areas] == ["A5-0001"]
 
 
-def test_snapping_is_said(locatk, tmp_path: Path) -> None:
+def test_snapping_is_reported(locatk, tmp_path: Path) -> None:
     result = locatk("print", "pattern", "-o", tmp_path / "a.pdf", "--pitch", 0.5, "--dot", 0.1)
     assert result.exit_code == 0
     assert "Pitch 0.5 mm becomes 0.508 mm, 6 px at 300 dpi." in result.stderr
@@ -333,7 +333,7 @@ def test_one_file_for_two_things_is_refused(locatk, tmp_path: Path) -> None:
     assert names(tmp_path) == []
 
 
-def test_a_margin_without_room_is_said(locatk, tmp_path: Path) -> None:
+def test_a_too_narrow_margin_is_reported(locatk, tmp_path: Path) -> None:
     run = ["print", "pattern", "--size", "A5", "--margin", 5]
     assert "A5-0001" in locatk(*run, "-o", tmp_path / "a.pdf").stderr
     assert "Warning" not in locatk(*run, "-o", tmp_path / "b.pdf", "--no-marks").stderr

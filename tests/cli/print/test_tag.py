@@ -57,7 +57,7 @@ def test_tags_that_are_named(locatk, tag_file: Path, tmp_path: Path) -> None:
     assert "id 5" in words(out)
 
 
-def test_json_says_where_each_tag_lies(locatk, tag_file: Path, tmp_path: Path) -> None:
+def test_json_has_the_position_of_each_tag(locatk, tag_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.svg"
     asked = ["--id", 7, "--id", 7, "--id", 8, "-o", out, "--json"]
     result = locatk("print", "tag", tag_file, *asked)
@@ -84,7 +84,7 @@ def test_json_says_where_each_tag_lies(locatk, tag_file: Path, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_family_is_drawn_whole(locatk, family_file: Path, tmp_path: Path) -> None:
+def test_all_members_of_a_family_are_drawn(locatk, family_file: Path, tmp_path: Path) -> None:
     out = tmp_path / "tags.pdf"
     result = locatk("print", "tag", family_file, "-o", out, "--json")
     assert result.exit_code == 0, result.stderr
@@ -111,7 +111,9 @@ def test_same_input_same_bytes(locatk, family_file: Path, tmp_path: Path) -> Non
         assert made[0] == made[1]
 
 
-def test_the_ending_or_the_option_says_the_format(locatk, tag_file: Path, tmp_path: Path) -> None:
+def test_the_ending_or_the_option_selects_the_format(
+    locatk, tag_file: Path, tmp_path: Path
+) -> None:
     for name, more, head in (
         ("a.svg", [], b"<?xml"),
         ("a.pdf", [], b"%PDF"),
@@ -154,7 +156,7 @@ def test_nothing_is_replaced_unasked(locatk, family_file: Path, tmp_path: Path) 
         (["--id", 1, "--size", "200x6000mm"], 1, "--format svg"),
     ],
 )
-def test_what_is_asked_wrongly_is_told(
+def test_wrong_arguments_are_reported(
     locatk, tag_file: Path, tmp_path: Path, more: list[object], status: int, said: str
 ) -> None:
     result = locatk("print", "tag", tag_file, "-o", tmp_path / "a.pdf", *more)

@@ -58,7 +58,7 @@ def calibrate(*args: object) -> Result:
 
 
 @pytest.mark.slow
-def test_dots_are_whole_pixels_and_say_what_they_ought_to(locatk, tmp_path: Path) -> None:
+def test_dots_are_whole_pixels_with_the_requested_sizes(locatk, tmp_path: Path) -> None:
     path = tmp_path / "test.pdf"
     result = locatk("print", "testsheet", "-o", path, "--size", "letter", "--dpi", 600, "--json")
     assert result.exit_code == 0, result.stderr
@@ -106,7 +106,7 @@ def test_the_sheet_is_always_the_same_and_black_alone(locatk, paper: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_a_scan_tells_dots_and_scale(scan: Path, tmp_path: Path) -> None:
+def test_a_scan_gives_dot_size_and_scale(scan: Path, tmp_path: Path) -> None:
     out = tmp_path / "printer.toml"
     upright = Manifest((Sheet("a", (0, 0), (9, 9), (0, 0), (210.0, 297.0), (10.0, 10.0)),))
     across = Manifest((Sheet("b", (0, 0), (9, 9), (0, 0), (297.0, 210.0), (10.0, 10.0)),))
@@ -145,7 +145,7 @@ def test_measured_rulers_count_and_words_are_for_people(scan: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_contradicts_itself_is_refused(scan: Path, tmp_path: Path) -> None:
+def test_contradictory_options_are_refused(scan: Path, tmp_path: Path) -> None:
     assert calibrate(scan, "--measured-x", 100).exit_code == 2
     assert (
         calibrate(scan, "--measured-x", 100, "--measured-y", 100, "--scan-dpi", 600).exit_code == 2

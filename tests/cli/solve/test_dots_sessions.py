@@ -174,7 +174,7 @@ def test_nothing_usable_leaves_nothing(locatk, tmp_path: Path) -> None:
         (["empty"], "Error: empty: no image files (1 files of other kinds)"),
     ],
 )
-def test_where_there_are_no_images(
+def test_a_folder_without_images(
     locatk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, paths: list[str], words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -223,7 +223,7 @@ def test_a_frame_is_never_the_output(locatk, folder: Path) -> None:
     assert frame.read_bytes() == before
 
 
-def test_frames_of_another_camera_than_told(locatk, folder: Path, tmp_path: Path) -> None:
+def test_frames_of_another_camera(locatk, folder: Path, tmp_path: Path) -> None:
     lens = tmp_path / "camera.toml"
     sheets.write_camera(lens, Camera((640, 480), 900.0, (319.5, 239.5)))
     result = locatk("import", "images", folder, "--camera", lens, "-o", tmp_path / "run.mcap")
@@ -391,7 +391,7 @@ def test_from_frames_to_poses(locatk, session: Path, tmp_path: Path) -> None:
     assert "7f3a-1" in locatk("info", out).stdout
 
 
-def test_what_viewers_see_of_a_sheet(locatk, session: Path, tmp_path: Path) -> None:
+def test_a_sheet_for_viewers(locatk, session: Path, tmp_path: Path) -> None:
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
     out = tmp_path / "solved.mcap"

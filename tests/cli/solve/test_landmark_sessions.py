@@ -134,7 +134,7 @@ def test_a_log_becomes_a_session(locatk, tmp_path: Path) -> None:
     assert "--overwrite" in again.stderr
 
 
-def test_sensors_and_start_are_told(locatk, tmp_path: Path) -> None:
+def test_sensors_and_start_are_reported(locatk, tmp_path: Path) -> None:
     run, out = log(tmp_path / "run.csv"), tmp_path / "run.mcap"
     args = ("import", "landmark-csv", run, *TOLD, "-o", out, "--overwrite")
     start = ("--start", "2026-01-31T12:00:00Z")
@@ -158,7 +158,7 @@ def test_sensors_and_start_are_told(locatk, tmp_path: Path) -> None:
     np.testing.assert_allclose(samples.field_t, -down[:, ::2], rtol=1e-6)
 
 
-def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
+def test_omissions_are_reported(locatk, tmp_path: Path) -> None:
     run = log(tmp_path / "run.csv", cells={(3, 0): "", (7, 0): "nan"})
     out = tmp_path / "run.mcap"
     result = locatk("import", "landmark-csv", run, *TOLD, "--circle", 25, "-o", out, "--json")
@@ -200,7 +200,7 @@ def test_wrong_use_of_the_format(
     assert "Traceback" not in result.stderr
 
 
-def test_the_options_belong_to_this_format(locatk, tmp_path: Path) -> None:
+def test_options_of_this_format(locatk, tmp_path: Path) -> None:
     run = log(tmp_path / "run.csv")
     for more in (("--volts-per-tesla", "3"), ("--downward",), ("--circle", 25)):
         result = locatk("import", "images", run, *more, "-o", tmp_path / "run.mcap")
@@ -211,7 +211,7 @@ def test_the_options_belong_to_this_format(locatk, tmp_path: Path) -> None:
 # ---- info
 
 
-def test_info_tells_samples_sensors_and_map(locatk, tmp_path: Path) -> None:
+def test_info_describes_samples_sensors_and_map(locatk, tmp_path: Path) -> None:
     run = record(tmp_path / "run.mcap")
     facts = json.loads(locatk("info", run, "--json").stdout)
     assert (facts["system"], facts["samples"], facts["devices"]) == ("landmarks", 40, ["robot"])
@@ -230,7 +230,7 @@ def test_info_tells_samples_sensors_and_map(locatk, tmp_path: Path) -> None:
     assert drawn[drawn.index("  1  035") + 1] == "  0  75."
 
 
-def test_info_tells_artifacts(locatk, tmp_path: Path) -> None:
+def test_info_describes_artifacts(locatk, tmp_path: Path) -> None:
     path = write_map(tmp_path / "map.toml")
     facts = json.loads(locatk("info", path, "--json").stdout)
     assert (facts["kind"], facts["pitch_mm"], facts["walls"]) == ("map", 200, 1)
@@ -384,7 +384,7 @@ def test_people_see_a_table_of_landmarks(locatk, solver: Solver, tmp_path: Path)
     assert "run.mcap: a note" in result.stderr
 
 
-def test_a_long_drive_is_not_listed_whole(locatk, solver: Solver, tmp_path: Path) -> None:
+def test_a_long_drive_is_listed_in_part(locatk, solver: Solver, tmp_path: Path) -> None:
     solver.seen = [detection((0, 0), time_s=n) for n in range(90)]
     result = locatk("solve", record(tmp_path / "run.mcap"), "-o", tmp_path / "solved.mcap")
     assert result.stdout.count("NNNS") == 40
@@ -407,7 +407,7 @@ def test_a_long_drive_is_not_listed_whole(locatk, solver: Solver, tmp_path: Path
         (told(), [detection(None, "no_landmark")], 5, "1 landmark refused (no landmark)"),
     ],
 )
-def test_what_is_left_unsolved_is_a_loss(
+def test_unsolved_parts_are_losses(
     locatk, solver: Solver, tmp_path: Path, facts: Any, seen: Any, poses: int, words: str
 ) -> None:
     solver.facts, solver.seen, solver.poses = facts, seen, poses
@@ -419,7 +419,7 @@ def test_what_is_left_unsolved_is_a_loss(
     assert len(solutions.read_solution(out).detections) == len(seen)
 
 
-def test_without_a_map_there_is_no_place(locatk, solver: Solver, tmp_path: Path) -> None:
+def test_without_a_map_there_is_no_position(locatk, solver: Solver, tmp_path: Path) -> None:
     solver.facts, solver.seen, solver.poses = told(False), [detection(None)], 0
     session = record(tmp_path / "run.mcap", floor=None)
     result = locatk("solve", session, "-o", tmp_path / "solved.mcap")

@@ -313,7 +313,7 @@ def test_a_table_without_factory_data_is_solved_up_to_scale(
     assert np.ptp(ratio) / np.mean(ratio) < 0.03
 
 
-def test_the_paper_s_way_on_the_same_light(
+def test_the_published_method_on_the_same_light(
     locatk, second: tuple[Array, Places], tmp_path: Path
 ) -> None:
     source = capture(tmp_path / "run.sal", light(second[1], 1.0, bits=170))
@@ -325,7 +325,7 @@ def test_the_paper_s_way_on_the_same_light(
     assert 0.5 * len(channels[0]) < len(channels[1]) <= len(channels[0])
 
 
-def test_what_the_paper_s_way_cannot_know_is_said(locatk, data: Path, tmp_path: Path) -> None:
+def test_limits_of_the_published_method_are_reported(locatk, data: Path, tmp_path: Path) -> None:
     """The station of this recording is on channel 7."""
     source, run = data / "lighthouse" / "fpga" / "take1.csv", tmp_path / "run.mcap"
     told = answer(locatk("import", "saleae", source, "-o", run, "--method", "paper", "--json"))
@@ -517,7 +517,7 @@ def test_published_capture_of_a_photodiode_at_rest(locatk, data: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_published_tracker_whole_and_cut(locatk, data: Path, tmp_path: Path) -> None:
+def test_published_tracker_complete_and_truncated(locatk, data: Path, tmp_path: Path) -> None:
     source = data / "lighthouse" / "libsurvive" / "tracker-cal-attempt.rec.gz"
     run, part = tmp_path / "run.mcap", tmp_path / "part.rec.gz"
     told = answer(locatk("import", "libsurvive", source, "-o", run, "--json"))

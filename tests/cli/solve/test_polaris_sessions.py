@@ -93,7 +93,7 @@ def test_the_tags_that_were_passed_go_into_the_session(locatk, tmp_path: Path) -
     assert "published tags" not in result.stderr
 
 
-def test_what_was_left_out_is_said(locatk, tmp_path: Path) -> None:
+def test_omissions_are_reported(locatk, tmp_path: Path) -> None:
     run = published(
         tmp_path / "run.csv", cells={5: "", 9: '"(1.0, nan, 2.0)"', 20: '"(4999, 0, 1)"'}
     )
@@ -136,7 +136,7 @@ def test_wrong_use_of_the_format(
     assert "Traceback" not in result.stderr
 
 
-def test_spacing_and_tag_belong_to_this_format(locatk, tmp_path: Path) -> None:
+def test_spacing_and_tag_are_options_of_this_format(locatk, tmp_path: Path) -> None:
     run = published(tmp_path / "run.csv")
     result = locatk("import", "images", run, "--spacing", 20, "-o", tmp_path / "run.mcap")
     assert result.exit_code == 2
@@ -146,7 +146,7 @@ def test_spacing_and_tag_belong_to_this_format(locatk, tmp_path: Path) -> None:
 # ---- info
 
 
-def test_info_tells_arrays_and_tags(locatk, tmp_path: Path) -> None:
+def test_info_describes_arrays_and_tags(locatk, tmp_path: Path) -> None:
     run, out = published(tmp_path / "run.csv", cells={5: ""}), tmp_path / "run.mcap"
     locatk("import", "polaris-csv", run, "--rate", 40, "--spacing", 20, "-o", out)
     facts = json.loads(locatk("info", out, "--json").stdout)
@@ -161,7 +161,7 @@ def test_info_tells_arrays_and_tags(locatk, tmp_path: Path) -> None:
     assert "MLX90393 gain 7 resolution 0 osr 3 filt 3" in text
 
 
-def test_info_tells_artifacts(locatk, tmp_path: Path) -> None:
+def test_info_describes_artifacts(locatk, tmp_path: Path) -> None:
     path = tmp_path / "tag.toml"
     built = AsBuiltTag(np.full((5, 2), 1e-4), np.full(5, math.radians(3)), 7)
     tags.write_tags(
@@ -392,7 +392,7 @@ def test_options_of_other_systems_are_refused(
     assert solver.asked == []
 
 
-def test_speed_is_refused_elsewhere(locatk, record, tmp_path: Path) -> None:
+def test_speed_is_refused_for_other_formats(locatk, record, tmp_path: Path) -> None:
     session = record(tmp_path / "light.mcap")
     result = locatk("solve", session, "-o", tmp_path / "solved.mcap", "--speed", 1)
     assert result.exit_code == 1
@@ -432,7 +432,7 @@ def test_templates_that_are_refused(
     assert words in " ".join(result.stderr.split())
 
 
-def test_viewers_see_the_tag_where_it_lies(locatk, solver: Solver, tmp_path: Path) -> None:
+def test_viewers_show_the_tag_at_its_position(locatk, solver: Solver, tmp_path: Path) -> None:
     from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
     for site, frame, corner in (
@@ -500,7 +500,7 @@ def test_passes_say_how_a_tag_was_built(locatk, solver: Solver, tmp_path: Path) 
     assert f"tag {ID}, 4 passes" in text
 
 
-def test_the_mean_offset_and_turn_are_none() -> None:
+def test_mean_offset_and_rotation_are_none() -> None:
     layout = layout_of(TAGS, ID)
     nominal = cell_positions(TAGS, layout.cells)
     offset = true_shape()[:, :2]

@@ -60,7 +60,7 @@ def test_json_is_the_contract(locatk, session: Path, tmp_path: Path) -> None:
     assert read_solution(out).poses == POSES
 
 
-def test_text_tells_poses_rejections_and_notes(locatk, session: Path, tmp_path: Path) -> None:
+def test_text_lists_poses_rejections_and_notes(locatk, session: Path, tmp_path: Path) -> None:
     result = locatk("solve", session, "-o", tmp_path / "solved.mcap")
     assert result.exit_code == 0
     assert "20 poses, lighthouse by bundle, 0.25 s" in result.stdout
@@ -196,7 +196,9 @@ def test_twins_and_files_for_folders_are_refused(locatk, record, tmp_path: Path)
     assert locatk("solve", *others, "-o", tmp_path / "out", *scene).exit_code == 2
 
 
-def test_what_is_no_session_is_refused(locatk, record, session: Path, tmp_path: Path) -> None:
+def test_files_other_than_sessions_are_refused(
+    locatk, record, session: Path, tmp_path: Path
+) -> None:
     solved = tmp_path / "solved.mcap"
     assert locatk("solve", session, "-o", solved).exit_code == 0
     unknown = record(tmp_path / "unknown.mcap", system="sonar")
@@ -238,7 +240,7 @@ def test_calibrate_writes_the_scene(locatk, session: Path, tmp_path: Path) -> No
     assert locatk("calibrate", "scene", session, "-o", out).exit_code == 1
 
 
-def test_systems_of_others_are_found(
+def test_systems_of_plugins_are_listed(
     locatk, record, monkeypatch, session: Path, tmp_path: Path
 ) -> None:
     """An entry point in the group locatk.systems serves a system we do not know."""

@@ -156,7 +156,7 @@ def test_folders_patterns_and_files(
     assert set(contents(tmp_path / "one")) == {"a.mcap"}
 
 
-def test_what_else_lies_in_a_folder(
+def test_other_files_in_a_folder(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pipes that nobody feeds, folders called like sessions, links in a circle, odd bytes."""
@@ -186,7 +186,7 @@ def test_what_else_lies_in_a_folder(
     assert "day/a.mcap and day/deep/a.mcap would have the same output" in named.stderr
 
 
-def test_beside_the_sessions_by_default(
+def test_outputs_are_next_to_the_sessions_by_default(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path
 ) -> None:
     sessions = day("a", "b")
@@ -254,7 +254,7 @@ def test_results_do_not_depend_on_jobs(
     assert "Incomplete: 5 of 8 sessions could not be solved." in errors[0]
 
 
-def test_the_solution_tells_what_made_it(
+def test_the_solution_names_its_origin(
     locatk: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -291,7 +291,7 @@ def test_a_deadly_session_does_not_stop_the_batch(
 
 
 @pytest.mark.slow
-def test_resume_leaves_out_what_is_done(
+def test_resume_skips_solved_sessions(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, sonar: Path
 ) -> None:
     sessions = day("a", "b", "c", "still")
@@ -396,7 +396,7 @@ def test_a_broken_artifact_is_one_error(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_interrupt_leaves_what_is_whole(
+def test_an_interrupt_keeps_complete_solutions(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, sonar: Path, jobs: int
 ) -> None:
     day("a", "b", "slow", "z")
@@ -524,7 +524,7 @@ def test_a_cluster_loses_nothing_when_a_worker_is_killed(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sonar")
-def test_who_does_not_answer_is_named(
+def test_an_unresponsive_server_is_named(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="dask is not installed")
@@ -642,7 +642,7 @@ def test_s3_in_and_out(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sonar")
-def test_s3_places(
+def test_s3_locations(
     locatk: Run, bucket: Any, day: Callable[..., list[Path]], tmp_path: Path
 ) -> None:
     [session] = day("a")

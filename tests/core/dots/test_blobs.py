@@ -143,7 +143,7 @@ def test_neighbours_that_lean_to_each_other_are_two() -> None:
 
 
 @pytest.mark.parametrize("width", [1, 2, 3, 4])
-def test_each_dot_is_found_once_where_there_is_no_noise(width: int) -> None:
+def test_each_dot_is_detected_once_without_noise(width: int) -> None:
     # Squares of whole pixels, as `print pattern --format png` makes them: equal minima.
     image = np.full((120, 192), 255, np.uint8)
     corners = [(x, y) for x in range(6, 180, 12) for y in range(6, 110, 12)]

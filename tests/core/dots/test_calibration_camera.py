@@ -236,7 +236,7 @@ def test_poses_are_of_the_centre_that_is_calibrated(
 # ---- what the frames do not tell
 
 
-def test_untilted_frames_tell_the_lens_but_not_the_focal_length(
+def test_untilted_frames_determine_the_lens_but_not_the_focal_length(
     upright_report: CameraReport,
 ) -> None:
     report = upright_report
@@ -271,7 +271,7 @@ def test_a_focal_length_that_is_given_is_kept(
 
 
 @pytest.mark.slow
-def test_an_earlier_focal_length_is_kept_where_nothing_tells_a_better_one(
+def test_a_prior_focal_length_is_kept_if_it_is_not_observable(
     upright: simulate.SimulatedSession, tilted: simulate.SimulatedSession
 ) -> None:
     earlier = CalibrateOptions(camera=Camera(SIZE, 333.0, (90.0, 60.0), -0.2))
@@ -298,7 +298,7 @@ def test_without_bend_and_tilt_the_centre_is_the_middle() -> None:
 
 
 @pytest.mark.slow
-def test_a_scale_that_was_not_measured_is_told_and_does_no_harm() -> None:
+def test_an_unmeasured_scale_is_reported_and_harmless() -> None:
     session = simulated(16, printer_scale=(1.003, 0.999), tilt_rad=math.radians(10))
     report = calibrate(session.frames, MANIFEST)
     check_lens(report)
@@ -312,7 +312,7 @@ def test_a_scale_that_was_not_measured_is_told_and_does_no_harm() -> None:
 
 
 @pytest.mark.slow
-def test_dots_stand_where_the_manifest_has_them() -> None:
+def test_dots_have_the_positions_of_the_manifest() -> None:
     shifted = replace(MANIFEST, offset_mm=0.060)
     options = SimulationOptions(frames=10, path="random", camera=TRUTH)
     frames = simulate.simulate(shifted, options).frames
@@ -438,7 +438,7 @@ def test_any_beginning_of_the_order_is_spread() -> None:
     assert spread_order(0) == []
 
 
-def test_the_few_frames_that_are_tilted_or_turned_are_among_those_taken(
+def test_rare_tilted_or_rotated_frames_are_selected(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(camera_views, "MAX_FITTED_FRAMES", 20)

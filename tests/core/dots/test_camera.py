@@ -74,7 +74,7 @@ def test_no_lens_changes_nothing_whatever_the_shape() -> None:
             np.testing.assert_allclose(moved, points)
 
 
-def test_where_no_distorted_point_belongs_there_is_nan() -> None:
+def test_points_without_distorted_image_are_nan() -> None:
     camera = Camera((188, 120), 100.0, (0.0, 0.0), 0.25)
     # r / (1 + k r^2) has its largest value, 1 / (2 sqrt(k)) = 1 focal length, at r = 2.
     result = camera.distort(np.array([[99.0, 0.0], [101.0, 0.0]]))

@@ -139,7 +139,7 @@ def test_without_noise_the_camera_comes_back_exactly(k: float) -> None:
 
 
 @pytest.mark.slow
-def test_sigmas_are_what_repetitions_scatter_by() -> None:
+def test_sigmas_match_the_scatter_of_repetitions() -> None:
     actual = []
     for seed in range(16):
         seen = views(12, seed=seed)
@@ -203,7 +203,7 @@ def test_a_sheet_that_is_stretched_does_not_move_the_focal_length() -> None:
     assert poses.aspect == pytest.approx(0.004, abs=1e-4)
 
 
-def test_a_lens_without_bend_has_a_centre_where_frames_are_tilted() -> None:
+def test_tilted_frames_locate_the_centre_of_a_lens_without_distortion() -> None:
     seen = views(25, k=0.0)
     bend = fit_homographies(seen)
     poses = fit_poses(seen, bend, 300.0)
@@ -213,7 +213,7 @@ def test_a_lens_without_bend_has_a_centre_where_frames_are_tilted() -> None:
     assert poses.focal == pytest.approx(FOCAL, rel=0.01)
 
 
-def test_a_centre_that_is_held_stays() -> None:
+def test_a_fixed_centre_is_kept() -> None:
     seen = views(10)
     bend = fit_homographies(seen, fix_centre=True)
     poses = fit_poses(seen, bend, 300.0, fix_centre=True)
@@ -300,7 +300,7 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         assert equations.gradient[k] == pytest.approx(slope, rel=1e-5)
 
 
-def test_the_prior_holds_what_frames_do_not_determine() -> None:
+def test_the_prior_constrains_unobservable_parameters() -> None:
     """Untilted frames of a lens without distortion have neither a centre nor a focal length."""
     fit = fit_homographies(views(6, tilt_deg=0.0, k=0.0))
     assert fit.sigma[:2] == pytest.approx([models.CENTRE_PRIOR_SIGMA * HALF] * 2, rel=0.1)

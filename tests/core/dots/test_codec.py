@@ -177,7 +177,7 @@ def test_every_shift_has_its_own_digits() -> None:
 
 
 @pytest.mark.parametrize(("order", "both"), [(6, 62), (7, 0), (8, 0), (12, 0)])
-def test_main_sequence_tells_its_direction_from_seven_bits_on(order: int, both: int) -> None:
+def test_seven_bits_of_the_main_sequence_give_its_direction(order: int, both: int) -> None:
     strings = cyclic(sequences.MAIN_DIGITS, order)
     assert sum(flipped(s[::-1]) in strings for s in strings) == both
 
@@ -258,7 +258,7 @@ def test_first_bits_are_those_of_py_microdots() -> None:
 @example("anoto", 0, 0, 9, 9, (0, 0))
 @example("libdots", SECTION_LENGTH - 100, SECTION_LENGTH - 100, 100, 100, (62, 62))
 @settings(max_examples=60, deadline=None)
-def test_closed_form_is_the_slow_road(
+def test_closed_form_equals_the_slow_reference(
     name: str, x: int, y: int, columns: int, rows: int, section: tuple[int, int]
 ) -> None:
     fast = codec(name).symbols((x, y), (columns, rows), section)
@@ -289,7 +289,7 @@ def test_phases_grow_by_the_shifts_between(name: str, start: int, count: int, se
 
 @given(names, st.lists(st.integers(0, SECTION_LENGTH - 1), min_size=1, max_size=5))
 @example("anoto", [0, 1, 235, 236, 240, 241, SECTION_LENGTH - 1])
-def test_place_of_residues(name: str, chosen: list[int]) -> None:
+def test_position_of_residues(name: str, chosen: list[int]) -> None:
     one = codec(name)
     residues = [[p % len(digits) for digits in one.digits] for p in chosen]
     assert one.position(residues).tolist() == chosen
@@ -305,7 +305,7 @@ def test_a_window_is_part_of_every_larger_one(
     np.testing.assert_array_equal(large[down : down + 9, right : right + 10], small)
 
 
-def test_sections_lay_columns_and_rows_elsewhere() -> None:
+def test_sections_shift_columns_and_rows() -> None:
     one = codec("anoto")
     first = one.symbols((5, 9), (70, 70), (0, 0))
     np.testing.assert_array_equal(one.symbols((5, 9), (70, 70), (3, 0))[:67] & 1, first[3:] & 1)

@@ -139,7 +139,7 @@ def test_windows_of_this_test_are_the_codecs(name: str) -> None:
 @pytest.mark.parametrize("name", CODECS)
 @pytest.mark.parametrize("side", [8, 12])
 @pytest.mark.parametrize("quarters", range(4))
-def test_every_place_section_and_turn(name: str, side: int, quarters: int) -> None:
+def test_every_position_section_and_rotation(name: str, side: int, quarters: int) -> None:
     windows = Windows(name, np.random.default_rng(side), 1000, side, side).turned(quarters)
     actual = identify_windows(*soft(windows.symbols), codec(name))
     took = accepted(actual)
@@ -190,7 +190,9 @@ def test_windows_at_the_rim_of_the_range() -> None:
 
 @pytest.mark.parametrize("quarters", range(4))
 @pytest.mark.parametrize("before", [(3, 0), (0, 4), (2, 5)])
-def test_a_window_may_look_past_the_first_places(before: tuple[int, int], quarters: int) -> None:
+def test_a_window_may_extend_before_the_first_positions(
+    before: tuple[int, int], quarters: int
+) -> None:
     # The frame on the upper left rim of a sheet at 0,0: its corner lies at places below 0.
     left, above = before
     windows = Windows("anoto", np.random.default_rng(4), 20, 16, 16, 0, 0)
@@ -273,7 +275,7 @@ def test_many_wrong_bits_of_larger_windows(side: int, share: float, least: float
 
 
 @pytest.mark.slow
-def test_bits_weigh_what_they_are_sure_of() -> None:
+def test_bits_are_weighted_by_confidence() -> None:
     # A quarter of all bits is wrong, but says itself that it hardly knows.
     rng = np.random.default_rng(8)
     windows = Windows("anoto", rng, 200, 12, 12)
@@ -310,7 +312,7 @@ def test_confidence_is_kept() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(17, 5), (40, 5), (40, 4), (10, 5), (5, 17), (5, 40)])
 @pytest.mark.parametrize("quarters", [0, 1])
-def test_five_lines_have_many_places(size: tuple[int, int], quarters: int) -> None:
+def test_five_lines_have_many_positions(size: tuple[int, int], quarters: int) -> None:
     # Four shifts: each secondary sequence holds a string of four digits about three times.
     windows = Windows("anoto", np.random.default_rng(10), 60, *size).turned(quarters)
     _, wrong, _ = fate(windows, soft(windows.symbols), codec("anoto"))
@@ -346,7 +348,7 @@ def repeated() -> Iterator[tuple[int, int]]:
 
 
 @pytest.mark.slow
-def test_what_libdots_repeats_is_not_told() -> None:
+def test_repeated_windows_of_libdots_are_ambiguous() -> None:
     one = codec("libdots")
     positions = list(repeated())
     assert len(positions) == 2 * (6 + 1)
@@ -392,7 +394,7 @@ def test_half_of_it_noise(side: int) -> None:
 
 
 @pytest.mark.parametrize("side", [8, 20])
-def test_what_only_looks_like_the_pattern_is_refused(side: int) -> None:
+def test_similar_patterns_are_refused(side: int) -> None:
     one = codec("anoto")
     original = Windows("anoto", np.random.default_rng(15), 40, side, side).symbols
     swap_x, swap_y = np.array([UP, RIGHT, LEFT, DOWN]), np.array([DOWN, LEFT, RIGHT, UP])

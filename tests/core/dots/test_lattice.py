@@ -158,7 +158,7 @@ def test_spoilt_lattices(how: dict[str, float], share: float) -> None:
     assert_found(clouds, share)
 
 
-def test_places_have_their_fractions() -> None:
+def test_positions_have_fractions() -> None:
     # Each dot lies beside its place by the sixth of a pitch that its symbol says.
     rng = np.random.default_rng(3)
     clouds = [

@@ -35,7 +35,7 @@ def test_usual_pattern_on_the_usual_printers() -> None:
     assert snap(0.508, None, 300).mm(6) == 0.508
 
 
-def test_pitch_and_dot_are_snapped_and_it_is_said() -> None:
+def test_snapped_pitch_and_dot_are_reported() -> None:
     raster = snap(0.3, 0.06, 600)
     assert raster == Raster(600, 7, 1, 1)
     assert snapped(raster, 0.3, 0.06) == [
@@ -100,14 +100,14 @@ def test_dots_fill_the_page_inside_its_margin(
 
 
 @given(page=PAGES, dpi=st.sampled_from(DPIS), pitch=st.floats(0.35, 1.2))
-def test_a_manifest_tells_the_pixels(page: tuple[float, float], dpi: int, pitch: float) -> None:
+def test_a_manifest_gives_the_pixels(page: tuple[float, float], dpi: int, pitch: float) -> None:
     layout = lay_out(page, 10, snap(pitch, None, dpi))
     generated = manifest(layout.raster, layout.sheets("a", (5, 6), (7, 8)), "anoto")
     assert pixels(generated, 0) == layout
     assert generated.sheets[0].section == (7, 8)
 
 
-def test_place_is_the_middle_of_the_dot_that_would_cover_it() -> None:
+def test_position_is_the_centre_of_a_covering_dot() -> None:
     layout = lay_out((210, 297), 10, snap(0.508, None, 600))
     generated = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
     # Two pixels from an even edge: the middle is at the edge between them.
@@ -198,7 +198,7 @@ def test_tiles_continue_one_area() -> None:
 
 
 @pytest.mark.parametrize("overlap", [0.0, 15.0])
-def test_neighbours_are_cut_at_the_same_place_of_the_floor(overlap: float) -> None:
+def test_neighbouring_sheets_share_their_cut(overlap: float) -> None:
     layout = floor()
     generated = manifest(
         layout.raster, tiling(layout, (3, 2), overlap).sheets("f", (0, 0)), "anoto"

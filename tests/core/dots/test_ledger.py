@@ -64,7 +64,7 @@ def test_new_areas_are_free(
     st.tuples(st.integers(0, 50), st.integers(0, 50), SIDES),
     st.tuples(st.integers(0, 50), st.integers(0, 50), SIDES),
 )
-def test_meeting_is_holding_one_place(
+def test_overlapping_areas_share_a_position(
     first: tuple[int, int, tuple[int, int]], second: tuple[int, int, tuple[int, int]]
 ) -> None:
     a, b = (area("a", x, y, *size) for x, y, size in (first, second))
@@ -86,21 +86,21 @@ def test_one_by_one_or_all_at_once() -> None:
     ]
 
 
-def test_sections_are_apart() -> None:
+def test_sections_do_not_overlap() -> None:
     held = [area("a", 0, 0, 500, 500)]
     assert free_origins(held, (500, 500)) == [(500 + GAP_POSITIONS, 0)]
     assert free_origins(held, (500, 500), (0, 1)) == [(0, 0)]
     assert not held[0].overlaps(area("b", 0, 0, 500, 500, v=1))
 
 
-def test_other_codecs_are_not_apart() -> None:
+def test_areas_of_other_codecs_overlap() -> None:
     """They share most digits: sheets of two codecs could be taken for one another."""
     held = [area("a", 0, 0, 500, 500)]
     with pytest.raises(InputError, match="in use"):
         allocate(held, [(100, 100)], prefixes=["x"], codec="libdots", origin=(499, 499))
 
 
-def test_a_full_section_is_said() -> None:
+def test_a_full_section_is_reported() -> None:
     held = [area("a", 0, 0, SECTION_LENGTH, SECTION_LENGTH - 200)]
     assert free_origins(held, (8, 200 - GAP_POSITIONS)) == [
         (0, SECTION_LENGTH - 200 + GAP_POSITIONS)

@@ -174,7 +174,7 @@ def test_other_cameras(shot: Shots, size: tuple[int, int], pitch: float, count: 
 
 
 @pytest.mark.slow
-def test_errors_are_as_large_as_the_covariance_says(shot: Shots) -> None:
+def test_errors_agree_with_the_covariance(shot: Shots) -> None:
     for how in ({}, {"noise": 12.0}, {"dot": 1 / 6, "tilt": TILT_10}, {"jitter": 0.02}):
         shots = shots_of(shot, 25, 5, **how)
         actual = localize_frames(np.stack([one.take() for one in shots]), codec("anoto"))
@@ -227,7 +227,7 @@ def locate_row(actual: LocalizedFrames, k: int) -> LocalizedFrames:
     )
 
 
-def test_quarter_turns_of_a_frame(shot: Shots) -> None:
+def test_frames_rotated_by_90_degrees(shot: Shots) -> None:
     (one,) = shots_of(shot, 1, 7)
     image = one.take()
     upright = localize_frames(image[None], codec("anoto"))
@@ -291,7 +291,7 @@ def test_frames_that_are_half_covered(
 
 
 @pytest.mark.slow
-def test_what_is_not_sure_is_rejected_and_says_so(shot: Shots) -> None:
+def test_uncertain_frames_are_rejected_with_a_reason(shot: Shots) -> None:
     shots = shots_of(shot, 40, 21)
     rng = np.random.default_rng(21)
     images = np.stack([bare(one.take(), rng, 0.62) for one in shots])
@@ -307,7 +307,7 @@ def test_what_is_not_sure_is_rejected_and_says_so(shot: Shots) -> None:
 
 
 @pytest.mark.slow
-def test_a_strip_of_few_rows_is_not_told(shot: Shots) -> None:
+def test_a_strip_of_few_rows_is_not_decoded(shot: Shots) -> None:
     # Rows tell y by the shifts between them; five rows have four, which many places share.
     shots = shots_of(shot, 24, 10)
     shots = [shot(**{**vars_of(one), "heading": 0.0}) for one in shots]
@@ -331,21 +331,21 @@ def test_the_rim_of_a_sheet(shot: Shots) -> None:
 
 
 @pytest.mark.parametrize("at", [(4.3, 700.2), (700.2, 4.3), (4.6, 4.1)])
-def test_the_first_places_of_all(shot: Shots, at: tuple[float, float]) -> None:
+def test_the_first_positions_of_the_pattern(shot: Shots, at: tuple[float, float]) -> None:
     # The frame looks past the corner of the plane; the ledger's first sheet lies there.
     shots = [shot(at=at, heading=heading, section=(5, 9)) for heading in (0.4, 2.0, 3.5, 5.1)]
     images = np.stack([one.take() for one in shots])
     assert judge(localize_frames(images, codec("anoto")), shots).fate == {"right": 4}
 
 
-def test_the_last_places_of_all(shot: Shots) -> None:
+def test_the_last_positions_of_the_pattern(shot: Shots) -> None:
     (one,) = shots_of(shot, 1, 12)
     last = shot(**{**vars_of(one), "at": (SECTION_LENGTH - 20.0, SECTION_LENGTH - 20.0)})
     assert judge(localize_frames(last.take()[None], codec("anoto")), [last]).fate == {"right": 1}
 
 
 @pytest.mark.parametrize("beyond", [-4, -2, 0, 2, 4])
-def test_a_border_of_sections_is_rejected_and_said(shot: Shots, beyond: int) -> None:
+def test_a_border_of_sections_is_rejected_with_a_reason(shot: Shots, beyond: int) -> None:
     """Two sections side by side, with ``beyond`` pitches of the second left of the middle."""
     rng = np.random.default_rng(13)
     images = []
@@ -424,7 +424,7 @@ def test_the_pattern_in_a_mirror_and_as_a_negative(shot: Shots) -> None:
         assert not localize_frames(np.ascontiguousarray(wrong), codec("anoto")).accepted.any()
 
 
-def test_a_sheet_of_another_codec_has_its_places_elsewhere(shot: Shots) -> None:
+def test_a_sheet_of_another_codec_has_other_positions(shot: Shots) -> None:
     # microdots and anoto share three of four sequences.
     images = np.stack([one.take() for one in shots_of(shot, 20, 16, codec="microdots")])
     assert not localize_frames(images, codec("anoto")).accepted.any()
@@ -508,7 +508,7 @@ def test_updates_keep_the_better_result() -> None:
 # --- what the dots say
 
 
-def test_of_two_dots_at_a_place_the_likelier_one_speaks() -> None:
+def test_the_likelier_of_two_dots_of_a_cell_is_used() -> None:
     # At place (1, 0): a dot just where "right" stands, and dust on the other side of it.
     for order in ([0, 1], [1, 0]):
         rest = np.array([[1 / 6, 0.01], [-0.25, 0.1]], np.float32)[order]
@@ -532,7 +532,7 @@ def test_of_two_dots_at_a_place_the_likelier_one_speaks() -> None:
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_sightings_are_dots_and_where_they_stand(shot: Shots, known: bool) -> None:
+def test_observations_are_dots_and_their_positions(shot: Shots, known: bool) -> None:
     camera = Camera((188, 120), 348.7, (93.5, 59.5), -0.045 * 348.7**2 / CORNER_SQUARE)
     (one,) = shots_of(shot, 1, 19, radial=camera.radial_px, noise=1.0)
     blank = np.full((120, 188), 200, np.uint8)

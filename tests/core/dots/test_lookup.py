@@ -62,7 +62,7 @@ def nothing(actual: ExactWindows) -> None:
         assert (values[bad] == -1).all()
 
 
-def test_a_quarter_turn_is_counter_clockwise() -> None:
+def test_a_rotation_by_90_degrees_is_counter_clockwise() -> None:
     page = np.array([[UP, UP, RIGHT], [DOWN, LEFT, LEFT]], np.uint8)
     rotated = np.array([[UP, DOWN], [LEFT, DOWN], [LEFT, RIGHT]], np.uint8)
     np.testing.assert_array_equal(rotate_symbols(page, 1), rotated)
@@ -73,7 +73,7 @@ def test_a_quarter_turn_is_counter_clockwise() -> None:
 
 @pytest.mark.parametrize("rotation", range(4))
 @pytest.mark.parametrize("name", NAMES)
-def test_8x8_anywhere_in_any_section_and_turn(name: str, rotation: int) -> None:
+def test_8x8_windows_at_any_position_section_and_rotation(name: str, rotation: int) -> None:
     windows, at, sections = draw(name, 400, (8, 8), 10 + rotation)
     actual = decode_exact(rotate_symbols(windows, rotation), codec(name))
     agrees(actual, slice(None), at, sections, rotation)
@@ -106,7 +106,7 @@ def test_corners_of_the_range(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["anoto", "microdots"])
-def test_6x6_is_read_as_it_stands(name: str) -> None:
+def test_6x6_windows_are_read_unrotated(name: str) -> None:
     windows, at, sections = draw(name, 600, (6, 6), 3)
     agrees(decode_exact(windows, codec(name)), slice(None), at, sections, 0)
 
@@ -135,7 +135,7 @@ def test_libdots_7x7_knows_all_but_one_string() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("rotation", range(4))
 @pytest.mark.parametrize("size", [(6, 6), (6, 9), (7, 6)])
-def test_small_windows_of_unknown_turn_are_right_or_not_read(
+def test_small_windows_of_unknown_rotation_are_right_or_rejected(
     size: tuple[int, int], rotation: int
 ) -> None:
     windows, at, sections = draw("anoto", 1500, size, 6)
@@ -145,7 +145,7 @@ def test_small_windows_of_unknown_turn_are_right_or_not_read(
     nothing(actual)
 
 
-def test_only_the_turns_that_are_asked_for() -> None:
+def test_only_requested_rotations() -> None:
     windows, at, sections = draw("anoto", 200, (8, 8), 7)
     half = rotate_symbols(windows, 2)
     agrees(decode_exact(half, codec("anoto"), (0, 2)), slice(None), at, sections, 2)
@@ -153,7 +153,7 @@ def test_only_the_turns_that_are_asked_for() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_one_wrong_bit_of_8x8_is_always_found(name: str) -> None:
+def test_one_wrong_bit_of_8x8_is_always_detected(name: str) -> None:
     windows, _, _ = draw(name, 6, (8, 8), 8)
     rows, columns, bits = np.indices((8, 8, 2)).reshape(3, -1)
     for window in windows:
@@ -183,7 +183,7 @@ def test_noise_is_not_read(seed: int, side: int) -> None:
     nothing(actual)
 
 
-def test_what_is_read_is_what_is_there() -> None:
+def test_decoded_windows_equal_the_pattern() -> None:
     # Of any window that is read, however it came about, all dots are the codec's.
     noise = np.random.default_rng(11).integers(0, 4, (20_000, 6, 6)).astype(np.uint8)
     one = codec("anoto")
@@ -246,6 +246,6 @@ def test_digits_of_shifts() -> None:
         (np.zeros((1, 8, 8)), "0..3"),
     ],
 )
-def test_what_is_no_window_is_refused(windows: Any, says: str) -> None:
+def test_invalid_windows_are_refused(windows: Any, says: str) -> None:
     with pytest.raises(InputError, match=says):
         decode_exact(windows, codec("anoto"))

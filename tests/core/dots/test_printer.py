@@ -110,7 +110,7 @@ def test_a_good_print_is_read_and_its_scale_measured(fine: Ink) -> None:
 
 
 @pytest.mark.slow
-def test_a_sheet_may_lie_across(coarse: Ink) -> None:
+def test_a_sheet_may_be_scanned_sideways(coarse: Ink) -> None:
     report = calibrate(scan(coarse, 300, (1.003, 0.996), 90), (SCAN_DPI, SCAN_DPI))
     assert report.scale == pytest.approx((1.003, 0.996), abs=2e-4)
     assert all(field.right == 1 for field in report.fields)
@@ -152,7 +152,7 @@ def test_dots_that_grow_are_measured_and_smaller_ones_recommended(coarse: Ink) -
 
 
 @pytest.mark.slow
-def test_a_field_is_known_by_what_it_says(coarse: Ink) -> None:
+def test_a_field_is_identified_by_its_code(coarse: Ink) -> None:
     image = scan(coarse, 300)
     sheet = printer_sheet("A4", 300)
     with_faults = next(field for field in sheet.fields if field.name == "B4")
@@ -168,7 +168,7 @@ def test_a_field_is_known_by_what_it_says(coarse: Ink) -> None:
 
 
 @pytest.mark.slow
-def test_a_picture_that_is_too_coarse_says_nothing_of_the_printer(coarse: Ink) -> None:
+def test_a_too_coarse_picture_gives_no_result_for_the_printer(coarse: Ink) -> None:
     report = calibrate(scan(coarse, 300, scan_dpi=300), (300, 300))
     for field in report.fields:
         assert field.judged == (field.pitch_px >= 5)
@@ -216,7 +216,7 @@ def score(name: str, **changes: float) -> FieldScore:
     return replace(field, **changes)
 
 
-def test_what_is_recommended() -> None:
+def test_the_recommended_settings() -> None:
     usual, dense, wide = score("u"), score("d", pitch_mm=0.339), score("w", pitch_mm=0.677)
     assert recommend([dense, usual, wide]) is usual
     # Wrong symbols count before all; a speck of dust does not.
@@ -234,7 +234,7 @@ def test_what_is_recommended() -> None:
         recommend([usual], pitch_mm=0.6)
 
 
-def test_no_two_fields_share_a_place() -> None:
+def test_no_two_fields_share_a_position() -> None:
     for dpi in (300, 600, 1200):
         sheet = printer_sheet("A4", dpi)
         assert len(sheet.fields) >= 10

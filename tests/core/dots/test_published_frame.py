@@ -35,12 +35,12 @@ def frame(data: Path) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
-def turned_by(result: float, true_deg: float) -> float:
+def rotation_error_deg(result: float, true_deg: float) -> float:
     return abs(math.remainder(math.degrees(result) - true_deg, 360))
 
 
 @pytest.mark.parametrize("quarters", range(4))
-def test_place_and_heading(frame: NDArray[np.uint8], quarters: int) -> None:
+def test_position_and_heading(frame: NDArray[np.uint8], quarters: int) -> None:
     # numpy turns the picture counter-clockwise, as if the camera had been turned clockwise.
     image = np.ascontiguousarray(np.rot90(frame, quarters))
     result = localize_frames(image[None], codec("libdots"))
@@ -48,7 +48,7 @@ def test_place_and_heading(frame: NDArray[np.uint8], quarters: int) -> None:
     np.testing.assert_allclose(result.grid[0], PLACE, atol=0.05)
     # A heading is that of the image's right. The picture is sheared: its down is 0.15 degrees
     # off the square, by whatever centroids, so that its quarter turns cannot be within 0.2 too.
-    assert turned_by(result.heading[0], HEADING_DEG - 90 * quarters) < (
+    assert rotation_error_deg(result.heading[0], HEADING_DEG - 90 * quarters) < (
         0.35 if quarters % 2 else 0.2
     )
     assert tuple(result.section[0]) == SECTION
@@ -58,7 +58,7 @@ def test_place_and_heading(frame: NDArray[np.uint8], quarters: int) -> None:
     assert (sigma[:2] < 0.01).all()
 
 
-def test_the_turns_agree_with_each_other(frame: NDArray[np.uint8]) -> None:
+def test_rotations_agree_with_each_other(frame: NDArray[np.uint8]) -> None:
     result = [
         localize_frames(np.ascontiguousarray(np.rot90(frame, k))[None], codec("libdots"))
         for k in range(4)
@@ -92,6 +92,6 @@ def test_metres_on_its_sheet(frame: NDArray[np.uint8], method: str) -> None:
     (pose,) = solution.detections
     assert pose.x_m * 1e3 == pytest.approx(10 + 129.168 * 0.508, abs=0.04)
     assert pose.y_m * 1e3 == pytest.approx(297 - 13.5 - 224.506 * 0.508, abs=0.04)
-    assert turned_by(pose.heading_rad, HEADING_DEG) < 0.5
+    assert rotation_error_deg(pose.heading_rad, HEADING_DEG) < 0.5
     assert (pose.sheet, pose.frame, pose.time_s) == ("libdots", "frame.bmp", 5.0)
     assert solution.rejected == {}

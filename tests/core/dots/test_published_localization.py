@@ -82,7 +82,7 @@ def photograph(
     return np.clip(np.rint(frame), 0, 255).astype(np.uint8)
 
 
-def turned_by(actual: float, true: float) -> float:
+def rotation_error_deg(actual: float, true: float) -> float:
     """Difference of two headings, in degrees."""
     return abs(math.degrees(math.remainder(actual - true, math.tau)))
 
@@ -105,7 +105,7 @@ def study(count: int, seed: int, **how: Any) -> tuple[Counter[str], list[float],
         else:
             fate["right"] += 1
             off.append(error)
-            turn_off.append(turned_by(pose.heading_rad, heading))
+            turn_off.append(rotation_error_deg(pose.heading_rad, heading))
     return fate, off, turn_off
 
 
@@ -136,7 +136,7 @@ def test_heading_is_counter_clockwise_from_the_sheets_x(quarter: int) -> None:
     pose = localize_published(photograph((7000.3, 900.8), heading, section=(4, 60)), codec("anoto"))
     assert pose.rejected is None
     assert math.hypot(pose.x - 7000.3, pose.y - 900.8) < 0.15
-    assert turned_by(pose.heading_rad, heading) < 2.5
+    assert rotation_error_deg(pose.heading_rad, heading) < 2.5
     assert pose.section == (4, 60)
     assert pose.dots > 150
     assert 0.5 < pose.quality <= 1.0
@@ -150,7 +150,7 @@ def test_other_codecs(name: str) -> None:
     assert math.hypot(pose.x - 250_000_000.5, pose.y - 77.7) < 0.15
 
 
-def test_published_frame_and_its_turns(data: Path) -> None:
+def test_published_frame_and_its_rotations(data: Path) -> None:
     file = data / "dots" / "frame.bmp"
     if not file.exists():
         pytest.skip(f"{file} is not there")
@@ -161,10 +161,10 @@ def test_published_frame_and_its_turns(data: Path) -> None:
         assert math.hypot(pose.x - 129.168, pose.y - 3224.506) < 0.1
         assert pose.section == (24, 32)
         # What turns the frame counter-clockwise is a camera turned clockwise.
-        assert turned_by(pose.heading_rad, math.radians(1.603 - 90 * quarter)) < 0.4
+        assert rotation_error_deg(pose.heading_rad, math.radians(1.603 - 90 * quarter)) < 0.4
 
 
-def test_camera_undoes_the_lens_and_says_where_the_centre_is() -> None:
+def test_camera_undistorts_and_gives_the_centre() -> None:
     camera = Camera((188, 120), 219.0, (99.0, 56.5), -0.35)
     right = {True: 0, False: 0}
     for k in range(12):
@@ -188,7 +188,7 @@ def rejected(pose: PublishedPose, *reasons: str) -> bool:
     return pose.rejected in reasons and math.isnan(pose.x) and pose.section == (-1, -1)
 
 
-def test_what_is_no_pattern_is_rejected() -> None:
+def test_frames_without_pattern_are_rejected() -> None:
     one = codec("anoto")
     for shape in ((1, 1), (120, 188)):
         for grey in (0, 128, 255):
@@ -221,7 +221,7 @@ def test_what_is_no_pattern_is_rejected() -> None:
         (np.zeros((121, 188), np.uint8), "188 x 121 px is not of the camera's 188 x 120"),
     ],
 )
-def test_what_is_no_frame_is_refused(image: Any, says: str) -> None:
+def test_invalid_frames_are_refused(image: Any, says: str) -> None:
     camera = Camera((188, 120), 200.0, (93.5, 59.5))
     with pytest.raises(InputError, match=says):
         localize_published(image, codec("anoto"), camera)
@@ -342,7 +342,7 @@ def test_likelihood_is_equation_9() -> None:
     )
 
 
-def test_soft_bits_tell_the_four_symbols_and_keep_the_likelier_dot() -> None:
+def test_soft_bits_give_the_symbol_and_keep_the_likelier_dot() -> None:
     g = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [1, 1], [3, 2]])
     offsets = np.array([[0, -1], [-1, 0], [1, 0], [0.0, 1], [-0.5, 0], [0, 0]]) / 6
     columns, rows = paper_grid.soft_bits(g + [5, -3], offsets)

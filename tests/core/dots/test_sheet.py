@@ -30,7 +30,7 @@ def test_measured_scale_stretches_the_whole_paper() -> None:
     )
 
 
-def test_tiles_lie_on_the_floor() -> None:
+def test_tiles_are_placed_on_the_floor() -> None:
     tile = replace(PAGE, position_mm=(1000.0, -200.0))
     plain = Manifest((tile,), pitch_mm=0.5)
     np.testing.assert_allclose(plain.to_metres(0, [1000, 2000]), [1.00508, 0.093], atol=1e-12)
@@ -76,7 +76,7 @@ def test_jacobian_is_the_derivative(
     assert np.linalg.det(manifest.jacobian(0)) < 0
 
 
-def test_find_tells_sheets_and_sections_apart() -> None:
+def test_find_distinguishes_sheets_and_sections() -> None:
     other = replace(PAGE, id="A4-2", origin=(1394, 2000))
     elsewhere = replace(PAGE, id="A4-3", section=(4, 5))
     manifest = Manifest((PAGE, other, elsewhere))

@@ -68,11 +68,11 @@ def test_tiles_are_one_floor(shoot: Shoot) -> None:
     heading = 2 * math.atan2(track.quaternion[1, 2], track.quaternion[1, 3])
     assert heading == pytest.approx(math.pi / 2 + 0.25, abs=1e-3)
     # The spread along the paper's x lies along the floor's y.
-    alone = solve([recorded_frames(images[1:])], Manifest((Sheet(*_without_place(rotated)),)))
+    alone = solve([recorded_frames(images[1:])], Manifest((Sheet(*_without_position(rotated)),)))
     assert track.sigma[1, 1] == pytest.approx(alone.trajectories[0].sigma[0, 0], rel=1e-6)
 
 
-def _without_place(sheet: Sheet) -> tuple[object, ...]:
+def _without_position(sheet: Sheet) -> tuple[object, ...]:
     return (sheet.id, sheet.origin, sheet.size, sheet.section, sheet.page_mm, sheet.first_mm)
 
 
@@ -84,7 +84,7 @@ def test_a_camera_that_sees_two_sheets_has_a_trajectory_on_each(shoot: Shoot) ->
     assert frames == {"A4-0001": ("robot-A4-0001", 2), "A4-0002": ("robot-A4-0002", 1)}
 
 
-def test_where_sheets_adjoin_each_holds_its_own() -> None:
+def test_adjacent_sheets_contain_their_own_dots() -> None:
     first, second = (Sheet(f"s{x}", (x, 0), (100, 100), (0, 0), (60, 60), (5, 5)) for x in (0, 100))
     manifest = Manifest((first, second))
     positions = [

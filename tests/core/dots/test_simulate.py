@@ -148,7 +148,7 @@ def test_a_frame_is_what_opencv_draws_of_the_same_page() -> None:
     assert away.max() < 6
 
 
-def test_each_dot_lies_where_its_symbol_and_the_truth_say() -> None:
+def test_each_dot_has_the_position_of_its_symbol_and_truth() -> None:
     """Straight down everything is a similarity, which is written out here."""
     manifest = simulate.sheet()
     simulated = simulate.simulate(manifest, replace(PLAIN, frames=3, blur_px=0.6))
@@ -184,7 +184,7 @@ def test_each_dot_lies_where_its_symbol_and_the_truth_say() -> None:
 
 
 @pytest.mark.slow
-def test_the_published_frame_looks_like_its_simulation(data: Path) -> None:
+def test_the_published_frame_resembles_its_simulation(data: Path) -> None:
     """Codec, conventions and heading against the real picture of cellulo-localization."""
     real = cv2.imread(str(data / "dots" / "frame.bmp"), cv2.IMREAD_GRAYSCALE)
     manifest = Manifest(
@@ -242,7 +242,7 @@ def test_a_dot_has_the_size_that_was_asked_for(
         assert wide == pytest.approx(alone + 36 / 12, rel=0.05)
 
 
-def test_a_path_blurs_along_its_way_by_speed_and_exposure() -> None:
+def test_motion_blur_follows_speed_and_exposure() -> None:
     manifest, ink = one_dot()
     options = replace(PLAIN, exposure_s=2e-3, paper_level=200.0, contrast=1.0)
     velocity_mps = np.array([[0.1 * math.cos(0.9), 0.1 * math.sin(0.9)]])
@@ -335,7 +335,7 @@ def test_dots_stray_by_the_jitter_that_was_asked_for() -> None:
     assert np.abs(np.corrcoef(np.transpose(strays))[0, 1]) < 0.25
 
 
-def test_a_printer_out_of_scale_is_told_by_the_truth_alone() -> None:
+def test_only_the_truth_contains_the_scale_of_the_printer() -> None:
     manifest = simulate.sheet()
     stretched = replace(manifest, scale=(1.004, 0.997))
     options = replace(PLAIN, frames=4)
@@ -360,7 +360,7 @@ def test_a_printer_out_of_scale_is_told_by_the_truth_alone() -> None:
 # ---- sheets
 
 
-def test_tiles_lie_on_the_floor_and_the_later_one_on_top() -> None:
+def test_the_later_of_overlapping_tiles_is_on_top() -> None:
     page = (50.0, 50.0)
     tiles = Manifest(
         (
@@ -409,7 +409,7 @@ def test_a_sheet_that_is_not_there_is_refused(number: int) -> None:
 # ---- paths and sessions
 
 
-def test_a_curve_keeps_its_speed_and_looks_ahead() -> None:
+def test_a_curve_has_constant_speed_and_faces_forward() -> None:
     options = replace(PLAIN, path="curve", frames=2000, rate_hz=100.0, speed_mps=0.25)
     truth = simulate.simulate(None, options).truth
     step = np.diff(truth.position[:, :2], axis=0)
@@ -462,7 +462,7 @@ def test_the_same_options_give_the_same_session_in_any_order() -> None:
     assert not np.array_equal(other.frames.images[0], frames[0])
 
 
-def test_frames_tilt_each_by_themselves_up_to_what_was_said() -> None:
+def test_each_frame_is_tilted_up_to_the_limit() -> None:
     simulated = simulate.simulate(None, replace(PLAIN, frames=300, tilt_rad=0.17))
     poses = simulated.frames.images._poses  # type: ignore[attr-defined]
     tilt = np.array([math.hypot(s.pitch_rad, s.roll_rad) for s in poses])
@@ -500,7 +500,7 @@ def test_frames_tilt_each_by_themselves_up_to_what_was_said() -> None:
     ],
     ids=lambda wrong: next(iter(wrong)),
 )
-def test_what_cannot_be_is_refused(wrong: dict[str, object]) -> None:
+def test_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError, match=next(iter(wrong))):
         SimulationOptions(**wrong)  # type: ignore[arg-type]
 

@@ -82,7 +82,7 @@ def test_margins_that_leave_nothing_are_rejected(margin: float) -> None:
         check_margin(A4, 105.0, min_content_mm=0.0)
 
 
-def test_a_larger_paper_grows_only_where_it_is_too_small() -> None:
+def test_an_extended_paper_grows_only_at_short_sides() -> None:
     assert larger_paper_text((100.0, 200.0), (90.0, 50.5), (80.0, 150.0)) == "110x200mm"
     assert larger_paper_text((100.0, 200.0), (90.0, 50.5), (80.0, 50.0)) == "110x201mm"
     assert size_text((215.9, 279.4)) == "215.9 x 279.4 mm"

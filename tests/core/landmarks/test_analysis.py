@@ -145,7 +145,7 @@ def test_radii_equal_the_reference(usual: LandmarkAnalysis) -> None:
     assert math.isnan(usual.patterns[4].r2_m)
 
 
-def test_contour_is_where_the_field_meets_the_threshold() -> None:
+def test_contour_is_at_the_threshold_of_the_field() -> None:
     phi = np.radians(np.array([10.0, 22.5, 30, 45, 60, 200, 225, 250, 300]))
     strengths = signs(code_of("NNNS"))
     result = threshold_contour(ONE, strengths[:, None], phi)[:, 0]
@@ -181,7 +181,9 @@ def test_gulfs_are_some_millimetres_wide(usual: LandmarkAnalysis) -> None:
 
 
 @pytest.mark.parametrize(("geometry", "low", "high"), [(ONE, 0.020, 0.030), (LONG, 0.015, 0.020)])
-def test_heights_end_where_the_table_collapses(geometry: Geometry, low: float, high: float) -> None:
+def test_heights_end_at_the_collapse_of_the_table(
+    geometry: Geometry, low: float, high: float
+) -> None:
     """40 mm bars give 2 valleys from a height of 20 mm on, 30 mm bars still 6 there."""
     bottom, top = valid_sensor_heights(geometry)
     assert bottom == 0
@@ -228,7 +230,7 @@ def test_neighbours_are_as_bad_as_the_worst_of_all_codes() -> None:
 
 
 @pytest.mark.slow
-def test_hall_sensors_tell_the_largest_field() -> None:
+def test_range_of_hall_sensors_follows_the_largest_field() -> None:
     result = analyse_landmark(Geometry())
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.06, 0.06, (20_000, 2))
@@ -270,7 +272,7 @@ def test_fields_grow_with_remanence_and_shrink_with_height() -> None:
     assert 1e3 * (stronger.r2_m - designed.r2_m) == pytest.approx(1, abs=0.5)
 
 
-def test_a_collapse_is_told_with_what_to_do() -> None:
+def test_a_collapse_is_reported_with_a_remedy() -> None:
     high = analyse_landmark(replace(LONG, sensor_height_m=0.02))
     assert [len(pattern.valleys_rad) for pattern in high.patterns] == [4, 2, 2, 6, 8, 8]
     assert np.isnan(high.patterns[2].bias_m).all()
@@ -280,7 +282,7 @@ def test_a_collapse_is_told_with_what_to_do() -> None:
     assert not list(landmark_warnings(analyse_landmark(Geometry())))
 
 
-def test_skewed_valleys_are_told() -> None:
+def test_skewed_valleys_are_reported() -> None:
     """50 mm bars put the inner valleys at 16 to 18 degrees, which is too large."""
     bars = replace(ONE, bar_length_m=0.05, bar_width_m=0.005, radius_m=0.028, sensor_height_m=0.004)
     result = analyse_landmark(bars)
@@ -288,7 +290,7 @@ def test_skewed_valleys_are_told() -> None:
     assert any("17 degrees" in text for text in landmark_warnings(result))
 
 
-def test_close_landmarks_are_told() -> None:
+def test_close_landmarks_are_reported() -> None:
     result = analyse_landmark(Geometry())
     assert not list(pitch_warnings(result, 0.2))
     (field,) = pitch_warnings(result, 0.17)

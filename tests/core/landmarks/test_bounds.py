@@ -74,7 +74,7 @@ def test_too_large_floors_are_refused_with_the_bound(
     )
 
 
-def test_holes_and_walls_make_room() -> None:
+def test_holes_and_walls_reduce_the_readings() -> None:
     with pytest.raises(InputError, match="256 readings"):
         require_enough_words(9, 9, alphabet="6", window="L")
     middle = {(r, c) for r in range(3, 6) for c in range(3, 6)}
@@ -83,7 +83,7 @@ def test_holes_and_walls_make_room() -> None:
     require_enough_words(9, 9, alphabet="6", window="L", walls=fence)
 
 
-def test_a_one_way_square_may_read_like_itself_turned() -> None:
+def test_a_one_way_square_may_equal_its_rotation() -> None:
     """One wall leaves one of the four ways around a square, and no word is useless then."""
     codes = np.zeros((2, 2), int)
     walls = frozenset({((0, 0), (0, 1))})

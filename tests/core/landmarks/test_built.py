@@ -30,7 +30,7 @@ def built(
     return AsBuiltLandmark(x_m, y_m, rotation, np.array(strength, float), np.full(7, np.nan))
 
 
-def test_codes_are_the_designs_where_nothing_else_is_known() -> None:
+def test_codes_default_to_the_design() -> None:
     assert np.array_equal(as_built_codes(FloorMap(CODES)), CODES)
     sound = {(1, 1): built(0.97 * signs(7)), (0, 1): built([np.nan] * 4)}
     assert np.array_equal(as_built_codes(FloorMap(CODES, built=sound)), CODES)
@@ -42,7 +42,7 @@ def test_flipped_bars_change_codes_and_missing_ones_do_not() -> None:
     assert CODES[0, 0] == 13
 
 
-def test_a_mark_is_where_and_what_was_built() -> None:
+def test_marks_show_position_and_pattern_as_built() -> None:
     floor = FloorMap(CODES, built={(1, 2): built([np.nan, 0.5, 0.0, -1.1], 2e-3, -1e-3, 0.02)})
     pose, strength = as_built_landmark(floor, (1, 2))
     assert pose == pytest.approx([0.402, 0.199, 0.02])

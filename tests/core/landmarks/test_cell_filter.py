@@ -224,7 +224,7 @@ def test_no_visits(published: FloorMap) -> None:
     assert identify(published, []) == []
 
 
-def test_quarter_turns_of_a_frame_are_equivalent(published: FloorMap) -> None:
+def test_rotations_of_a_frame_by_90_degrees_are_equivalent(published: FloorMap) -> None:
     """The quarter turn of a hypothesis' frame is arbitrary."""
     path = walk(((9, 12), 3), (0, 1, 0))
     observed = visits_of(published, path, on_map(published, path))

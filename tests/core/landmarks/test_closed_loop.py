@@ -74,7 +74,7 @@ def test_a_motion_is_executed_by_the_biased_odometry(bias: int) -> None:
     assert abs(true_pose - ordered.pose).max() > 1e-3
 
 
-def test_readouts_on_the_way_are_the_start_of_the_session() -> None:
+def test_early_readouts_equal_the_start_of_the_session() -> None:
     driver = ScriptedDriver(SCRIPT)
     session = simulate(FLOOR, OPTIONS, driver)
     (samples,), (reported,) = session.samples, session.odometry

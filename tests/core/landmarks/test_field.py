@@ -91,7 +91,7 @@ def test_beside_and_below_too() -> None:
     np.testing.assert_allclose(result, expected[:, 2], rtol=1e-11)
 
 
-def test_a_turned_landmark_has_a_turned_field() -> None:
+def test_a_rotated_landmark_has_a_rotated_field() -> None:
     geometry = GEOMETRIES[0]
     points = scattered(geometry, 3)[:200]
     field = basis(geometry, points[:, :2], points[:, 2])

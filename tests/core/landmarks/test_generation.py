@@ -82,7 +82,7 @@ def test_same_seed_same_map() -> None:
     assert [floor.seed for floor in maps] == [0, 0, 1, -5, 2**40]
 
 
-def test_what_was_asked_for_is_on_the_map() -> None:
+def test_the_map_has_the_requested_properties() -> None:
     geometry = Geometry(bar_length_m=0.02)
     forbidden = frozenset({(0, 0), (3, 4), (2, 2)})
     walls = frozenset({((1, 1), (1, 2)), ((5, 3), (4, 3))})
@@ -101,7 +101,7 @@ def test_more_than_the_bound_is_refused() -> None:
         design_map(DesignOptions(40, 40))
 
 
-def test_a_spent_budget_says_what_is_left() -> None:
+def test_an_exhausted_budget_reports_the_remainder() -> None:
     """34 x 34 less one is within the bound, and none is known."""
     observed: list[tuple[float, int]] = []
     options = DesignOptions(32, 32, evaluations=100_000)

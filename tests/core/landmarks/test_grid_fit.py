@@ -57,7 +57,7 @@ def test_the_pitch_can_be_given() -> None:
     assert fit_grid(pair, names(2), pitch_m=0.2).cells[1, 1] == 2
 
 
-def test_what_is_off_is_named() -> None:
+def test_deviating_landmarks_are_named() -> None:
     at = positions([(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)], 0.2)
     at[4, 1] += 0.03
     at[2, 0] += 0.016
@@ -77,7 +77,7 @@ def test_what_is_off_is_named() -> None:
         fit_grid([], [])
 
 
-def test_a_turned_survey_has_no_grid() -> None:
+def test_a_rotated_survey_has_no_grid() -> None:
     at = positions([(r, c) for r in range(10) for c in range(10)], 0.2)
     rotation = np.deg2rad(3)
     rotated = at @ np.array(

@@ -34,7 +34,7 @@ def test_other_letters_are_refused(letters: str) -> None:
         code_of(letters)
 
 
-def test_a_turn_moves_each_bar_to_the_next_place() -> None:
+def test_a_rotation_moves_each_bar_to_the_next_side() -> None:
     """By strings, which know nothing of bits."""
     for code in range(CODE_COUNT):
         letters = name(code)
@@ -43,7 +43,7 @@ def test_a_turn_moves_each_bar_to_the_next_place() -> None:
             assert name(int(rotated(code, quarters))) == moved
 
 
-def test_turns_broadcast_and_undo() -> None:
+def test_rotations_broadcast_and_invert() -> None:
     codes = np.arange(CODE_COUNT)
     table = rotated(codes[:, None], np.arange(-4, 5))
     assert table.shape == (CODE_COUNT, 9)
@@ -72,7 +72,7 @@ def test_sixteen_orientations_of_six_patterns() -> None:
         assert {pattern(code) for code in result} == {PATTERNS[number - 1]}
 
 
-def test_a_turned_code_is_a_turned_field() -> None:
+def test_a_rotated_code_has_a_rotated_field() -> None:
     """The robot's reading: a landmark seen under q quarter turns is turned back by q."""
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (50, 2))
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])

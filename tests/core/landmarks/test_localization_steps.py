@@ -85,11 +85,11 @@ def test_as_robots_with_lists(seed: int, random_floor: Callable[[int], FloorMap]
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-def test_turns_of_the_windows(window: str) -> None:
+def test_rotations_of_windows(window: str) -> None:
     assert window_turns(window) == TURNS[window]
 
 
-def test_starts_that_look_alike_for_ever() -> None:
+def test_starts_that_stay_ambiguous() -> None:
     """On a square of equal landmarks all corners and headings are four kinds of start."""
     result = count_localization_steps(FloorMap(np.zeros((3, 3), int), alphabet="6"))
     assert result.never == 36
@@ -98,7 +98,7 @@ def test_starts_that_look_alike_for_ever() -> None:
     assert len(result.never_starts) == 10
 
 
-def test_starts_that_are_told_apart_late() -> None:
+def test_starts_that_are_distinguished_late() -> None:
     """A corridor that differs at its far end only."""
     codes = np.zeros((1, 60), int)
     codes[0, -1] = 15

@@ -295,7 +295,7 @@ def test_rotation_moves_sensors_on_any_side_of_the_robot() -> None:
     check_odometry(replace(recording, samples=samples, pose=pose), GEOMETRY)
 
 
-def test_noise_of_sensors_that_report_in_turn_is_assumed() -> None:
+def test_noise_of_alternating_sensors_is_assumed() -> None:
     session = simulate(FloorMap(CODES), SimulationOptions(seed=1, rate_hz=100.0))
     samples = session.samples[0]
     field = samples.field_t.copy()

@@ -62,7 +62,9 @@ def test_published_maps_are_unique(data: Path, walked: Walk, name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["id6_S_17x17", "or16_L_24x24"])
-def test_a_changed_letter_is_found_with_both_places(data: Path, walked: Walk, name: str) -> None:
+def test_a_changed_letter_is_reported_with_both_positions(
+    data: Path, walked: Walk, name: str
+) -> None:
     floor = published(data, name)
     repeated_count = 0
     for cell in floor.cells()[:40:6]:
@@ -137,7 +139,7 @@ def walked_word(floor: FloorMap, position: tuple[tuple[int, int], int]) -> tuple
     return tuple(observed.letters[row].tolist())
 
 
-def test_least_distance_is_told_beyond_one() -> None:
+def test_a_minimum_distance_above_one_is_reported() -> None:
     words = np.array([[0, 0, 0, 0], [1, 2, 3, 0], [15, 15, 0, 15]])
     assert min_hamming_distance(words) == 3
     assert min_hamming_distance(words[[0, 0]]) == 0
@@ -145,7 +147,7 @@ def test_least_distance_is_told_beyond_one() -> None:
     assert min_hamming_distance(words[:1]) is None
 
 
-def test_what_is_promised_is_not_believed() -> None:
+def test_claims_of_the_file_are_verified() -> None:
     floor = FloorMap(np.array([[0, 1], [3, 7]]), alphabet="16", detect=1)
     proof = prove_map(floor)
     assert proof.is_unique
@@ -163,7 +165,7 @@ def test_floors_without_a_window_are_proved_too() -> None:
         assert proof.flipped_bar.harmful_fraction == 0
 
 
-def test_fingerprint_tells_maps_apart() -> None:
+def test_fingerprint_distinguishes_maps() -> None:
     floor = FloorMap(np.arange(9).reshape(3, 3))
     codes = floor.codes.copy()
     codes[2, 2] = HOLE_CODE

@@ -66,7 +66,7 @@ def test_two_points_have_no_hull() -> None:
     assert not is_in_hull(np.array([[-1.0, 0], [1, 0]]), np.zeros((1, 2))).any()
 
 
-def test_distance_from_ways_is_that_from_their_points() -> None:
+def test_distance_from_segments_equals_that_from_their_points() -> None:
     rng = np.random.default_rng(4)
     ways = rng.uniform(-1, 1, (2, 4, 2))
     ways[1, 2:] = np.nan
@@ -81,7 +81,7 @@ def test_distance_from_ways_is_that_from_their_points() -> None:
 
 
 @pytest.mark.parametrize("rule", ["literal", "corrected"])
-def test_one_line_tells_the_centre_of_a_circle(rule: str) -> None:
+def test_one_line_gives_the_centre_of_a_circle(rule: str) -> None:
     # The right sensor's line is 30 mm left of the centre; the others run farther left.
     points = np.array([chord(0.03, 0.05)])
     silent = NO_PATHS.copy()
@@ -140,7 +140,7 @@ def straight(count: int, aside: float) -> np.ndarray:
 @given(
     st.lists(st.sampled_from([-9.0, -7.0, -2.0, 0.0, 1.0, 4.0, 6.0, 8.0]), min_size=2, max_size=30)
 )
-def test_crossings_lie_where_the_line_between_samples_meets_the_threshold(values: list) -> None:
+def test_crossings_are_interpolated_at_the_threshold(values: list) -> None:
     value = np.array(values)
     position = straight(len(value), 0.0)[:, 0]
     point, rising = threshold_crossings(position, value, 5.0)
@@ -192,7 +192,7 @@ def test_front_and_rear_give_one_entry_and_silent_sensors_their_way() -> None:
     assert np.allclose(path[~np.isnan(path[:, 0])], position[:, 2])
 
 
-def test_nothing_seen() -> None:
+def test_no_crossing() -> None:
     observed = find_entries(straight(4, 0.0), np.zeros((4, 1)), 2.0)
     assert observed.point_m.shape == (0, 2)
     assert np.isnan(observed.robot_m).all()

@@ -63,14 +63,14 @@ def test_three_sensors_are_enough_and_two_are_not() -> None:
         compensate_pose(GEOMETRY, 0b0111, circle(), field)
 
 
-def test_sensors_in_one_place_tell_no_pose() -> None:
+def test_coincident_sensors_give_no_pose() -> None:
     lever = np.repeat(circle()[:1], 4, axis=0)
     with pytest.raises(DegenerateError, match="do not determine a pose"):
         compensate_pose(GEOMETRY, 0b0111, lever, np.zeros(4))
 
 
 @given(st.floats(-20, 20), st.floats(-math.pi, math.pi))
-def test_the_turn_to_the_bars_is_the_least(heading: float, first: float) -> None:
+def test_the_rotation_to_the_bars_is_the_smallest(heading: float, first: float) -> None:
     bars = first + np.radians([0, 90, 180, 270])
     rotation = rotation_to_bars(heading, bars)
     assert abs(rotation) <= math.pi / 4 + 1e-9
@@ -112,7 +112,7 @@ def test_two_equal_arcs_lead_to_the_goal(
     assert curve.length_m < 1.3 * np.hypot(*(goal - start)[:2])
 
 
-def test_without_an_error_the_way_is_straight() -> None:
+def test_without_errors_the_path_is_straight() -> None:
     curve = landing_curve((0, 0, 0), (0.2, 0, 0))
     assert curve == LandingCurve(math.inf, (0.0, 0.0), 0.2)
     assert np.allclose(curve.poses((0, 0, 0), [0.1]), [[0.1, 0, 0]])

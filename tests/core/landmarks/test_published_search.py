@@ -148,7 +148,7 @@ def test_without_odometry_there_is_an_error() -> None:
         detect_landmarks(run.samples, late, GEOMETRY)
 
 
-def test_spins_are_turns_on_the_spot() -> None:
+def test_spins_are_rotations_in_place() -> None:
     rotation = np.radians(np.arange(0, 360, 3.0))
     still = np.zeros_like(rotation)
     spin = np.column_stack([still + 0.1, still, rotation])

@@ -112,7 +112,7 @@ def test_small_ripples_are_no_valleys() -> None:
     assert len(find_valleys(3 + ripple, 0.5).angle_rad) == 0
 
 
-def test_a_circle_that_is_not_seen_all_around() -> None:
+def test_a_partly_observed_circle() -> None:
     angle = np.radians(np.arange(0, 300.0, 3))[:, None]
     position = np.stack([np.cos(angle), np.sin(angle)], -1)
     assert np.isnan(circle_profile(position, np.ones((100, 1)), np.zeros(2))).all()

@@ -81,7 +81,7 @@ def test_no_odometry_is_an_error(published: FloorMap) -> None:
 
 
 @pytest.mark.slow
-def test_a_map_that_has_not_these_three_is_told(published: FloorMap) -> None:
+def test_a_map_without_these_three_is_reported(published: FloorMap) -> None:
     other = FloorMap(np.zeros((24, 24), np.int64))
     _, result = solved(published, 1, other)
     assert not result.trajectories

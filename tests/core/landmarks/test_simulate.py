@@ -119,7 +119,7 @@ def test_samples_are_the_closed_form_at_the_truth(tour: SimulatedSession) -> Non
     assert np.abs(samples.field_t).max() > 0.02
 
 
-def test_a_landmark_that_lies_badly_is_felt_where_it_lies() -> None:
+def test_a_displaced_landmark_has_its_field_there() -> None:
     floor = replace(FLOOR, codes=np.array([[14]]))
     errors = replace(
         NONE, landmark_place_m=5e-3, landmark_turn_rad=0.1, bar_strength=0.1, height_m=2e-3
@@ -141,7 +141,7 @@ def test_a_landmark_that_lies_badly_is_felt_where_it_lies() -> None:
     assert np.sign(mark.strength) == pytest.approx(signs(14))
 
 
-def test_bars_that_turn_and_lean_are_what_magpylib_places_by_itself() -> None:
+def test_rotated_and_tilted_bars_agree_with_magpylib() -> None:
     geometry, rng = Geometry(), np.random.default_rng(4)
     errors = replace(NONE, bar_place_m=1e-3, bar_turn_rad=0.1, bar_lean_rad=0.1)
     _, middle, axes = scatter_bars(geometry, rng.standard_normal((1, BAR_DRAWS)), errors)
@@ -248,7 +248,7 @@ def test_a_landing_curve_arrives_with_the_heading_it_had(
     assert halfway[2] - pose[2] == pytest.approx(2 * off, abs=1e-9)
 
 
-def test_it_goes_back_rather_than_around_where_that_is_near() -> None:
+def test_the_robot_reverses_over_short_distances() -> None:
     robot = Robot(np.array([0.0, 0.0, 0.0]))
     robot.drive_to((-0.02, 0.0), back_m=0.05)
     assert robot.pose == pytest.approx([-0.02, 0, 0])
@@ -376,7 +376,7 @@ def test_what_is_free() -> None:
     assert is_free(replace(floor, walls=frozenset()), line((0.0, 0.0), (0.2, 0.2)))
 
 
-def test_it_starts_where_it_is_told() -> None:
+def test_the_robot_starts_at_the_given_cell() -> None:
     start = (0.4, 0.0, 0.8)
     simulated = simulate(FLOOR, replace(PLAIN, start=start, rate_hz=20.0))
     assert flat(simulated.truth[0])[0] == pytest.approx(start)
@@ -384,7 +384,7 @@ def test_it_starts_where_it_is_told() -> None:
         simulate(FLOOR, replace(PLAIN, start=(0.2, 0.0, math.pi)))
 
 
-def test_more_landmarks_than_there_is_a_way_to_are_noted() -> None:
+def test_more_landmarks_than_reachable_are_noted() -> None:
     alone = FloorMap(np.array([[14]]), pitch_m=0.3)
     simulated = simulate(alone, replace(PLAIN, rate_hz=20.0))
     assert {visit.cell for visit in simulated.events} == {(0, 0)}
@@ -471,7 +471,7 @@ def test_errors_of_odometry_are_as_large_as_asked() -> None:
     assert np.std(rotations) == pytest.approx(0.01 * 4 * math.pi, rel=0.1)
 
 
-def test_a_wheel_that_slips_turns_too_far() -> None:
+def test_a_slipping_wheel_rotates_too_far() -> None:
     straight = np.linspace([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 1001)
     errors = replace(NONE, slips_per_m=3.0, slip_m=0.005)
     counts = []
@@ -540,7 +540,7 @@ def test_dead_stuck_and_swapped_sensors() -> None:
     assert not np.array_equal(exact[:, 0], exact[:, 1])
 
 
-def test_faults_of_the_floor_are_where_they_were_asked_for() -> None:
+def test_faults_of_the_floor_are_at_the_given_cells() -> None:
     faults = Faults(
         flipped=(((1, 2), 0), ((1, 2), 3)),
         missing=(((0, 1), 2),),
@@ -589,7 +589,7 @@ def test_a_misread_landmark_is_another_one_of_the_alphabet(alphabet: str) -> Non
         assert {mark.code for mark in wrong} <= set(letters.tolist())
 
 
-def test_a_floor_lies_as_it_was_built() -> None:
+def test_a_floor_has_the_built_positions() -> None:
     built = AsBuiltLandmark(
         0.004, -0.003, 0.05, np.array([1.1, -0.9, 0.0, math.nan]), np.full(7, math.nan)
     )
@@ -643,7 +643,7 @@ def test_more_noise_leaves_all_else_as_it_is(nominal: SimulatedSession) -> None:
         ({"limits": RobotLimits(speed_mps=0.0)}, "limits"),
     ],
 )
-def test_what_cannot_be_is_refused(given: dict[str, object], said: str) -> None:
+def test_impossible_settings_are_refused(given: dict[str, object], said: str) -> None:
     with pytest.raises(InputError) as raised:
         simulate(FLOOR, replace(PLAIN, **given))  # type: ignore[arg-type]
     assert said in f"{raised.value} {raised.value.hint}"

@@ -39,9 +39,7 @@ def test_as_a_robot_walks(
 
 @given(seed=SEEDS)
 @settings(deadline=None, max_examples=50)
-def test_ways_are_where_the_floor_is_open(
-    seed: int, random_floor: Callable[[int], FloorMap]
-) -> None:
+def test_paths_avoid_walls_and_holes(seed: int, random_floor: Callable[[int], FloorMap]) -> None:
     floor = random_floor(seed)
     free = passable_steps(floor)
     for cell in floor.cells():
@@ -49,7 +47,7 @@ def test_ways_are_where_the_floor_is_open(
     assert not free[floor.codes == HOLE_CODE].any()
 
 
-def test_a_left_turn_by_hand() -> None:
+def test_a_left_turn_computed_by_hand() -> None:
     """Facing up the rows, left is towards lower columns."""
     codes = np.array([[0, code_of("NSSS")], [code_of("SSNS"), code_of("NNSS")]])
     observed = window_readings(FloorMap(codes, window="L"))

@@ -174,7 +174,7 @@ def test_covariance_of_stations_is_that_of_noise_draws(draws: Any) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_held_has_no_covariance(draws: Any) -> None:
+def test_covariance_excludes_the_gauge(draws: Any) -> None:
     # Moving, turning and scaling the whole rig is held: nothing is known or unknown there.
     for _, found, told in draws:
         np.testing.assert_allclose(told, found, rtol=0.3, atol=0.02 * found[-1])
@@ -210,7 +210,7 @@ def test_known_points_fix_a_station_without_gauge(world: Any) -> None:
     assert nees.mean() == pytest.approx(6, rel=0.2)
 
 
-def test_tilt_and_phase_are_found_where_they_show(world: Any) -> None:
+def test_observable_tilt_and_phase_are_estimated(world: Any) -> None:
     # Four stations around: the shape of the room tells the tilt of the planes.
     lamps = world.lamps(1, 2, 5, 16)
     points = world.curve(100, flat=False)
@@ -231,7 +231,7 @@ def test_tilt_and_phase_are_found_where_they_show(world: Any) -> None:
         assert calibration.sweeps[0, PHASE] == pytest.approx(0, abs=1e-6)
 
 
-def test_priors_hold_what_the_data_do_not_tell(world: Any) -> None:
+def test_priors_constrain_unobservable_parameters(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = world.curve(4, flat=True)
     done = adjust_bundle(

@@ -70,7 +70,7 @@ def test_bursts_off_the_rotor_are_refused(light: Any) -> None:
     assert np.all(read.matches.is_certain()[~read.is_accepted])
 
 
-def test_weak_bursts_are_taken_where_a_rotor_expects_them(light: Any) -> None:
+def test_weak_bursts_are_accepted_if_a_rotor_predicts_them(light: Any) -> None:
     # Ten microseconds of noisy light do not stand on their own; with the rotor they do.
     strong = light.Receiving()
     weak = light.Receiving(width_s=6.5e-6, jitter_s=5e-9)
@@ -91,7 +91,7 @@ def test_weak_bursts_are_taken_where_a_rotor_expects_them(light: Any) -> None:
 
 
 @pytest.mark.slow
-def test_what_stands_on_its_own_is_not_talked_into_something_else(light: Any) -> None:
+def test_bursts_of_a_doubled_channel_are_rejected(light: Any) -> None:
     senders = [light.Sender(3), light.Sender(3, zero_s=0.011), light.Sender(9, zero_s=0.002)]
     (line,), _ = light.of(senders, 10.0, light.Receiving(rim_s=1e-6))
     read = reading(line)
@@ -103,7 +103,7 @@ def test_what_stands_on_its_own_is_not_talked_into_something_else(light: Any) ->
     assert sure.sum() > 1900
 
 
-def test_without_a_rotor_only_what_stands_alone(light: Any) -> None:
+def test_without_a_rotor_certain_bursts_are_accepted(light: Any) -> None:
     (line,), passed = light.of([light.Sender(3, until_s=0.03)], 1.0, light.Receiving(missing=0.3))
     read = reading(line)
     assert 0 < len(passed.time_s) < 4

@@ -238,7 +238,7 @@ def detection(channel: int, sweeps: int, rejected: int, **values: Any) -> Statio
         ([(1, 9), (1, 9)], False),  # all stations: the receiver or the scene is wrong
     ],
 )
-def test_a_station_whose_sweeps_mostly_contradict_the_poses_is_reported(
+def test_a_station_with_many_contradicting_sweeps_is_reported(
     numbers: list[tuple[int, int]], is_warned: bool
 ) -> None:
     rows = [detection(k + 1, *number) for k, number in enumerate(numbers)]

@@ -27,7 +27,7 @@ def facts_of(solution: Solution) -> Any:
     return to_json(solution.facts)
 
 
-def detections_of(solution: Solution) -> Any:
+def detections_as_json(solution: Solution) -> Any:
     """Return the detections in their JSON form."""
     return to_json(solution.detections)
 
@@ -70,16 +70,16 @@ def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any) -> None:
         # Both were at the same positions; the start of the clock is known to a rotation.
         assert np.median(np.linalg.norm(track.position - true, axis=1)) < 0.03
     assert solution.artifact is scene
-    rows = detections_of(solution)
+    rows = detections_as_json(solution)
     assert sum(int(row["sweeps"]) + int(row["rejected"]) for row in rows) <= len(sweeps)
     assert [row["channel"] for row in rows] == [1, 2, 5]
     assert [row["station"] for row in rows] == [0, 1, 2]
     assert "verification" in facts_of(solution)
     assert facts_of(solution)["rigid"]
-    rigid_rows = detections_of(
+    rigid_rows = detections_as_json(
         solve(sweeps.take(sweeps.device == 0), scene, receivers={"rigid": RIGID})
     )
-    single_rows = detections_of(solve(sweeps.take(sweeps.device == 1), scene))
+    single_rows = detections_as_json(solve(sweeps.take(sweeps.device == 1), scene))
     for merged, first, second in zip(rows, rigid_rows, single_rows, strict=True):
         assert merged["sweeps"] == first["sweeps"] + second["sweeps"]
         assert merged["rejected"] == first["rejected"] + second["rejected"]
@@ -91,7 +91,7 @@ def test_a_rigid_device_needs_no_single_photodiode(mixed: Any, world: Any) -> No
     alone = world.take(sweeps, np.flatnonzero(sweeps.device == 0))
     solution = solve(alone, scene, receivers={"rigid": RIGID})
     assert [t.device for t in solution.trajectories] == ["rigid"]
-    assert [row["station"] for row in detections_of(solution)] == [0, 1, 2]
+    assert [row["station"] for row in detections_as_json(solution)] == [0, 1, 2]
 
 
 def test_without_receivers_each_photodiode_has_a_trajectory(mixed: Any) -> None:
@@ -203,7 +203,7 @@ def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: A
     solution = solve(
         sweeps, replace(scene, stations=(first, moved, third)), receivers={"robot": RIGID}
     )
-    off = {row["channel"]: row["verification_m"] for row in detections_of(solution)}
+    off = {row["channel"]: row["verification_m"] for row in detections_as_json(solution)}
     assert off[2] > 0.02
     jumps = {c["channel"]: c["without_rad"] for c in facts_of(solution)["verification"]["stations"]}
     assert jumps[2] < 0.5 * min(jumps[1], jumps[5])
@@ -215,4 +215,4 @@ def test_one_station_has_no_other_to_be_verified_against(mixed: Any, world: Any)
     sweeps = world.stream(lamps[:1], position_at, 2.0, sensors=SPAN)
     solution = solve(sweeps, scene, receivers={"robot": RIGID})
     assert "verification" not in facts_of(solution)
-    assert "verification_rad" not in detections_of(solution)[0]
+    assert "verification_rad" not in detections_as_json(solution)[0]

@@ -131,7 +131,7 @@ def test_reflections_of_one_station_are_outvoted(world: Any, where: str, flat: b
     assert off(found, points) < 5e-3
 
 
-def test_a_station_that_shares_no_place_is_left_out(world: Any) -> None:
+def test_a_station_without_common_positions_is_left_out(world: Any) -> None:
     angles = angles_of(world.lamps(1, 2, 5), world.curve(100, flat=True))
     angles[:80, 2] = np.nan
     angles[80:, :2] = np.nan
@@ -166,7 +166,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("kind", REFUSED)
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
-def test_what_does_not_determine_a_scene_is_named_and_refused(
+def test_insufficient_observations_are_refused_with_a_reason(
     world: Any, kind: str, noise: float
 ) -> None:
     points = {
@@ -187,7 +187,7 @@ def test_what_does_not_determine_a_scene_is_named_and_refused(
     assert refused.value.hint
 
 
-def test_four_places_do_not_tell_their_kind(world: Any) -> None:
+def test_four_positions_do_not_determine_the_kind(world: Any) -> None:
     # A homography fits any four places exactly: that is no sign of a floor.
     with pytest.raises(DegenerateError) as refused:
         run(angles_of(world.lamps(1, 2), world.curve(4, flat=False)))

@@ -137,7 +137,7 @@ def test_no_sighting_is_no_marker(recorded: Recorded) -> None:
     assert seen.shape == (0, 2, 2)
 
 
-def seen_on_floor(recorded: Recorded) -> Any:
+def positions_on_floor(recorded: Recorded) -> Any:
     """Positions on the floor, in the rig's unit, of photodiodes that saw given angles."""
     rig = recorded.state
     return lambda angles: (
@@ -150,7 +150,7 @@ def seen_on_floor(recorded: Recorded) -> Any:
 def test_distances_give_the_scale(recorded: Recorded) -> None:
     def scale(*distances: Distance) -> float:
         return frame.scale_from_distances(
-            seen_on_floor(recorded), distances, recorded.epochs, recorded.angles
+            positions_on_floor(recorded), distances, recorded.epochs, recorded.angles
         )
 
     edge = Distance(recorded.stay(0), recorded.stay(1), 1.0)
@@ -162,11 +162,11 @@ def test_distances_give_the_scale(recorded: Recorded) -> None:
     assert 5 < scale(wrong, diagonal) < 5.25
 
 
-def test_distances_nobody_saw_are_refused(recorded: Recorded) -> None:
+def test_unobserved_distances_are_refused(recorded: Recorded) -> None:
     unseen = Distance(recorded.stay(0), MarkerVisit("robot", 0, 1), 1.0)
     with pytest.raises(DegenerateError) as refused:
         frame.scale_from_distances(
-            seen_on_floor(recorded), [unseen], recorded.epochs, recorded.angles
+            positions_on_floor(recorded), [unseen], recorded.epochs, recorded.angles
         )
     assert refused.value.hint
 
@@ -194,7 +194,7 @@ def test_odometry_gives_the_scale_in_spite_of_drift(world: Any, seed: int) -> No
     assert found == pytest.approx(5, rel=0.02)
 
 
-def test_odometry_of_another_or_of_no_motion_says_nothing(world: Any) -> None:
+def test_odometry_of_another_device_or_at_rest_is_ignored(world: Any) -> None:
     points = world.curve(100, flat=True)
     when = world.start_ns + np.arange(100) * SECOND // 10
     device = np.zeros(100, np.int64)
@@ -207,7 +207,7 @@ def test_odometry_of_another_or_of_no_motion_says_nothing(world: Any) -> None:
     assert frame.scale_from_odometry(points, when, device, ["robot"], []) is None
 
 
-def test_a_rig_of_its_own_stands_at_its_first_station(recorded: Recorded) -> None:
+def test_frame_of_the_first_station(recorded: Recorded) -> None:
     for planar in (True, False):
         to = frame.first_station_frame(recorded.state, planar, 5.0)
         home = frame.transform_state(recorded.state, to)

@@ -111,7 +111,7 @@ def test_noise_around_does_not_matter(light: Any) -> None:
     assert np.abs(found.end - 140).mean() < 2
 
 
-def test_unknown_bits_count_neither_way(light: Any) -> None:
+def test_unknown_bits_are_ignored(light: Any) -> None:
     index = np.arange(5, 119_000, 977)
     value = sent(light, 4, index, 120)
     clean = identify_sequences(soft(value))

@@ -41,14 +41,14 @@ def test_creeping_is_not_standing() -> None:
     assert np.max(np.bincount(run)) * STANDSTILL_ANGLE_RAD / 2 < 4 * STANDSTILL_ANGLE_RAD
 
 
-def test_devices_do_not_share_a_place() -> None:
+def test_devices_have_separate_positions() -> None:
     angles = np.zeros((10, 2, 2))
     places, run = average_standstills(angles, np.repeat([0, 1], 5))
     assert len(places) == 2
     np.testing.assert_array_equal(run, np.repeat([0, 1], 5))
 
 
-def test_what_was_not_seen_is_not_averaged() -> None:
+def test_unobserved_planes_are_not_averaged() -> None:
     angles = np.zeros((10, 2, 2))
     angles[5:, 1] = np.nan
     places, run = average_standstills(angles, np.zeros(10, np.int64))
@@ -87,7 +87,7 @@ def test_few_places_that_link_stations_are_kept_among_many() -> None:
     assert set(range(400, 407)) <= set(chosen.tolist())
 
 
-def test_what_is_few_is_taken_whole() -> None:
+def test_few_positions_are_all_taken() -> None:
     rows = np.array([3, 5, 900])
     np.testing.assert_array_equal(spread_evenly(ALL, rows, 3), rows)
     assert len(spread_evenly(ALL, rows[:0], 3)) == 0

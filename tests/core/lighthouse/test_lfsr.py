@@ -78,7 +78,7 @@ def test_state_without_place() -> None:
     assert np.all(lfsr.indices(np.zeros(32, int), np.arange(32)) == lfsr.NO_INDEX)
 
 
-def test_no_index_comes_twice_in_a_turn() -> None:
+def test_no_index_repeats_within_a_revolution() -> None:
     assert PERIOD_TICKS.max() / TICKS_PER_COUNT < lfsr.SEQUENCE_LENGTH
 
 

@@ -139,7 +139,7 @@ def test_a_chain_in_space_takes_its_scale_from_few_places_of_three(world: Any) -
     check(found, lamps, points, 2 * MEAN_M[False])
 
 
-def test_without_any_place_of_three_the_distance_is_unknown_and_that_is_said(world: Any) -> None:
+def test_without_positions_of_three_stations_the_distance_is_unknown(world: Any) -> None:
     lamps = world.lamps(1, 2, 5)
     points = world.curve(300, flat=False)
     found = run(only(seen_by(lamps, points), (0, 1), (1, 2)))
@@ -227,7 +227,7 @@ def test_hiding_a_station_moves_poses_by_millimetres(planar: bool) -> None:
         assert station.jump_95_m < 3e-3
 
 
-def test_what_is_left_out_is_named_by_channel_and_reason(world: Any) -> None:
+def test_omitted_stations_are_named_with_channel_and_reason(world: Any) -> None:
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(300, flat=False))
     drive.counts[:150, 2] = np.nan
@@ -240,7 +240,7 @@ def test_what_is_left_out_is_named_by_channel_and_reason(world: Any) -> None:
     assert "distance is unknown" in warning.message
 
 
-def test_serial_numbers_that_were_heard_are_kept(world: Any) -> None:
+def test_received_serial_numbers_are_kept(world: Any) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(120, flat=True))
     solution = solve(drive.sweeps, Scene(ids={2: 0x0FF22226}))

@@ -48,7 +48,7 @@ def noise(n: int, seed: int) -> Bits:
 
 
 @given(PAYLOADS)
-def test_encodes_as_the_description_says(payload: bytes) -> None:
+def test_encodes_as_documented(payload: bytes) -> None:
     bits = ootx.encode_frame(payload)
     assert bits.tolist() == by_hand(payload)
     assert len(bits) == 443
@@ -126,7 +126,7 @@ def test_one_wrong_bit_never_passes(payload: bytes, place: int) -> None:
     assert not any(f.is_valid for f in ootx.decode_frames(bits))
 
 
-def test_a_wrong_frame_among_right_ones_is_told_and_not_mended() -> None:
+def test_a_wrong_frame_among_right_ones_is_counted_not_repaired() -> None:
     stream = np.tile(ootx.encode_frame(STATION), 5)
     stream[443 * 2 + 60] ^= 1
     found = ootx.decode_frames(stream)
@@ -155,7 +155,7 @@ def test_shared_bits_do_not_count_as_missing() -> None:
     assert not found.is_valid
 
 
-def test_repetitions_tell_missing_bits() -> None:
+def test_repetitions_give_missing_bits() -> None:
     """A third of the rotations missed: no frame could be read alone."""
     rng = np.random.default_rng(7)
     stream = np.tile(ootx.encode_frame(STATION), 12)
@@ -168,7 +168,7 @@ def test_repetitions_tell_missing_bits() -> None:
 
 
 @pytest.mark.parametrize("repeats", [2, 3, 6, 20])
-def test_where_no_frame_is_right_the_majority_is_asked(repeats: int) -> None:
+def test_without_a_valid_frame_the_majority_decides(repeats: int) -> None:
     """A wrong bit in each frame, none twice; of two that differ, both values are tried."""
     place = 18 + 17 + 17 * np.arange(20) + np.random.default_rng(repeats).integers(0, 16, 20)
     stream = np.tile(ootx.encode_frame(STATION), (repeats, 1))
@@ -191,7 +191,7 @@ def test_a_frame_that_changes_is_not_mixed_with_the_old_one() -> None:
     assert [f.is_valid for f in found].count(True) >= 5
 
 
-def test_what_a_recording_cannot_tell() -> None:
+def test_unobservable_properties_of_a_recording() -> None:
     frame = ootx.encode_frame(STATION)
     assert ootx.decode_frames([]) == []
     assert ootx.decode_frames(frame[:-1])[:1] != []

@@ -153,7 +153,7 @@ def test_eq_4_is_the_difference() -> None:
 # ---- 24 bits
 
 
-def windows_elsewhere(
+def windows_of_other_polynomials(
     polynomial: NDArray[np.int64], index: NDArray[np.int64], length: int, max_differing: int
 ) -> NDArray[np.bool_]:
     """Return whether each window occurs in another polynomial's sequence, but for some bits."""
@@ -174,9 +174,9 @@ def test_24_bits_do_not_select_a_polynomial() -> None:
     rng = np.random.default_rng(24)
     polynomial, index = rng.integers(0, 32, 300), rng.integers(0, 119_000, 300)
     # Over all 4.2 million windows: 99.83 % and 21.6 %.
-    assert windows_elsewhere(polynomial, index, 24, 1).mean() > 0.99
-    assert 0.14 < windows_elsewhere(polynomial, index, 24, 0).mean() < 0.29
-    assert windows_elsewhere(polynomial, index, 46, 1).mean() == 0
+    assert windows_of_other_polynomials(polynomial, index, 24, 1).mean() > 0.99
+    assert 0.14 < windows_of_other_polynomials(polynomial, index, 24, 0).mean() < 0.29
+    assert windows_of_other_polynomials(polynomial, index, 46, 1).mean() == 0
 
 
 @pytest.mark.parametrize("pair", [(0, 1), (2, 3), (7, 30)])

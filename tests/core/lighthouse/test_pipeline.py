@@ -140,7 +140,7 @@ def test_factory_data_of_two_stations(light: Any) -> None:
     assert got.warnings == ()
 
 
-def test_a_station_that_says_another_channel(light: Any) -> None:
+def test_a_station_that_reports_another_channel(light: Any) -> None:
     lines, _ = light.of([light.Sender(4, slow=factory(7, 5))], 10.0)
     got = demodulate_recording(lines)
     (warning,) = got.warnings
@@ -406,7 +406,7 @@ def test_the_light_of_a_doubled_channel_alone_is_an_error_with_a_remedy(light: A
     assert raised.value.hint == "Set each station to a channel of its own"
 
 
-def test_a_rejected_burst_beside_a_decoded_sweep_is_not_missed(light: Any) -> None:
+def test_a_rejected_burst_near_a_decoded_sweep_is_not_missed(light: Any) -> None:
     (line,), _ = light.of([light.Sender(2)], 2.0)
     got = demodulate_recording([line])
     validated, rotor = got.photodiodes[0], got.rotors[2]

@@ -59,7 +59,7 @@ def test_on_a_floor_one_station_is_enough(world: Any, channels: tuple[int, ...])
     assert np.all(estimates.position[:, 2] == 0.07)
 
 
-def test_a_single_plane_helps_where_others_see_too(world: Any) -> None:
+def test_a_single_plane_helps_other_stations(world: Any) -> None:
     # Planes that only lean: a bent plane alone cannot be corrected, see below.
     plain = (world.Plane(tilt=-0.049), world.Plane(tilt=0.046))
     lamps = [replace(lamp, planes=plain) for lamp in world.lamps(1, 2)]
@@ -153,7 +153,7 @@ def test_residuals_measure_the_noise(world: Any) -> None:
     assert np.sqrt(squares.mean()) == pytest.approx(5e-4, rel=0.03)
 
 
-def test_no_place_where_planes_do_not_meet_in_one(world: Any) -> None:
+def test_no_position_if_planes_do_not_intersect_in_a_point(world: Any) -> None:
     lamps = world.lamps(1, 2)
     points = world.curve(6, flat=False)
     angles = angles_of(lamps, points)
@@ -182,7 +182,7 @@ def test_no_place_behind_a_station(world: Any) -> None:
     assert np.isnan(estimates.position).all()
 
 
-def test_a_ray_along_the_floor_meets_it_nowhere_near(world: Any) -> None:
+def test_a_ray_parallel_to_the_floor_gives_no_position(world: Any) -> None:
     level = world.Lamp(1, np.array([0.0, 0.0, 0.5]), np.eye(3), world.planes_of(FACTORY_UNITS[0]))
     angles = level.angles(np.array([[2.0, 0.0, 0.5]]))[None]
     with warnings.catch_warnings():
@@ -202,7 +202,7 @@ def test_blocks_do_not_show(world: Any) -> None:
         np.testing.assert_allclose(getattr(estimates, name)[-5:], getattr(alone, name), atol=1e-9)
 
 
-def test_nothing_seen_is_nothing_found(world: Any) -> None:
+def test_no_observations_give_no_result(world: Any) -> None:
     lamps = world.lamps(1, 2)
     estimates = estimate_positions(np.zeros((0, 2, 2)), *factory(lamps))
     assert isinstance(estimates, PositionEstimates)

@@ -117,7 +117,7 @@ def test_grid_scatter_at_rest(grid: Grid) -> None:
     assert scatter[2] <= 0.135 * 1.085
 
 
-def test_grid_covariance_tells_the_scatter(grid: Grid) -> None:
+def test_grid_covariance_matches_the_scatter(grid: Grid) -> None:
     # What repeats at a standstill is noise; the rest of the covariance is calibration.
     solution = solve(grid.sweeps, grid.edge())
     (track,) = solution.trajectories

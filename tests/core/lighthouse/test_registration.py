@@ -110,7 +110,7 @@ def test_the_unit_is_that_of_the_points(world: Any) -> None:
         np.testing.assert_allclose(position, 1000 * lamp.position, rtol=1e-5)
 
 
-def test_a_floor_seen_from_below_is_from_below(world: Any) -> None:
+def test_a_floor_observed_from_below(world: Any) -> None:
     # Markers in a frame whose z points down: the station has negative z.
     (lamp,) = world.lamps(1)
     position, rotation = resect_on_plane(world.square[:, [1, 0]], rays_of(lamp, world.square))

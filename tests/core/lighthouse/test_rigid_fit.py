@@ -193,7 +193,7 @@ def test_the_adjustment_finds_a_station_that_was_put_wrong() -> None:
     assert not np.any(done.covariance[0])
 
 
-def test_no_step_turns_a_device_over() -> None:
+def test_no_step_flips_a_device() -> None:
     looks, poses = world(2, 30)
     problem = pose_fit._PoseProblem(looks, STATIONS, 1e-4, np.ones((2, 1)), np.inf)
     step = np.zeros((2, 12))

@@ -90,7 +90,7 @@ def test_one_station_needs_only_its_markers(world: Any) -> None:
     np.testing.assert_allclose(solution.artifact.stations[0].position, lamps[0].position, atol=0.1)
 
 
-def test_one_station_says_how_sure_it_is(world: Any) -> None:
+def test_one_station_gives_its_uncertainty(world: Any) -> None:
     lamps = world.lamps(1)
     drive = world.drive(lamps, world.curve(50, flat=True, size=0.5))
     (track,) = strict(drive.sweeps, marked(world, lamps)).trajectories
@@ -118,7 +118,7 @@ def test_markers_at_a_height_raise_the_floor(world: Any) -> None:
 
 
 @pytest.mark.parametrize("flat", [True, False])
-def test_a_frame_that_turns_clockwise_is_served_and_named(world: Any, flat: bool) -> None:
+def test_a_clockwise_frame_is_solved_and_named(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(120, flat=flat))
     turned = [
@@ -134,7 +134,7 @@ def test_a_frame_that_turns_clockwise_is_served_and_named(world: Any, flat: bool
 
 
 @pytest.mark.parametrize("flat", [True, False])
-def test_without_a_scale_it_says_so(world: Any, flat: bool) -> None:
+def test_a_missing_scale_is_reported(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(120, flat=flat))
     solution = strict(drive.sweeps)
@@ -224,7 +224,7 @@ def test_a_solved_scene_serves_later_sessions(world: Any, flat: bool) -> None:
     assert errors(solution, more).mean() < 3e-3
 
 
-def test_one_station_of_a_scene_in_space_finds_nothing_and_says_so(world: Any) -> None:
+def test_one_station_of_a_scene_in_space_gives_a_note_only(world: Any) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(100, flat=False))
     artifact = strict(drive.sweeps, marked(world, lamps)).artifact
@@ -339,7 +339,7 @@ def test_free_rotors_and_a_moving_receiver(world: Any, flat: bool) -> None:
     assert solution.artifact.planar is flat
 
 
-def test_photodiodes_of_a_device_are_solved_apart(world: Any) -> None:
+def test_photodiodes_of_a_device_are_solved_separately(world: Any) -> None:
     lamps = world.lamps(1, 2)
     sensors = np.array([[0.015, 0.0075, 0.0], [-0.015, -0.0075, 0.0]])
 
@@ -407,7 +407,7 @@ def test_single_reflections_are_rejected(world: Any, flat: bool) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("liar", [0, 1, 2])
-def test_a_station_that_lies_for_a_while_is_outvoted(world: Any, liar: int, flat: bool) -> None:
+def test_a_temporarily_wrong_station_is_outvoted(world: Any, liar: int, flat: bool) -> None:
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(300, flat=flat))
     mirrored = drive.points[100:130] * [-1, 1, 1] + [0.3, 0.4, 0.2]
@@ -421,7 +421,7 @@ def test_a_station_that_lies_for_a_while_is_outvoted(world: Any, liar: int, flat
     assert solution.poses > 290
 
 
-def test_a_lie_in_a_known_scene_is_outvoted(world: Any) -> None:
+def test_a_wrong_station_in_a_known_scene_is_outvoted(world: Any) -> None:
     lamps = world.lamps(1, 2, 5)
     scene = strict(
         world.drive(lamps, world.curve(200, flat=False)).sweeps, marked(world, lamps)
@@ -434,7 +434,7 @@ def test_a_lie_in_a_known_scene_is_outvoted(world: Any) -> None:
     assert errors(solution, drive).max() < 6e-3
 
 
-def test_a_scene_of_another_place_is_told(world: Any) -> None:
+def test_a_scene_of_another_site_is_reported(world: Any) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(200, flat=False))
     scene = strict(drive.sweeps, marked(world, lamps)).artifact
@@ -485,7 +485,7 @@ def test_markers_decide_between_two_readings_or_protest(world: Any) -> None:
     assert right or "marker_misfit" in codes(solution)
 
 
-def test_markers_that_contradict_the_scene_are_told(world: Any) -> None:
+def test_markers_that_contradict_the_scene_are_reported(world: Any) -> None:
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(100, flat=True))
     right = strict(drive.sweeps, marked(world, lamps))
@@ -543,7 +543,7 @@ def test_a_station_with_nothing_in_common_is_left_out_and_named(world: Any, flat
     assert errors(solution, drive).mean() < SPOILED_MEAN[flat]
 
 
-def test_what_is_out_of_reach_is_rejected(world: Any) -> None:
+def test_positions_out_of_range_are_rejected(world: Any) -> None:
     lamps = world.lamps(1, 2)
     near = world.curve(100, flat=True)
     far = near[:5] + [0.0, 2 * MAX_RANGE_M, 0.0]
@@ -603,7 +603,7 @@ def test_covariance_of_poses_is_worth_its_name(world: Any, flat: bool) -> None:
         assert solution.facts.angle_sigma_rad == pytest.approx(noise, rel=0.1)
 
 
-def test_station_covariance_turns_and_grows_with_its_frame(world: Any) -> None:
+def test_station_covariance_rotates_and_scales_with_its_frame(world: Any) -> None:
     """The same recording in two frames: C -> J C J' with J = (s R, R)."""
     lamps = world.lamps(1, 2)
     drive = world.drive(lamps, world.curve(100, flat=False))
@@ -623,7 +623,7 @@ def test_station_covariance_turns_and_grows_with_its_frame(world: Any) -> None:
 # ---- what is said of it
 
 
-def test_detections_say_what_was_seen_of_each_station(world: Any) -> None:
+def test_detections_describe_the_observations_of_each_station(world: Any) -> None:
     lamps = world.lamps(2, 5)
     drive = world.drive(lamps, world.curve(100, flat=True))
     drive.counts[:30, 1] = np.nan
@@ -756,7 +756,7 @@ def test_a_few_moments_in_space_that_are_called_flat(world: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["any counts", "one jumbled", "equal planes", "drawn twice"])
 @pytest.mark.parametrize("channels", [(1,), (1, 2), (2, 5, 16), (1, 2, 5, 16)])
-def test_garbage_is_refused_or_told_never_a_crash(
+def test_garbage_is_refused_or_reported_without_a_crash(
     world: Any, channels: tuple[int, ...], kind: str
 ) -> None:
     lamps = world.lamps(*channels)

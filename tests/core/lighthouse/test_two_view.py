@@ -158,7 +158,7 @@ def test_motions_behind_an_essential_matrix_are_opencvs(space: Views) -> None:
     )
 
 
-def test_only_one_motion_puts_the_points_ahead_as_opencv_says(space: Views) -> None:
+def test_the_motion_with_points_in_front_agrees_with_opencv(space: Views) -> None:
     e = two_view.fit_epipolar(space.a, space.b)
     ahead = []
     for r, t in two_view.decompose_essential(e):
@@ -184,7 +184,7 @@ def test_parallel_rays_have_no_depth() -> None:
 
 
 @pytest.mark.parametrize("n", [40, 400])
-def test_consensus_finds_who_agrees(world: Any, n: int) -> None:
+def test_consensus_selects_the_inliers(world: Any, n: int) -> None:
     rng = np.random.default_rng(n)
     wrong = rng.random(n) < 0.25
     for is_flat, agree in (

@@ -92,7 +92,7 @@ def test_a_moved_station_is_found(world: Any, moved: int, flat: bool) -> None:
     assert wrong.channel == channels[moved]
 
 
-def test_what_was_never_seen_tells_nothing(world: Any) -> None:
+def test_an_unobserved_station_is_not_verified(world: Any) -> None:
     lamps = world.lamps(1, 2, 5)
     angles = seen_by(lamps, world.curve(20, flat=False), 1e-4)
     angles[:, 2] = np.nan
@@ -170,7 +170,7 @@ def test_solutions_carry_it(world: Any) -> None:
         assert row.verification_m == station.residual_m < 2e-3
 
 
-def test_few_places_are_all_needed_and_that_is_told(world: Any) -> None:
+def test_few_positions_are_all_used_for_the_scene(world: Any) -> None:
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(60, flat=True))
     found = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square))).facts

@@ -33,7 +33,7 @@ def sampled(
     return np.packbits(np.array(levels, np.uint8)[chip])
 
 
-def test_each_window_tells_polynomial_index_and_where_its_first_bit_began() -> None:
+def test_each_window_gives_polynomial_index_and_start() -> None:
     rng = np.random.default_rng(5)
     polynomial = rng.integers(0, 32, 300)
     index = rng.integers(10, 110_000, 300)

@@ -227,7 +227,7 @@ def spoiled(samples: Samples, field_t: Array) -> Samples:
     return replace(samples, field_t=field_t)
 
 
-def seen_from(course: Course, time_ns: int, tag: Tag) -> tuple[float, float, float]:
+def true_tag_pose(course: Course, time_ns: int, tag: Tag) -> tuple[float, float, float]:
     """Truth: the tag in the frame of the bar at a time; x, y and heading."""
     x, y, heading = (float(v) for v in course.at(np.array((time_ns - START_NS) * 1e-9)))
     dx, dy = tag.x - x, tag.y - y
@@ -255,7 +255,7 @@ class World:
     bar = staticmethod(bar)
     record = staticmethod(record)
     spoiled = staticmethod(spoiled)
-    seen_from = staticmethod(seen_from)
+    true_tag_pose = staticmethod(true_tag_pose)
     turn = staticmethod(turn)
 
 

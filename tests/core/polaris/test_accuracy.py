@@ -35,7 +35,7 @@ def the_tag(solution: Solution) -> TagDetection:
 
 def pose_errors(world: Any, found: TagDetection, course: Any, tag: Any) -> Array:
     """Of the tag (x, y in m, heading in rad) against the truth at that time."""
-    truth = world.seen_from(course, round(found.time_s * 1e9), tag)
+    truth = world.true_tag_pose(course, round(found.time_s * 1e9), tag)
     error = np.array([found.x_m, found.y_m, found.heading_rad]) - truth
     error[2] = world.turn(error[2])
     return error
@@ -48,7 +48,7 @@ def magnet_errors(world: Any, found: TagDetection, course: Any, tag: Any) -> tup
         k = tag.cells.index(magnet.cell)
         (x, y), angle = tag.places[k], tag.angles[k]
         alone = replace(tag, x=float(x), y=float(y), heading=float(angle))
-        truth = world.seen_from(course, round(found.time_s * 1e9), alone)
+        truth = world.true_tag_pose(course, round(found.time_s * 1e9), alone)
         error = np.array([magnet.x_m, magnet.y_m, magnet.angle_rad]) - truth
         rows.append([error[0], error[1], float(world.turn(error[2]))])
         spread.append([magnet.sigma_x_m, magnet.sigma_y_m, magnet.sigma_angle_rad])
@@ -199,7 +199,7 @@ def test_no_wrong_bit_at_any_speed_profile(hand_installed: HandInstalledTags) ->
 
 
 @pytest.mark.slow
-def test_position_and_heading_of_tags_laid_by_hand(hand_installed: HandInstalledTags) -> None:
+def test_position_and_heading_of_hand_built_tags(hand_installed: HandInstalledTags) -> None:
     """Five magnets 0.4 mm off put a tag 0.18 mm off and turn it by 0.3 degrees."""
     rms = np.sqrt(np.mean(hand_installed.pose**2, axis=0))
     assert np.all(rms < [4e-4, 4e-4, np.radians(0.6)])

@@ -96,7 +96,7 @@ def test_a_magnet_that_some_passes_miss_is_measured_by_the_others() -> None:
     np.testing.assert_allclose(shape_of(report.built), shape_of(expected), atol=1e-8)
 
 
-def test_a_magnet_seen_once_is_named() -> None:
+def test_a_magnet_detected_once_is_named() -> None:
     _, generated = passes(3)
     for k in (0, 1):
         generated[k].observed[2] = np.nan
@@ -118,7 +118,7 @@ def test_a_stray_pass_moves_nothing(what: tuple[int, float]) -> None:
     np.testing.assert_array_equal(report.calibrated[0].built.offset_m, clean.built.offset_m)
 
 
-def test_what_is_far_from_the_design_is_said() -> None:
+def test_large_deviations_from_the_design_are_reported() -> None:
     _, generated = passes(3)
     for each in generated:
         # A speed that is told 3 % too low, on the same way each time.

@@ -115,7 +115,7 @@ def test_a_template_is_nearest_to_itself_at_other_speeds() -> None:
         assert abs(math.remainder(rotated, math.tau)) < math.radians(21)
 
 
-def test_each_orientation_is_told_under_the_middle_of_a_sensor() -> None:
+def test_each_orientation_is_identified_below_a_sensor() -> None:
     # Where the axes are brought to one size each, those of a quadrant are the same, and those
     # with an axis of zeros (0, 90, 180 and 270 degrees) are not numbers.
     angles = np.linspace(0, math.tau, 36, endpoint=False)
@@ -127,7 +127,7 @@ def test_each_orientation_is_told_under_the_middle_of_a_sensor() -> None:
     assert [int(ddtw.distances(window, slopes).argmin()) for window in noisy] == list(range(36))
 
 
-def test_what_does_not_change_is_no_signal() -> None:
+def test_a_constant_field_is_no_signal() -> None:
     slopes = ddtw.prepare(np.stack([np.full((20, 3), 0.3), walk(8, 20, 3)]))
     assert np.all(slopes[..., 0] == 0)
     still = ddtw.distances(np.full((20, 3), 5e-5), slopes)

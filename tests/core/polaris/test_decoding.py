@@ -82,7 +82,7 @@ designs = st.sampled_from([SMALL, DEFAULT, RELEASED, WIDE])
 
 @settings(deadline=None)
 @given(designs, st.data())
-def test_what_is_laid_is_read(tags: Tags, data) -> None:
+def test_installed_tags_are_decoded(tags: Tags, data) -> None:
     """In any order of the magnets, at any wrap, off by less than half a step."""
     tag_id = data.draw(st.integers(0, codec.capacity(tags) - 1))
     cells, steps = magnets(tags, tag_id)
@@ -195,7 +195,7 @@ def test_with_tags_as_built_it_is_the_nearest_of_all_ids(data) -> None:
         assert reading.margin == pytest.approx(margin)
 
 
-def test_a_magnet_laid_13_degrees_off_is_read_at_16_orientations_once_it_was_measured() -> None:
+def test_a_measured_error_of_13_degrees_is_decoded_at_16_orientations() -> None:
     """The default tag of the published recordings (github.com/wjk5117/Polaris) has one."""
     design = Tags(orientations=16)
     cells, steps = magnets(design, 54321)
@@ -285,7 +285,7 @@ def test_beyond_half_its_distance_nothing_is_read_as_another(data) -> None:
 
 def test_between_two_members_is_a_tie() -> None:
     cells, steps = magnets(DEFAULT, 0)
-    ids = tuple(codec.id_of(DEFAULT, layout) for layout in _turned_layouts(0, (0, 2)))
+    ids = tuple(codec.id_of(DEFAULT, layout) for layout in _rotated_layouts(0, (0, 2)))
     tags = replace(DEFAULT, ids=ids, min_distance=2)
     assert families.smallest_distance(tags, ids) == 2
     steps[1] += 1
@@ -293,7 +293,7 @@ def test_between_two_members_is_a_tie() -> None:
     assert (reading.tag_id, reading.refused, reading.margin) == (None, "tie", 0)
 
 
-def _turned_layouts(tag_id: int, by):
+def _rotated_layouts(tag_id: int, by):
     layout = codec.layout_of(DEFAULT, tag_id)
     for steps in by:
         symbols = list(layout.symbols)
@@ -318,7 +318,7 @@ def test_a_foreign_tag_is_not_in_the_family() -> None:
 
 @settings(deadline=None)
 @given(st.data())
-def test_a_missing_magnet_takes_half_a_turn_from_the_distance(data) -> None:
+def test_a_missing_magnet_reduces_the_distance_by_half_a_revolution(data) -> None:
     """Distance 9, P = 8: one missing leaves 5, so that two steps are corrected beside it."""
     tags = family(30, 9)
     member = data.draw(st.sampled_from(tags.ids))
@@ -332,7 +332,7 @@ def test_a_missing_magnet_takes_half_a_turn_from_the_distance(data) -> None:
     assert (reading.tag_id, reading.erased, reading.corrected) == (member, 1, wrong)
 
 
-def test_beside_a_missing_magnet_less_is_corrected() -> None:
+def test_with_a_missing_magnet_less_is_corrected() -> None:
     """Distance 9 bears four steps, with one magnet missing two, with two missing none."""
     tags = family(30, 9)
     member = tags.ids[11]
@@ -351,7 +351,7 @@ def test_beside_a_missing_magnet_less_is_corrected() -> None:
 
 def test_a_magnet_missing_from_two_members_alike_is_no_guess() -> None:
     cells, steps = magnets(DEFAULT, 0)
-    ids = tuple(codec.id_of(DEFAULT, layout) for layout in _turned_layouts(0, (0, 4)))
+    ids = tuple(codec.id_of(DEFAULT, layout) for layout in _rotated_layouts(0, (0, 4)))
     tags = replace(DEFAULT, ids=(*ids, 202517), min_distance=4)
     kept = [0, 2, 3, 4]
     reading = decode_tag(tags, [cells[k] for k in kept], steps[kept])
@@ -363,7 +363,7 @@ def test_a_magnet_missing_from_two_members_alike_is_no_guess() -> None:
     assert (two.tag_id, two.refused) == (None, "magnets_missing")
 
 
-def test_a_magnet_in_a_wrong_cell_counts_half_a_turn() -> None:
+def test_a_magnet_in_a_wrong_cell_counts_half_a_revolution() -> None:
     tags = family(30, 9)
     member = tags.ids[7]
     cells, steps = magnets(tags, member)
@@ -398,7 +398,7 @@ def capped(steps: np.ndarray, word, positions: list[int]) -> float:
 @pytest.mark.slow
 @settings(deadline=None, max_examples=150)
 @given(st.data())
-def test_a_missing_magnet_and_a_misread_one_are_borne(data) -> None:
+def test_a_missing_and_a_misread_magnet_are_corrected(data) -> None:
     tag_id = data.draw(st.integers(0, 63))
     cells, steps = magnets(REDUNDANT, tag_id)
     steps += [data.draw(offsets) for _ in cells]
@@ -417,7 +417,7 @@ def test_a_missing_magnet_and_a_misread_one_are_borne(data) -> None:
     assert reading.margin <= min(others) - own + 1e-9
 
 
-def test_what_the_margin_of_a_clean_tag_is() -> None:
+def test_margin_of_a_clean_tag() -> None:
     assert decode_tag(REDUNDANT, *magnets(REDUNDANT, 33)).margin == 5
 
 

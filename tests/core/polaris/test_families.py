@@ -147,7 +147,7 @@ def test_all_ids_are_a_family_of_distance_one() -> None:
     assert sorted(families.generate_family(tags, 512, 1)) == list(range(512))
 
 
-def test_what_the_codec_does_not_hold_is_refused() -> None:
+def test_ids_beyond_the_codec_are_refused() -> None:
     tags = Tags(order=2, magnets=3, orientations=4)
     with pytest.raises(InputError, match="the codec has 64 ids"):
         families.generate_family(tags, 65, 1)

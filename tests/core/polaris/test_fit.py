@@ -119,7 +119,7 @@ def test_many_starts_one_optimum(world: Any) -> None:
     assert np.ptp([fitted.state.position_m for fitted in fits], axis=0).max() < 2e-6
 
 
-def test_free_steps_follow_an_uneven_way(world: Any) -> None:
+def test_free_steps_follow_an_uneven_path(world: Any) -> None:
     """The speed swings by a quarter, and once eight samples are lost of which the clock
     knows nothing; the start is a steady drive."""
     window, truth, _ = posed(world, known=False)
@@ -196,7 +196,7 @@ def test_missing_samples_are_no_samples(world: Any) -> None:
     assert np.linalg.norm(fitted.state.position_m - tag.places, axis=1).max() < 1e-4
 
 
-def test_what_the_samples_do_not_determine_is_an_error(world: Any) -> None:
+def test_undetermined_parameters_are_an_error(world: Any) -> None:
     window, truth, _ = posed(world, known=True)
     nothing = replace(window, field_t=np.full_like(window.field_t, np.inf))
     with pytest.raises(DegenerateError):

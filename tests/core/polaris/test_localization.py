@@ -125,7 +125,7 @@ def test_without_a_site_the_first_tag_is_the_frame(world: Any, tour: tuple[Any, 
         )
 
 
-def test_a_tag_that_is_not_on_the_site_is_told(tour: tuple[Any, Samples]) -> None:
+def test_a_tag_outside_the_site_is_reported(tour: tuple[Any, Samples]) -> None:
     _, recording = tour
     known = {i: SITE[i] for i in IDS[:2]}
     solution = solve([recording], replace(TAGS, site=known))

@@ -92,7 +92,7 @@ def test_magnets_of_a_tag_the_strongest_first(world: Any) -> None:
     assert left < 0.2
 
 
-def test_the_way_may_go_backward(world: Any) -> None:
+def test_the_path_may_go_backward(world: Any) -> None:
     course = world.driven(world.line(length=0.24), [0, 2.4], [1, 0])
     atoms, _ = atoms_of(world, [single(world, 0.03, -0.01, 1.0)], most=1, course=course)
     assert np.linalg.norm(atoms[0].position_m - [0.03, -0.01]) < 0.3 * HEIGHT

@@ -77,7 +77,7 @@ def test_any_pose_in_any_order(
     assert best.misfit_m < 6e-4
 
 
-def test_every_way_to_lay_it_is_offered() -> None:
+def test_every_assignment_is_enumerated() -> None:
     """Four magnets in a small square lie on the grid in many ways, three of the corners
     of the tag in one."""
     assert len(match_tags(detected_magnets(magnet_positions(((0, 0), (0, 2), (2, 2)))), TAGS)) == 1
@@ -123,7 +123,7 @@ def test_worse_magnets_give_a_worse_pose() -> None:
         assert np.all(np.diag(other.covariance) > 2 * np.diag(sure.covariance))
 
 
-def test_the_tag_is_the_ruler_of_a_way_unknown() -> None:
+def test_the_tag_scales_an_unknown_path() -> None:
     positions = magnet_positions(CELLS, (0.0, 0.01, 0.3))
     short = positions * [0.97, 1.0]
     best = match_tags(detected_magnets(short, free=True), TAGS)[0]
@@ -155,7 +155,7 @@ def test_another_grid_does_not_fit(spacing: float) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_too_few_magnets_lie_on_no_grid(count: int) -> None:
+def test_too_few_magnets_match_no_grid(count: int) -> None:
     assert match_tags(detected_magnets(magnet_positions(CELLS)[:count].reshape(-1, 2)), TAGS) == []
 
 

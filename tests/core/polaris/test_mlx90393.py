@@ -50,7 +50,7 @@ def recorded(data: Path) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize(("osr", "filt"), ALLOWED)
-def test_conversion_takes_what_the_data_sheet_says(osr: int, filt: int) -> None:
+def test_conversion_time_follows_the_data_sheet(osr: int, filt: int) -> None:
     part = Settings(osr=osr, filt=filt)
     assert round(part.conversion_s * 1e3, 2) == CONVERSION_MS[filt][osr]
     assert part.max_rate_hz < 1 / part.conversion_s

@@ -45,7 +45,7 @@ def tags_and_ids(draw) -> tuple[Tags, int]:
     return tags, draw(st.integers(0, codec.capacity(tags) - 1))
 
 
-def bits_apart(one: int, other: int) -> int:
+def hamming_distance_of(one: int, other: int) -> int:
     return (one ^ other).bit_count()
 
 
@@ -131,7 +131,7 @@ def test_neighbouring_orientations_differ_in_one_bit(base: int) -> None:
     words = mosk.gray_words(base)
     assert len(set(words)) == base
     if base > 2:
-        assert all(bits_apart(words[s], words[s - 1]) == 1 for s in range(base))
+        assert all(hamming_distance_of(words[s], words[s - 1]) == 1 for s in range(base))
     assert max(words).bit_length() == (base - 1).bit_length()
 
 
@@ -140,8 +140,8 @@ def test_neighbouring_orientations_differ_in_one_bit(base: int) -> None:
 def test_odd_orientations_differ_in_one_bit_but_at_the_wrap(base: int) -> None:
     words = mosk.gray_words(base)
     assert len(set(words)) == base
-    assert all(bits_apart(words[s], words[s - 1]) == 1 for s in range(1, base))
-    assert bits_apart(words[-1], words[0]) == 2
+    assert all(hamming_distance_of(words[s], words[s - 1]) == 1 for s in range(1, base))
+    assert hamming_distance_of(words[-1], words[0]) == 2
 
 
 @settings(deadline=None)
@@ -163,7 +163,7 @@ def test_a_step_changes_one_bit_of_the_id(data) -> None:
     symbols = list(layout.symbols)
     symbols[data.draw(st.integers(0, 4))] += data.draw(st.sampled_from([1, -1]))
     rotated = tuple(s % tags.orientations for s in symbols)
-    assert bits_apart(codec.id_of(tags, TagLayout(layout.cells, rotated)), tag_id) == 1
+    assert hamming_distance_of(codec.id_of(tags, TagLayout(layout.cells, rotated)), tag_id) == 1
 
 
 def test_released_ids_are_the_published_ones() -> None:

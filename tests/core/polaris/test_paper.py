@@ -330,7 +330,7 @@ def test_a_long_slow_recording_is_thinned_out() -> None:
     assert compared(sighting, samples, truth)[:, 0].mean() < 2.4e-3
 
 
-def test_what_cannot_be_solved_is_refused() -> None:
+def test_unsolvable_sessions_are_refused() -> None:
     samples = drive([], 0.3)
     with pytest.raises(InputError, match="speed") as error:
         paper.detect_magnets(samples, TAGS, None)

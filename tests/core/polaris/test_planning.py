@@ -71,7 +71,7 @@ def test_the_rule_gives_the_spacings_of_the_paper() -> None:
     ("ratio", "degrees", "mm"),
     [(2, 9.5, 3.3), (2.5, 5.6, 2.8), (3, 3.5, 2.4), (4, 1.6, 1.8), (5, 0.85, 1.4), (6, 0.5, 1.1)],
 )
-def test_what_a_neighbour_does(ratio: float, degrees: float, mm: float) -> None:
+def test_effect_of_a_neighbour(ratio: float, degrees: float, mm: float) -> None:
     angle, shift = neighbour_error(ratio * 0.01, 0.01)
     assert math.degrees(angle) == pytest.approx(degrees, rel=0.08)
     assert shift * 1e3 == pytest.approx(mm, abs=0.2)
@@ -145,7 +145,7 @@ def test_misread_is_the_chance_of_a_tag() -> None:
     )
 
 
-def test_calibrated_tags_tell_how_well_they_are_laid() -> None:
+def test_calibrated_tags_give_their_placement_error() -> None:
     off = np.radians([4.3, -2.2, 13.0, 0.0, -2.8])
     tags = replace(Tags(), built={7: AsBuiltTag(np.zeros((5, 2)), off, 10)})
     assert evaluate_design(tags).placement_rad == pytest.approx(np.sqrt(np.mean(off**2)))

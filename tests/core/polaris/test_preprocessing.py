@@ -79,7 +79,7 @@ def test_a_bar_without_noise_is_not_stuck() -> None:
     assert result.warnings == ()
 
 
-def test_what_is_not_finite_is_missing() -> None:
+def test_non_finite_samples_are_missing() -> None:
     generated = samples()
     generated.field_t[50, 1, 2] = np.inf
     result = preprocess(generated)
@@ -95,7 +95,7 @@ def passes_of(samples: Any) -> list[PassRange]:
 
 
 @pytest.mark.parametrize("noise", [0.2e-6, 1e-6])
-def test_noise_beside_magnets(noise: float, world: Any) -> None:
+def test_noise_near_magnets(noise: float, world: Any) -> None:
     """It is that of the sensors although magnets pass for half of the recording."""
     tag = world.Tag(CELLS, SYMBOLS)
     samples = world.record([tag], world.line(length=0.3), noise=noise)
@@ -138,7 +138,7 @@ def test_one_pass_a_tag_and_all_of_it(step_mm: float, world: Any) -> None:
     assert x[part.stop - 1] - x[part.first] < 0.26 + 50 * step_mm * 1e-3  # not all of it
 
 
-def test_tags_far_apart_are_passes_of_their_own(world: Any) -> None:
+def test_distant_tags_are_separate_passes(world: Any) -> None:
     tags = [world.Tag(CELLS, SYMBOLS, x=x) for x in (-0.5, 0.0, 0.5)]
     parts = passes_of(world.record(tags, world.line(length=1.4)))
     assert len(parts) == 3
@@ -159,7 +159,7 @@ def test_noise_alone_is_no_pass(world: Any) -> None:
         assert passes_of(world.record([], world.line(length=3.0), seed=seed)) == []
 
 
-def test_what_all_sensors_share_is_no_pass(world: Any) -> None:
+def test_a_common_field_of_all_sensors_is_no_pass(world: Any) -> None:
     """The robot turns under the Earth's field; its motors start and stop."""
     samples = world.record([], world.line(length=1.0))
     n = len(samples)

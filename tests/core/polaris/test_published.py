@@ -137,7 +137,7 @@ def test_orientation_scatter(name: str, runs: dict[str, list[Run]]) -> None:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_orientations_are_those_that_were_laid(name: str, runs: dict[str, list[Run]]) -> None:
+def test_orientations_equal_those_of_the_tag(name: str, runs: dict[str, list[Run]]) -> None:
     """Hand-laid: the worst magnet is 13 degrees off, in each run the same."""
     expected = np.exp(-1j * np.radians(CLOCKWISE_DEG[name]))
     for run in runs[name]:

@@ -74,7 +74,9 @@ def test_words_differ_in_five_places(magnets: int, orientations: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("magnets", "orientations", "step"), [(5, 4, 1), (5, 5, 4), (6, 5, 17)])
-def test_decoding_is_right_for_whatever_is_seen(magnets: int, orientations: int, step: int) -> None:
+def test_decoding_is_optimal_for_any_observation(
+    magnets: int, orientations: int, step: int
+) -> None:
     """Of every ``step``-th observation, exactly what brute force over the words would accept."""
     tags = design(magnets, orientations)
     known = words(magnets, orientations)

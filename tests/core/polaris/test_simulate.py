@@ -73,7 +73,7 @@ def sample_at(simulated: SimulatedSession, x_m: float, axis: int = 0) -> Array:
 # ---- the field
 
 
-def test_samples_are_what_magpylib_says_one_by_one() -> None:
+def test_each_sample_agrees_with_magpylib() -> None:
     """Its own sensors and magnets, placed by truth and by the paper's words alone."""
     tags = Tags(site={300: PlanarPose(0.1, -0.2, 0.4), 77: PlanarPose(0.45, -0.05, -2.0)})
     options = replace(
@@ -163,7 +163,7 @@ def test_orientation_two_of_eight_points_to_the_right() -> None:
     assert left[2] == pytest.approx(-right[2], abs=0.1 * UT)
 
 
-def test_a_turned_array_sees_the_field_in_its_own_axes() -> None:
+def test_a_rotated_array_measures_in_its_own_axes() -> None:
     """Across the tag, towards its left: a north ahead of the tag is on the array's right."""
     layout = TagLayout(((0, 0), (0, 1), (1, 1)), (0, 0, 0))
     route = (codec.id_of(WIDE_SPACING, layout),)
@@ -179,7 +179,7 @@ def test_a_turned_array_sees_the_field_in_its_own_axes() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
-def test_the_earth_turns_against_the_array(heading: float) -> None:
+def test_the_earth_field_rotates_relative_to_the_array(heading: float) -> None:
     options = replace(
         PLAIN, earth_t=48 * UT, dip_rad=1.1, north_rad=0.4, heading_rad=heading, crab_rad=0.2
     )
@@ -215,7 +215,7 @@ def test_each_axis_is_measured_at_its_own_time() -> None:
 
 
 @pytest.mark.slow
-def test_the_published_run_looks_like_its_simulation(data: Path) -> None:
+def test_the_published_run_resembles_its_simulation(data: Path) -> None:
     """Axes, signs and orientations against the real array over the real tag."""
     with open(data / "polaris" / "default" / "RawData_1.csv", newline="") as file:
         rows = [
@@ -361,7 +361,7 @@ def test_a_pass_goes_straight_over_the_tag_at_its_heading() -> None:
     assert crossing.heading_rad == pytest.approx(-2.0)
 
 
-def test_it_starts_from_rest_as_it_was_told() -> None:
+def test_the_car_starts_from_rest_as_configured() -> None:
     options = replace(PLAIN, rest_s=0.5, acceleration_mps2=0.4, speed_mps=0.2)
     simulated = simulate(None, options)
     time_s, path = stamped(simulated), simulated.truth.position[:, 0]
@@ -375,7 +375,7 @@ def test_it_starts_from_rest_as_it_was_told() -> None:
     assert path == pytest.approx(0.2 * np.maximum(stamped(jump) - 0.5, 0), abs=2e-5)
 
 
-def test_what_wobbles_stays_within_its_share_and_comes_near_it() -> None:
+def test_the_wobble_stays_within_its_fraction_and_approaches_it() -> None:
     speeds, heights, headings = [], [], []
     for seed in range(20):
         options = replace(
@@ -467,7 +467,7 @@ def test_a_tag_is_crossed_whole_in_part_or_not(lateral: float, whole: bool | Non
 
 
 @pytest.mark.slow
-def test_hand_built_tags_are_the_same_in_every_session_and_told() -> None:
+def test_hand_built_tags_are_reproducible_and_in_the_truth() -> None:
     wrong = {"build_angle_rad": 0.1, "build_place_m": 5e-4, "build_strength": 0.05}
     tags = Tags(site={k: PlanarPose(0.3 * k, 0.0, 0.3) for k in range(40)})
     plain = replace(PLAIN, rate_hz=20.0)
@@ -529,7 +529,7 @@ def test_soft_iron_takes_three_times_the_field_it_is_in() -> None:
     assert full.moment_am2[:, 2] / volume == pytest.approx(1.7e6)
 
 
-def test_iron_beside_a_magnet_is_magnetised_by_it() -> None:
+def test_iron_near_a_magnet_is_magnetised_by_it() -> None:
     disc = Discs(Magnet(), (1,), np.zeros((1, 2)), np.zeros(1), np.ones(1))
     low, high = np.array([-0.01, -0.01]), np.array([0.01, 0.01])
     bits = scatter_debris(disc, low, high, 200, 1e-3, 0.0, np.zeros(3), np.random.default_rng(0))
@@ -540,7 +540,7 @@ def test_iron_beside_a_magnet_is_magnetised_by_it() -> None:
     assert bits.moment_am2[unsaturated] == pytest.approx(induced[unsaturated], rel=1e-6)
 
 
-def test_debris_lies_on_the_tag_and_is_felt_as_dipoles() -> None:
+def test_debris_on_the_tag_acts_as_dipoles() -> None:
     options = replace(PLAIN, heading_rad=0.5, earth_t=50 * UT)
     clean = simulate(None, options)
     dirty = simulate(None, replace(options, debris=25, seed=3))
@@ -589,7 +589,7 @@ def test_motors_are_felt_while_they_drive_and_more_at_one_end() -> None:
 
 
 @pytest.mark.slow
-def test_odometry_tells_the_way_too_long_and_turns_away() -> None:
+def test_odometry_has_scale_and_heading_errors() -> None:
     tags = Tags(site={1: PlanarPose(0.0, 0.0, 0.0), 2: PlanarPose(1.0, 0.5, 0.0)})
     options = replace(PLAIN, odometry=True, rate_hz=20.0)
     assert simulate(tags, replace(options, odometry=False)).odometry is None
@@ -708,7 +708,7 @@ def test_the_paper_and_its_miniature_car() -> None:
     ],
     ids=lambda wrong: "-".join(map(str, wrong)),
 )
-def test_what_cannot_be_is_refused(wrong: dict[str, object]) -> None:
+def test_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError, match=next(iter(wrong))):
         SimulationOptions(**wrong)  # type: ignore[arg-type]
 
@@ -728,7 +728,7 @@ def test_what_cannot_be_is_refused(wrong: dict[str, object]) -> None:
         (Tags(), {"speed_mps": 1e3}, "frames"),
     ],
 )
-def test_what_the_tags_do_not_allow_is_refused(
+def test_settings_that_contradict_the_tags_are_refused(
     tags: Tags, options: dict[str, object], said: str
 ) -> None:
     with pytest.raises(InputError, match=said):

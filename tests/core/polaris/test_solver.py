@@ -41,7 +41,7 @@ def the_tag(solution: Solution) -> TagDetection:
 
 def errors(world: Any, result: TagDetection, course: Any, tag: Any) -> Array:
     """Of the pose (x, y in m, heading in rad) against the truth at that time."""
-    truth = world.seen_from(course, round(result.time_s * 1e9), tag)
+    truth = world.true_tag_pose(course, round(result.time_s * 1e9), tag)
     observed = np.array([result.x_m, result.y_m, result.heading_rad]) - truth
     observed[2] = world.turn(observed[2])
     return observed
@@ -113,7 +113,7 @@ def test_read_in_spite_of(kind: str, world: Any) -> None:
     assert np.all(np.abs(error) < 4 * sigmas(result))
 
 
-def test_missing_samples_are_told(world: Any) -> None:
+def test_missing_samples_are_reported(world: Any) -> None:
     _, _, recording = passed(world)
     solution = solve([with_faults("dead sensor", recording)], TAGS)
     (warning,) = [each for each in solution.warnings if each.code == "samples_missing"]
@@ -166,7 +166,7 @@ def test_standing_still_over_the_tag(world: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lateral", [-0.12, -0.08, 0.09, 0.12])
-def test_tag_beside_the_bar_is_partial(lateral: float, world: Any) -> None:
+def test_a_tag_partly_outside_the_bar_is_partial(lateral: float, world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, heading=0.1)
     recording = world.record([tag], world.line(lateral=lateral, length=0.28), seed=5)
     solution = solve([recording], TAGS)
@@ -338,7 +338,7 @@ def test_nothing_there_is_nothing_found(kind: str, world: Any) -> None:
     assert solution.trajectories == ()
 
 
-def test_devices_stay_apart(world: Any) -> None:
+def test_devices_are_solved_separately(world: Any) -> None:
     tag, course, left = passed(world, device="left", seed=1)
     right = world.record([world.Tag(CELLS, OTHER)], course, device="right", seed=2)
     solution = solve([left, right], TAGS)
@@ -350,7 +350,7 @@ def test_devices_stay_apart(world: Any) -> None:
     assert tag.cells == CELLS
 
 
-def test_a_height_is_as_sure_as_the_scale_of_its_way(world: Any) -> None:
+def test_the_sigma_of_a_height_follows_the_scale_of_the_path(world: Any) -> None:
     """A speed that is told one percent too high lifts the array by as much."""
     _, _, samples = passed(world, course=world.line(length=0.28, speed=0.1))
     solution = solve([samples], TAGS, SolveOptions(speed_mps=0.101))

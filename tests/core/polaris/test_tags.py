@@ -201,7 +201,7 @@ def test_magnets_off_their_cells_are_refused(world: Any) -> None:
     )
 
 
-def test_a_way_of_another_scale_is_refused(world: Any) -> None:
+def test_a_path_of_another_scale_is_refused(world: Any) -> None:
     """The tag is the ruler of a way unknown, but for a tenth at most: beyond, it is not
     the tag."""
     sighting = detected_magnets(world.Tag(CELLS, SYMBOLS), is_path_estimated=True)

@@ -12,7 +12,7 @@ from locatk.formats.benchmarks.figures import Duration, Figure
 
 
 @pytest.fixture(scope="session")
-def run_here() -> Callable[[str], list[float]]:
+def run_in_process() -> Callable[[str], list[float]]:
     """Return a replacement of ``run_single_threaded`` that runs the call in this process."""
 
     def run(call: str) -> list[float]:

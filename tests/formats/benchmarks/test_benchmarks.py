@@ -43,7 +43,7 @@ EQUAL_IN_TRUE_HEIGHT = "3D grid, static scatter z"
 @pytest.fixture
 def quick(
     monkeypatch: pytest.MonkeyPatch,
-    run_here: Callable[[str], list[float]],
+    run_in_process: Callable[[str], list[float]],
     time_once: Callable[..., Duration],
 ) -> None:
     """Use few draws and few sweeps: the code is tested, not the accuracy."""
@@ -51,7 +51,7 @@ def quick(
     monkeypatch.setattr(lighthouse, "PLANAR_EXPERIMENTS", range(1, 4))
     monkeypatch.setattr(lighthouse, "SCENE_DRAWS", 1)
     monkeypatch.setattr(lighthouse, "SIMULATED_SWEEPS", 4000)
-    monkeypatch.setattr(timing, "run_single_threaded", run_here)
+    monkeypatch.setattr(timing, "run_single_threaded", run_in_process)
 
 
 @pytest.mark.parametrize(

@@ -90,11 +90,11 @@ def quick(time_once: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def rows(
-    by_name: Any, run_here: Any, tmp_path_factory: pytest.TempPathFactory
+    by_name: Any, run_in_process: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Figure]:
     """All figures, without the published frame."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timing, "run_single_threaded", run_here)
+        patch.setattr(timing, "run_single_threaded", run_in_process)
         return by_name(dots.figures(tmp_path_factory.mktemp("empty")))
 
 
@@ -132,7 +132,7 @@ def test_missing_data_are_reported(tmp_path: Path) -> None:
         assert "frame.bmp" in figure.how
 
 
-def test_the_published_frame_is_found_in_all_turns(data: Path) -> None:
+def test_the_published_frame_is_decoded_in_all_rotations(data: Path) -> None:
     for figure in dots.published_frame_figures(data / "dots" / "frame.bmp"):
         assert figure.value is not None
         if figure.unit == "pitch":

@@ -103,7 +103,7 @@ def test_noise_that_passes_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert infrared.false_alarm_fraction() > 0.05
 
 
-def test_without_data_each_figure_says_why(tmp_path: Path) -> None:
+def test_without_data_each_figure_gives_the_reason(tmp_path: Path) -> None:
     (tmp_path / "lighthouse").mkdir()
     for measure in (infrared.demodulation_figures, infrared.fpga_figures):
         (row,) = infrared.explain(partial(measure, tmp_path / "lighthouse"), {"a figure": "%"})

@@ -66,7 +66,7 @@ EXACT = (
 
 @pytest.fixture(scope="module")
 def quick(
-    run_here: Callable[[str], list[float]], time_once: Callable[..., Duration]
+    run_in_process: Callable[[str], list[float]], time_once: Callable[..., Duration]
 ) -> Iterator[None]:
     """Use few cases: the code is tested, not the accuracy."""
     with pytest.MonkeyPatch.context() as patch:
@@ -86,8 +86,8 @@ def quick(
         patch.setattr(landmarks_speed, "FIELD_POINTS", 2000)
         patch.setattr(landmarks_speed, "SEARCHED_MAPS", landmarks_speed.SEARCHED_MAPS[:1])
         patch.setattr(landmarks_speed, "time_call", time_once)
-        patch.setattr(landmarks_speed, "run_single_threaded", run_here)
-        patch.setattr(timing, "run_single_threaded", run_here)
+        patch.setattr(landmarks_speed, "run_single_threaded", run_in_process)
+        patch.setattr(timing, "run_single_threaded", run_in_process)
         yield
 
 
@@ -209,7 +209,7 @@ def test_baselines_are_about_as_good_as_the_facts_say() -> None:
         assert 5 < landmarks_visits.errors_mm(found).mean() < 15
 
 
-def test_errors_do_not_depend_on_the_frames_quarter_turns() -> None:
+def test_errors_do_not_depend_on_rotations_by_90_degrees() -> None:
     true = np.array([0.01, -0.02, 0.3])
     for quarters in range(-3, 4):
         turn = quarters * math.pi / 2
@@ -226,7 +226,7 @@ def test_errors_do_not_depend_on_the_frames_quarter_turns() -> None:
     assert landmarks_visits.centre_error(true + [3e-3, 4e-3, 0], true) == pytest.approx(5e-3)
 
 
-def test_calibration_is_how_far_shares_are_from_what_was_told() -> None:
+def test_calibration_error_compares_fractions_with_probabilities() -> None:
     def told(probability: float, right: int, of: int) -> list[VisitResult]:
         return [VisitResult(k, 3, is_correct=k < right, probability=probability) for k in range(of)]
 
@@ -252,7 +252,7 @@ def test_nothing_found_is_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "not detected or refused" in found["one pass: mean"].how
 
 
-def test_robots_stand_where_it_is_said() -> None:
+def test_robots_stop_at_the_distances_of_the_paper() -> None:
     rng = np.random.default_rng(1)
     for anywhere, mean_m in ((False, 3.76e-3), (True, 6.67e-3)):
         away = np.hypot(*landmarks_visits.random_stops(4000, anywhere, rng)[:, :2].T)
@@ -303,7 +303,7 @@ def test_sightings_are_what_the_robot_reads(floor: FloorMap) -> None:
     assert all(0 <= code < CODE_COUNT and code != floor.codes[cell] for cell, code in wrong.items())
 
 
-def test_a_filter_that_is_sure_of_another_place_is_caught(
+def test_a_filter_certain_of_a_wrong_cell_is_detected(
     floor: FloorMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(landmarks_global, "START_STRIDE", 500)
@@ -345,7 +345,7 @@ def test_a_solved_session_is_compared_with_the_truth(
     assert one.error_m.mean() == pytest.approx(0.2, abs=0.01)
 
 
-def test_a_wrong_cell_is_seen(solved: tuple[SimulatedSession, Solution]) -> None:
+def test_a_wrong_cell_is_detected(solved: tuple[SimulatedSession, Solution]) -> None:
     made, solution = solved
     *others, last = solution.detections
     row, column = last.cell

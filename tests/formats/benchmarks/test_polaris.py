@@ -75,12 +75,12 @@ TAG = 255183
 
 @pytest.fixture(scope="module")
 def rows(
-    by_name: Any, run_here: Any, time_once: Any, tmp_path_factory: pytest.TempPathFactory
+    by_name: Any, run_in_process: Any, time_once: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Figure]:
     """Return all figures of few passes, without the published runs."""
     with pytest.MonkeyPatch.context() as patch:
         for module in (timing, polaris_speed):
-            patch.setattr(module, "run_single_threaded", run_here)
+            patch.setattr(module, "run_single_threaded", run_in_process)
         patch.setattr(polaris_speed, "time_call", time_once)
         patch.setattr(polaris_passes, "HEADINGS_DEG", (30,))
         for name in ("HEADING_REPEATS", "RANDOM_DESIGNS", "REPEATED_PASSES"):

@@ -157,7 +157,7 @@ class Running:
         assert held, f"did not come about; told: {self.said}"
         assert condition(), f"did not come about; told: {self.said}, {self._error!r}"
 
-    def until_said(self, words: str) -> None:
+    def wait_for_message(self, words: str) -> None:
         """Wait until somebody is told this."""
         self.until(lambda: any(words in text for text in self.said))
 

@@ -45,7 +45,7 @@ def test_every_byte_has_the_time_of_its_read(table: np.ndarray, byte_ns: float) 
     assert (wire <= read).all()
 
 
-def test_frames_of_one_read_are_told_apart_by_the_wire() -> None:
+def test_frames_of_one_read_are_dated_by_the_baud_rate() -> None:
     arrivals = filled(np.array([(10, 1_000_000), (30, 3_000_000)]), byte_ns=86_805.0)
     ends = np.array([10, 20, 30])
     assert arrivals.read_ns(ends).tolist() == [1_000_000, 3_000_000, 3_000_000]
@@ -57,7 +57,7 @@ def test_nothing_is_dated_before_the_read_before_it() -> None:
     assert arrivals.wire_ns(np.array([11, 999])).tolist() == [1_000_000, 1_413_195]
 
 
-def test_what_is_not_there_yet_has_the_last_time() -> None:
+def test_bytes_after_the_last_read_get_its_time() -> None:
     assert filled(np.array([(10, 7), (20, 9)])).read_ns(np.array([21])).tolist() == [9]
 
 

@@ -80,7 +80,9 @@ def test_two_of_a_kind(tmp_path: Path) -> None:
         ("", "format"),
     ],
 )
-def test_what_is_no_artifact_is_told_now(tmp_path: Path, text: str, words: str) -> None:
+def test_files_other_than_artifacts_are_refused_at_once(
+    tmp_path: Path, text: str, words: str
+) -> None:
     path = write(tmp_path / "wrong.toml", text)
     with pytest.raises((ArtifactError, FormatError)) as caught:
         attachments([path])
@@ -117,7 +119,7 @@ def test_a_session_without_any(tmp_path: Path) -> None:
         attachments([path])
 
 
-def test_what_is_damaged_in_a_session_is_told_now(tmp_path: Path) -> None:
+def test_damaged_sessions_are_refused_at_once(tmp_path: Path) -> None:
     path = session(tmp_path / "old.mcap", tag="format = 'locatk-tag'\nversion = 1\n")
     with pytest.raises((ArtifactError, FormatError), match=r"old\.mcap"):
         attachments([path])

@@ -126,7 +126,7 @@ def test_silence_until_a_frame_is_due(video: Path) -> None:
         link.read(0.0)
 
 
-def test_a_file_waits_for_who_reads_slowly(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_waits_for_a_slow_reader(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera, "MAX_WAITING_BYTES", 3 * SIZE[0] * SIZE[1] * 2)
     link = camera_port(str(video), clock=ticks(), speed=0).open()
     time.sleep(0.05)
@@ -165,7 +165,7 @@ def test_a_camera_that_is_not_there() -> None:
     assert "camera:/dev/video73: no such camera" in str(refused("/dev/video73"))
 
 
-def test_an_address_where_nobody_is() -> None:
+def test_an_address_without_a_camera() -> None:
     error = refused("rtsp://127.0.0.1:1/stream")
     assert str(error) == "rtsp://127.0.0.1:1/stream: no video was received"
 
@@ -330,7 +330,7 @@ def test_a_video_without_frames_is_named(
     assert str(refused(str(video))) == f"{video}: the video has no frame"
 
 
-def test_frames_that_nobody_reads_are_counted(
+def test_unread_frames_are_counted(
     driver: Callable[[list[bool]], Capture], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(camera, "MAX_WAITING_BYTES", 4 * SIZE[0] * SIZE[1] * 3)

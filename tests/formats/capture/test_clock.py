@@ -61,6 +61,6 @@ def test_without_a_clock_that_runs_through_sleep_there_is_the_monotonic_one(
 
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="the system has no such clock")
-def test_where_there_is_one_it_runs_through_sleep() -> None:
+def test_the_clock_runs_during_sleep() -> None:
     before = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
     assert before <= steady_ns() <= time.clock_gettime_ns(time.CLOCK_BOOTTIME)

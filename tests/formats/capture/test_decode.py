@@ -160,7 +160,7 @@ def test_binary_devices_alike(
     assert systems == {"polaris" if name == "polaris-array" else "landmarks"}
 
 
-def test_where_the_port_was_opened_again(tmp_path: Path) -> None:
+def test_reopened_ports_decode_as_recorded(tmp_path: Path) -> None:
     reads: Reads = [(0, b"1,2\n3,4\n5,6\n7,"), None, (900, b"8\n9,10\n11,12\n"), (950, b"13,14\n")]
     live = record(tmp_path / "live.mcap", "lines", reads)
     decode(live, tmp_path / "again.mcap")
@@ -172,7 +172,7 @@ def test_where_the_port_was_opened_again(tmp_path: Path) -> None:
     assert lines == ["connection lost: a test", "connected again"]
 
 
-def test_what_is_told_stays(tmp_path: Path) -> None:
+def test_facts_of_the_recording_are_kept(tmp_path: Path) -> None:
     live = record(
         tmp_path / "live.mcap", "lines", numbered(20), facts={"meta:robot": "7", "baud": "9600"}
     )

@@ -70,7 +70,7 @@ def test_another_program(path: str, another: int) -> None:
 
 
 @linux
-def test_locks_are_told_of_all_users(
+def test_locks_of_other_users_are_listed(
     path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The line of a lock as Linux writes it, and a /proc whose files nobody may look into.
@@ -89,7 +89,9 @@ def test_locks_are_told_of_all_users(
     assert find_port_users([path]) == {path: (PortUser(os.getpid(), "capture"),)}
 
 
-def test_where_nobody_can_be_seen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_processes_that_cannot_be_inspected(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(holding, "PROC_DIR", tmp_path / "none")
     error = busy_error("/dev/ttyACM0", "/dev/ttyACM0")
     assert str(error) == "/dev/ttyACM0: in use by another program"

@@ -197,7 +197,7 @@ def test_how_it_was_read_changes_no_record(data: bytes, cut: st.DataObject) -> N
     assert totals.samples.get("/readings/red", 0) == totals.frames == len(values(made))
 
 
-def test_the_decoder_is_told_of_pauses() -> None:
+def test_the_decoder_receives_pauses() -> None:
     intake = SerialIntake("red", "", "quads")
     decoder: Any = intake._decoder
     list(intake.take(reads(b"a", b"b", step_ns=MS)))
@@ -207,7 +207,7 @@ def test_the_decoder_is_told_of_pauses() -> None:
     assert decoder.counts.bytes == 5
 
 
-def test_reads_with_a_pause_between_them_stay_apart() -> None:
+def test_reads_separated_by_a_pause_are_not_merged() -> None:
     intake = SerialIntake("red", "", "quads")
     made = list(intake.take(reads(b"ab", b"cd", b"ef", step_ns=PAUSE_NS)))
     chunks = [each for each in made if isinstance(each.message, SerialChunk)]
@@ -237,7 +237,7 @@ def test_samples_in_short_bursts_keep_their_times() -> None:
     np.testing.assert_allclose(got, np.arange(50) * 2 * MS, atol=0.2 * MS)
 
 
-def test_options_reach_the_decoder_and_its_remarks_are_said_once() -> None:
+def test_options_reach_the_decoder_and_remarks_are_reported_once() -> None:
     intake = SerialIntake("red", "", "quads", Options(columns=("a", "b")))
     assert intake.remarks() == ["columns are ('a', 'b')"]
     assert intake.remarks() == []
@@ -313,14 +313,14 @@ def test_a_decoder_that_fails_costs_no_byte(where: str) -> None:
 
 
 @pytest.mark.parametrize("kind", [b"kind", b"shape", b"column", b"none"])
-def test_a_decoder_that_gives_what_nobody_can_use_costs_no_byte(kind: bytes) -> None:
+def test_invalid_batches_of_a_decoder_lose_no_bytes(kind: bytes) -> None:
     intake = SerialIntake("red", "", "odd")
     made = [*intake.take(reads(kind)), *intake.take(reads(b"more", start_ns=START_NS + MS))]
     assert raw(made) == kind + b"more"
     assert len(intake.remarks()) == 1
 
 
-def test_what_a_failed_decoder_had_counted_stays() -> None:
+def test_counts_of_a_failed_decoder_are_kept() -> None:
     intake = SerialIntake("red", "", "quads")
     list(intake.take(reads(b"abcd??efgh??")))
     list(intake.take(reads(b"!", start_ns=START_NS + MS)))

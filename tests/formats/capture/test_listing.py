@@ -127,7 +127,7 @@ def test_identity() -> None:
     assert PortInfo("/dev/ttyS0", serial_number="a").identity is None
 
 
-def test_interfaces_of_one_device_are_apart() -> None:
+def test_interfaces_of_one_device_are_listed_separately() -> None:
     first, second = (
         PortInfo("/dev/ttyACM0", vid=1, pid=2, serial_number="a", location=f"1-2:1.{interface}")
         for interface in (0, 2)

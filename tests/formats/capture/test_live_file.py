@@ -98,7 +98,9 @@ def test_places_that_are_no_files(tmp_path: Path) -> None:
             LiveFile(tmp_path, overwrite=overwrite)
 
 
-def test_who_may_not_write_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_write_permission_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
@@ -131,7 +133,7 @@ def test_a_write_is_whole_or_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
-def test_all_kinds_of_no_room(tmp_path: Path, number: int) -> None:
+def test_all_errors_of_a_full_disk(tmp_path: Path, number: int) -> None:
     """EFBIG: 4 GB on a FAT32 stick, or ``ulimit -f``."""
     file = LiveFile(tmp_path / "run.mcap")
     on(file, room=0).error = number
@@ -201,7 +203,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Taken:
     return taken
 
 
-def test_there_is_always_room_for_what_was_asked(tmp_path: Path, taken: Taken) -> None:
+def test_the_requested_space_is_reserved(tmp_path: Path, taken: Taken) -> None:
     file = LiveFile(tmp_path / "run.mcap")
     for _ in range(50):
         file.make_room(300_000)
@@ -211,7 +213,7 @@ def test_there_is_always_room_for_what_was_asked(tmp_path: Path, taken: Taken) -
     file.close()
 
 
-def test_a_full_disk_is_told_while_there_is_still_room(tmp_path: Path, taken: Taken) -> None:
+def test_a_nearly_full_disk_is_reported_in_time(tmp_path: Path, taken: Taken) -> None:
     file = LiveFile(tmp_path / "run.mcap")
     file.make_room(1000)
     had = taken.ends[-1]
@@ -236,7 +238,7 @@ def exhaust(stream: IO[bytes]) -> None:
 
 
 @pytest.mark.parametrize("number", [errno.EOPNOTSUPP, errno.ENOSYS])
-def test_where_room_cannot_be_taken_nobody_asks_again(
+def test_an_impossible_reservation_is_not_repeated(
     tmp_path: Path, taken: Taken, number: int
 ) -> None:
     taken.answers = [number]
@@ -248,7 +250,7 @@ def test_where_room_cannot_be_taken_nobody_asks_again(
     file.close()
 
 
-def test_a_signal_does_not_end_the_taking_of_room(tmp_path: Path, taken: Taken) -> None:
+def test_a_signal_does_not_interrupt_the_reservation(tmp_path: Path, taken: Taken) -> None:
     taken.answers = [errno.EINTR]
     file = LiveFile(tmp_path / "run.mcap")
     file.make_room(1000)
@@ -258,7 +260,7 @@ def test_a_signal_does_not_end_the_taking_of_room(tmp_path: Path, taken: Taken) 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="fallocate(2) is of Linux")
-def test_room_is_taken_without_a_longer_file_and_given_back(tmp_path: Path) -> None:
+def test_space_is_reserved_beyond_the_end_and_released(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     file = LiveFile(path)
     file.write(b"x")

@@ -51,7 +51,7 @@ def test_names_of_parts() -> None:
     assert part_path(Path("run.2.mcap"), 1234) == Path("run.2-1234.mcap")
 
 
-def test_one_file_with_all_that_was_said(tmp_path: Path) -> None:
+def test_one_file_with_all_messages(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     made = RecordingFiles(path, CONTENT)
     made.write([chunk(b"first")])
@@ -86,7 +86,7 @@ def test_streams_without_a_message_are_known_too(tmp_path: Path) -> None:
     }
 
 
-def test_what_was_flushed_is_there_when_the_program_is_killed(tmp_path: Path) -> None:
+def test_flushed_data_survive_a_killed_program(tmp_path: Path) -> None:
     made = RecordingFiles(tmp_path / "run.mcap", CONTENT)
     made.flush()
     made.write([chunk(b"kept")])
@@ -114,7 +114,7 @@ def test_a_new_topic_is_there_when_the_program_is_killed(tmp_path: Path) -> None
     assert message.device == "robot"
 
 
-def test_no_chunk_is_larger_than_what_room_was_made_for(
+def test_no_chunk_exceeds_the_reserved_space(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[int] = []
@@ -146,7 +146,7 @@ def test_no_chunk_is_larger_than_what_room_was_made_for(
     assert contents(tmp_path / "run.mcap") == b"".join(sent * 3)
 
 
-def test_room_is_taken_for_chunks_that_are_there(
+def test_space_is_reserved_for_pending_chunks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A silent line, flushed five times a second for a day, needs no more of the disk."""
@@ -209,7 +209,7 @@ def test_outputs_that_are_there_are_refused_ahead(tmp_path: Path, number: int) -
     check_outputs(tmp_path / "run.mcap", numbered=False, overwrite=False)
 
 
-def test_names_that_only_look_like_parts_are_no_matter(tmp_path: Path) -> None:
+def test_names_that_resemble_parts_are_ignored(tmp_path: Path) -> None:
     for name in ("run.mcap", "run-x.mcap", "run-001.csv", "other-001.mcap", "run-001-b.mcap"):
         (tmp_path / name).write_bytes(b"")
     check_outputs(tmp_path / "run.mcap", numbered=True, overwrite=False)
@@ -290,7 +290,7 @@ def test_a_full_disk_leaves_a_whole_file_of_large_messages(small_disk: Path, siz
     assert session.metadata()["capture"]["ended"] == "full"
 
 
-def test_a_message_that_the_disk_has_no_room_for_is_left_out(small_disk: Path) -> None:
+def test_a_message_too_large_for_the_disk_is_omitted(small_disk: Path) -> None:
     path = small_disk / "run.mcap"
     made = RecordingFiles(path, CONTENT)
     made.flush()

@@ -185,7 +185,7 @@ def test_one_port_has_one_owner(terminal: Terminal, opened: Opened) -> None:
     opened(terminal.path)
 
 
-def test_who_holds_it_is_named(terminal: Terminal) -> None:
+def test_the_user_of_a_port_is_named(terminal: Terminal) -> None:
     code = (
         "import fcntl, os, sys, time; port = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY);"
         "fcntl.flock(port, fcntl.LOCK_EX); print(flush=True); time.sleep(60)"
@@ -200,7 +200,7 @@ def test_who_holds_it_is_named(terminal: Terminal) -> None:
     assert f"(pid {child.pid})" in str(error)
 
 
-def as_another(path: str) -> str:
+def error_for_another_user(path: str) -> str:
     """Of which error a user without rights is told; needs no other user if this is one."""
     reading, writing = os.pipe()
     pid = os.fork()
@@ -228,9 +228,9 @@ def test_a_holder_that_takes_no_lock(terminal: Terminal) -> None:
     os.chmod(terminal.path, 0o666)
     number = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
     fcntl.ioctl(number, termios.TIOCEXCL)
-    assert f"{terminal.path}: in use by" in as_another(terminal.path)
+    assert f"{terminal.path}: in use by" in error_for_another_user(terminal.path)
     fcntl.ioctl(number, termios.TIOCNXCL)
-    assert as_another(terminal.path) == "opened"
+    assert error_for_another_user(terminal.path) == "opened"
     os.close(number)
 
 
@@ -243,9 +243,9 @@ def test_closed_to_programs_that_take_no_lock(
     link = opened(terminal.path)
     # The lock alone would say so too; without it there is still TIOCEXCL.
     monkeypatch.setattr("fcntl.flock", lambda *_: None)
-    assert ": in use by" in as_another(terminal.path)
+    assert ": in use by" in error_for_another_user(terminal.path)
     link.close()
-    assert as_another(terminal.path) == "opened"
+    assert error_for_another_user(terminal.path) == "opened"
 
 
 def test_a_killed_holder_leaves_a_pseudo_terminal_open(terminal: Terminal) -> None:
@@ -255,7 +255,7 @@ def test_a_killed_holder_leaves_a_pseudo_terminal_open(terminal: Terminal) -> No
         port_of(terminal.path, baud=BAUD).open()
         os.kill(os.getpid(), 9)
     os.waitpid(pid, 0)
-    assert as_another(terminal.path) == "opened"
+    assert error_for_another_user(terminal.path) == "opened"
 
 
 def test_no_permission(terminal: Terminal) -> None:
@@ -266,7 +266,7 @@ def test_no_permission(terminal: Terminal) -> None:
     else:
         os.chmod(terminal.path, 0)
         advice = f"sudo chmod a+rw {terminal.path}"
-    told = as_another(terminal.path)
+    told = error_for_another_user(terminal.path)
     assert told.startswith(f"{terminal.path}: no permission to open it; ")
     assert advice in told
 
@@ -344,7 +344,7 @@ def test_a_speed_that_no_driver_takes(terminal: Terminal, baud: int) -> None:
         (serial.SerialException("could not open port: PermissionError(13, 'x')"), ": in use by"),
     ],
 )
-def test_what_a_driver_says(
+def test_errors_of_a_driver_are_explained(
     monkeypatch: pytest.MonkeyPatch, failure: Exception, words: str
 ) -> None:
     def fails(self: Any) -> None:
@@ -401,7 +401,7 @@ def test_it_comes_back_under_another_name(
     assert port.describe()["location"] == "1-4"
 
 
-def test_it_has_gone_elsewhere_and_its_name_is_anothers(
+def test_a_device_is_followed_if_its_name_is_taken(
     terminal: Terminal, another: Terminal, plugged: list[PortInfo], opened: Opened
 ) -> None:
     plugged.append(device(terminal.path))
@@ -427,7 +427,7 @@ def test_another_device_is_not_taken_for_it(
     opened(port)
 
 
-def test_what_a_link_points_to_is_taken(
+def test_the_target_of_a_link_is_opened(
     tmp_path: Path, terminal: Terminal, plugged: list[PortInfo], opened: Opened
 ) -> None:
     name = tmp_path / "by-path"
@@ -455,7 +455,7 @@ def test_a_link_that_is_late(
 
 
 @pytest.mark.parametrize("serial_number", [None, "0001"])
-def test_twins_are_told_apart_by_their_sockets(
+def test_identical_adapters_are_distinguished_by_their_sockets(
     terminal: Terminal,
     another: Terminal,
     plugged: list[PortInfo],

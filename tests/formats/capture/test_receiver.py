@@ -61,9 +61,7 @@ def test_every_read_in_its_order(port: Any, receive: Callable[..., PortReader]) 
     assert port.links[0].closed
 
 
-def test_what_the_system_holds_at_the_end_is_read(
-    port: Any, receive: Callable[..., PortReader]
-) -> None:
+def test_buffered_bytes_are_read_at_the_end(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive()
     waiting, go_on = threading.Event(), threading.Event()
 
@@ -206,7 +204,7 @@ def test_a_link_that_breaks_whenever_it_is_opened_is_not_tried_for_ever_at_once(
     assert waits[:7] == [1, 2, 3, 4, 4, 4, 1]
 
 
-def test_what_does_not_come_again_is_at_its_end(
+def test_a_port_that_cannot_reconnect_has_ended(
     port: Any, receive: Callable[..., PortReader]
 ) -> None:
     port.can_reconnect = False
@@ -233,7 +231,9 @@ def test_the_end_of_the_source(port: Any, receive: Callable[..., PortReader]) ->
     assert port.links[0].closed
 
 
-def test_whatever_a_driver_raises_is_told(port: Any, receive: Callable[..., PortReader]) -> None:
+def test_any_exception_of_a_driver_is_reported(
+    port: Any, receive: Callable[..., PortReader]
+) -> None:
     def fail() -> bytes:
         raise RuntimeError("driver gone mad")
 
@@ -266,7 +266,7 @@ def test_a_port_that_cannot_be_opened_again_for_an_unforeseen_reason(
 
 
 @pytest.mark.slow
-def test_when_nobody_takes_reading_waits(port: Any, receive: Callable[..., PortReader]) -> None:
+def test_a_full_queue_pauses_reading(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive(max_waiting_bytes=1000)
     port.send(*[bytes(100)] * 50)
     held = threading.Event()
@@ -329,7 +329,7 @@ def test_overruns_are_counted_once_though_the_device_is_away(
     assert receiver.overruns == Overruns(overrun=7)
 
 
-def test_nobody_counts(port: Any, receive: Callable[..., PortReader]) -> None:
+def test_no_overrun_counters(port: Any, receive: Callable[..., PortReader]) -> None:
     receiver = receive()
     port.send(b"x")
     receiver.stop()

@@ -103,7 +103,7 @@ def test_times_are_of_the_reads_and_ascend(port: Any, start: Any) -> None:
         assert chunk.timestamp.ToNanoseconds() == time_ns
 
 
-def test_what_is_said_late_is_not_dated_before_what_is_written_later(
+def test_late_messages_keep_stamps_ascending(
     port: Any, start: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bytes that arrive while something is said are written after it."""
@@ -123,7 +123,7 @@ def test_what_is_said_late_is_not_dated_before_what_is_written_later(
         time.sleep(0.005)  # the bytes are older than what is said of the clock
 
     running.when_shown = meanwhile
-    running.until_said("wall clock")
+    running.wait_for_message("wall clock")
     (path,) = running.end().paths
     times = [time_ns for _, time_ns, _ in Session.open(path).messages()]
     assert times == sorted(times)
@@ -147,7 +147,7 @@ def test_a_disk_that_is_slow_costs_no_byte(
     running = start(flush_s=0.02)
     port.send(*sent)
     port.settle()
-    running.until_said("the disk is slower than the port")
+    running.wait_for_message("the disk is slower than the port")
     recorded = running.end()
     assert raw_bytes(*recorded.paths) == b"".join(sent)
     assert 0 < recorded.totals.high_water_bytes <= 21_000
@@ -173,7 +173,7 @@ def test_a_disk_that_hangs_does_not_stop_the_reading(
     assert raw_bytes(*recorded.paths) == b"".join(sent)
 
 
-def test_what_is_flushed_is_in_the_file_while_it_grows(port: Any, start: Any) -> None:
+def test_flushed_data_are_in_the_growing_file(port: Any, start: Any) -> None:
     running = start(flush_s=0.01)
     port.send(b"kept")
     port.settle()
@@ -292,7 +292,7 @@ def test_a_device_that_does_not_come_back(port: Any, start: Any, raw_bytes: Any)
     port.refusals = [SourceError("not there") for _ in range(10_000)]
     port.send(b"all there is")
     port.lose()
-    running.until_said("connection lost")
+    running.wait_for_message("connection lost")
     time.sleep(0.05)
     recorded = running.end()
     assert raw_bytes(*recorded.paths) == b"all there is"
@@ -306,7 +306,7 @@ def test_a_silence_while_it_is_away_is_no_second_warning(port: Any, start: Any) 
     running = start(silence_s=0.1)
     port.refusals = [SourceError("not there") for _ in range(10_000)]
     port.lose()
-    running.until_said("connection lost")
+    running.wait_for_message("connection lost")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 10)
     assert running.shown[-1].away_s > 0.1
@@ -372,9 +372,9 @@ def test_a_driver_that_hangs_does_not_hold_the_file(
 
 
 @pytest.mark.slow
-def test_silence_is_told_once_until_something_comes(port: Any, start: Any, log_lines: Any) -> None:
+def test_silence_is_reported_once(port: Any, start: Any, log_lines: Any) -> None:
     running = start(silence_s=0.1)
-    running.until_said("no data received for 0 s")
+    running.wait_for_message("no data received for 0 s")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 8)
     assert len(running.said) == 1
@@ -419,14 +419,14 @@ def test_a_disk_that_was_slow_is_no_silence(
 
 
 @pytest.mark.slow
-def test_bytes_in_which_no_frame_is_found_are_told_of_once(
+def test_bytes_without_frames_are_reported_once(
     port: Any, start: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The wrong device, or the wrong baud."""
     monkeypatch.setattr(recorder, "FRAME_CHECK_S", 0.1)
     running = start("locatk")
     port.send(b"\x80" * 500)
-    running.until_said("no frame of locatk in 500 bytes")
+    running.wait_for_message("no frame of locatk in 500 bytes")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 3)
     recorded = running.end()
@@ -436,7 +436,7 @@ def test_bytes_in_which_no_frame_is_found_are_told_of_once(
 
 
 @pytest.mark.slow
-def test_a_wall_clock_that_is_set_is_told_and_changes_nothing(
+def test_a_set_wall_clock_is_reported_and_changes_nothing(
     port: Any, start: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wall_s = 1_700_000_000.0
@@ -449,7 +449,7 @@ def test_a_wall_clock_that_is_set_is_told_and_changes_nothing(
     port.send(b"before")
     port.settle()
     wall_s -= 3600.0
-    running.until_said("the wall clock was set by -3600.0 s")
+    running.wait_for_message("the wall clock was set by -3600.0 s")
     shown = len(running.shown)
     running.until(lambda: len(running.shown) > shown + 2)
     port.send(b"after")
@@ -623,7 +623,7 @@ def test_the_next_part_cannot_be_begun(port: Any, start: Any, raw_bytes: Any) ->
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
+def test_a_filling_disk_is_reported_then_ends_the_recording(
     port: Any, start: Any, raw_bytes: Any, log_lines: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free = 10_000_000
@@ -631,7 +631,7 @@ def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
     running = start(reserve_bytes=5_000_000)
     sent = pieces(60, size=1000)
     port.send(*sent)
-    running.until_said("the disk will be full in")
+    running.wait_for_message("the disk will be full in")
     free = 4_000_000
     last = pieces(30, size=1000)
     running.when_shown = lambda: port.send(*last)
@@ -645,7 +645,7 @@ def test_a_disk_that_fills_is_told_ahead_and_then_stops_it(
     assert any("the disk will be full in" in line for line in log_lines(*recorded.paths))
 
 
-def test_a_disk_that_nobody_can_ask_is_no_matter(
+def test_a_disk_without_statistics_is_accepted(
     port: Any, start: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(LiveFile, "free", lambda self: None)
@@ -655,7 +655,7 @@ def test_a_disk_that_nobody_can_ask_is_no_matter(
 
 
 @pytest.mark.slow
-def test_a_disk_without_room_leaves_a_whole_file(
+def test_a_disk_without_space_leaves_a_complete_file(
     port: Any, start: Any, raw_bytes: Any, small_disk: Path
 ) -> None:
     running = start(output=small_disk / "run.mcap", reserve_bytes=1)
@@ -673,7 +673,7 @@ def test_a_disk_without_room_leaves_a_whole_file(
     assert recorded.file_bytes == recorded.paths[0].stat().st_size
 
 
-def test_parts_on_a_disk_without_room(
+def test_parts_on_a_disk_without_space(
     port: Any, start: Any, raw_bytes: Any, small_disk: Path
 ) -> None:
     running = start(
@@ -821,7 +821,7 @@ def test_a_port_that_cannot_be_opened_keeps_the_old_file(
     assert (tmp_path / "run.mcap").read_bytes() == b"old"
 
 
-def test_the_old_file_is_replaced_where_that_is_asked_for(
+def test_overwrite_replaces_the_old_file(
     port: Any, start: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
     (tmp_path / "run.mcap").write_bytes(b"old" * 10_000)
@@ -858,8 +858,8 @@ def test_the_output_is_what_is_played(start: Any, tmp_path: Path, port: Any) -> 
 
 
 @pytest.fixture
-def recorded_alone(port: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """``recorded_alone(tell=...)`` records in this thread until the source is at its end."""
+def recorded_inline(port: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """``recorded_inline(tell=...)`` records in this thread until the source is at its end."""
     monkeypatch.setattr(session.ports, "port_of", lambda *args, **more: port)
 
     def run(**talk: Callable[[Any], None]) -> Any:
@@ -870,7 +870,7 @@ def recorded_alone(port: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_interrupt_in_the_middle_finishes_the_file(
-    port: Any, recorded_alone: Any, raw_bytes: Any, tmp_path: Path
+    port: Any, recorded_inline: Any, raw_bytes: Any, tmp_path: Path
 ) -> None:
     """The second Ctrl-C."""
 
@@ -881,7 +881,7 @@ def test_an_interrupt_in_the_middle_finishes_the_file(
     port.lose()
     port.send(b"too")
     with pytest.raises(KeyboardInterrupt):
-        recorded_alone(tell=interrupt)
+        recorded_inline(tell=interrupt)
     assert raw_bytes(tmp_path / "alone.mcap").startswith(b"kept")
     assert all(link.closed for link in port.links)
 

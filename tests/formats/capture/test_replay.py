@@ -118,9 +118,7 @@ def test_silence_until_it_is_due(session: Path, monkeypatch: pytest.MonkeyPatch)
     assert link.read(0.0) == b""
 
 
-def test_who_comes_late_gets_all_that_is_due(
-    session: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_late_reader_gets_all_due_bytes(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     time = FakeTime(monkeypatch)
     link = ReplayPort(f"replay:{session}").open()
     assert link.read(0.0) == PIECES[0]

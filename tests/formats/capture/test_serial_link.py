@@ -176,7 +176,7 @@ def test_an_unplugged_terminal_is_lost(terminal: Terminal) -> None:
             terminal.link.read(1.0)
 
 
-def test_a_second_reader_is_told(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_reader_is_reported(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     # Ready, but another program has taken the bytes before they are read.
     monkeypatch.setattr(serial_link.select, "select", lambda *_: ([0], [], []))
     with pytest.raises(LinkLost, match="another program"):

@@ -243,7 +243,7 @@ def test_after_a_restart_the_ticks_may_be_others() -> None:
 # ---- lines of the device
 
 
-def test_what_the_device_says_goes_to_the_log() -> None:
+def test_messages_of_the_device_are_logged() -> None:
     batch = Batch(
         Stream("log", node="3"),
         np.array([10, 20]),
@@ -259,7 +259,7 @@ def test_what_the_device_says_goes_to_the_log() -> None:
     assert [line.timestamp.ToNanoseconds() for line in lines] == [START_NS, START_NS + 20 * MS]
 
 
-def test_a_kind_that_nobody_knows() -> None:
+def test_an_unknown_kind() -> None:
     batch = Batch(Stream("smell"), np.array([1]), {})
     with pytest.raises(ValueError, match="smell"):
         list(MessageEncoder("red").messages([batch], arrivals_of([1]), START_NS))
@@ -268,7 +268,7 @@ def test_a_kind_that_nobody_knows() -> None:
 # ---- solvers can read them
 
 
-def test_what_was_recorded_reads_like_what_was_written(tmp_path: Path) -> None:
+def test_recorded_streams_equal_written_ones(tmp_path: Path) -> None:
     ends = np.arange(1, 51) * 10
     arrivals, streams = arrivals_of(ends), MessageEncoder("red")
     columns = {kind: values(kind, 50) for kind in STREAMS}

@@ -57,7 +57,7 @@ Found = list[tuple[bytes, int]]
 """Contents and the ends of their frames."""
 
 
-def one_by_one(wire: bytes) -> tuple[Found, Counts]:
+def parse_byte_by_byte(wire: bytes) -> tuple[Found, Counts]:
     """What is right in ``wire``, and what is not, by the plainest code there is."""
     found: Found = []
     counts = Counts(bytes=len(wire))
@@ -156,7 +156,7 @@ def test_what_was_sealed_is_found(sent: list[bytes], cuts: list[int]) -> None:
     wire = b"".join(map(encode_frame, sent))
     found, counts = fed(wire, cuts)
     assert [content for content, _ in found] == sent
-    assert (found, counts) == one_by_one(wire)
+    assert (found, counts) == parse_byte_by_byte(wire)
     assert (counts.bad, counts.skipped) == (0, 0)
 
 
@@ -176,7 +176,7 @@ def test_many_at_once_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -
     wire = b"".join(map(encode_frame, sent))
     found, counts = fed(wire, [100_000, 100_001, 200_000])
     assert [content for content, _ in found] == sent
-    assert (found, counts) == one_by_one(wire)
+    assert (found, counts) == parse_byte_by_byte(wire)
     assert (counts.bad, counts.skipped) == (0, 0)
 
 
@@ -200,7 +200,7 @@ def test_damage_as_one_by_one(monkeypatch: pytest.MonkeyPatch, few: int) -> None
             else:
                 wire.insert(place, int(random.integers(0, 256)))
         whole = fed(bytes(wire), [])
-        assert whole == one_by_one(bytes(wire))
+        assert whole == parse_byte_by_byte(bytes(wire))
         assert {content for content, _ in whole[0]} <= set(sent)
         assert len(whole[0]) >= len(sent) - 2 * faults
         assert fed(bytes(wire), random.integers(0, len(wire), 30).tolist()) == whole
@@ -228,7 +228,7 @@ def test_a_short_content_has_no_long_checksum(longest: int) -> None:
     body = bytes([1]) * (longest - 4)
     for content, crc in ((body, checksum(bytes(1) * 300)), (body + b"\1\1", b"\1\1")):
         wire = cobs_encode(content + crc) + b"\0"
-        assert fed(wire, []) == one_by_one(wire) == ([], Counts(bytes=len(wire)))
+        assert fed(wire, []) == parse_byte_by_byte(wire) == ([], Counts(bytes=len(wire)))
 
 
 def test_memory_is_bounded() -> None:

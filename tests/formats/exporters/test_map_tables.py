@@ -49,11 +49,11 @@ def placed_floors(draw: st.DrawFn) -> FloorMap:
     )
 
 
-def back_from_csv(floor: FloorMap) -> FloorMap:
+def reread_csv(floor: FloorMap) -> FloorMap:
     return loads_csv(dumps_csv(floor), file="map.csv")
 
 
-def back_from_lif(floor: FloorMap) -> FloorMap:
+def reread_lif(floor: FloorMap) -> FloorMap:
     return loads_lif(dumps_lif(floor, STAMP), file="map.json")
 
 
@@ -61,12 +61,12 @@ def back_from_lif(floor: FloorMap) -> FloorMap:
 @settings(max_examples=30, deadline=None)
 @given(placed_floors())
 def test_a_map_as_designed_comes_back(floor: FloorMap) -> None:
-    for back in (back_from_csv(floor), back_from_lif(floor)):
+    for back in (reread_csv(floor), reread_lif(floor)):
         np.testing.assert_array_equal(back.codes, floor.codes)
         assert back.pitch_m == floor.pitch_m
         assert back.origin_m == floor.origin_m
         assert back.built == {}
-    assert back_from_lif(floor).walls == floor.walls
+    assert reread_lif(floor).walls == floor.walls
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_landmarks_as_built_keep_their_positions(floor: FloorMap, data: st.DataO
         for cell in cells
     }
     laid = FloorMap(floor.codes, floor.pitch_m, origin_m=floor.origin_m, built=built)
-    for back, turned in ((back_from_csv(laid), True), (back_from_lif(laid), False)):
+    for back, turned in ((reread_csv(laid), True), (reread_lif(laid), False)):
         np.testing.assert_array_equal(back.codes, laid.codes)
         places = as_built_poses(back)
         # A place that is as near to its cell as 1 um is the cell's.
@@ -214,7 +214,7 @@ def test_the_layout_has_what_lif_requires() -> None:
     assert "r0c0-r1c0" not in {edge["edgeId"] for edge in layout["edges"]}
     named = {node["nodeId"]: node["nodeName"] for node in layout["nodes"]}
     assert named["r0c0"] == "NNNS"
-    assert back_from_lif(FLOOR).name == "hall"
+    assert reread_lif(FLOOR).name == "hall"
 
 
 def test_the_stamp_is_in_utc() -> None:

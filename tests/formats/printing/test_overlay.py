@@ -58,7 +58,7 @@ def shown(source: Any, page: int = 0, scale: float = SCALE) -> NDArray[np.uint8]
     return bitmap.to_numpy()[..., :3]
 
 
-def dots_alone(picture: NDArray[np.uint8], stamps: NDArray[np.uint8]) -> bool:
+def only_dots_are_black(picture: NDArray[np.uint8], stamps: NDArray[np.uint8]) -> bool:
     """Whether pure black is where the stamp has it, and nowhere else."""
     black = picture.max(axis=2) < PURE_BLACK
     return bool(((stamps.max(axis=2) < PURE_BLACK) == black).all())
@@ -162,8 +162,8 @@ def test_the_documents_black_is_gone_and_its_look_is_not(tmp_path: Path) -> None
     assert (made.pages, made.left_black, made.dropped) == (1, {}, 0)
     before, plain, after = shown(document), shown(kept.data), shown(made.data)
     dots = shown(stamp())
-    assert not dots_alone(plain, dots)
-    assert dots_alone(after, dots)
+    assert not only_dots_are_black(plain, dots)
+    assert only_dots_are_black(after, dots)
     # The same shapes in nearly the same colours; where there was nothing there is nothing.
     elsewhere = dots.min(axis=2) == 255
     assert (after[elsewhere & (before.min(axis=2) == 255)] == 255).all()
@@ -259,7 +259,7 @@ def test_everything_that_has_a_colour_is_converted(tmp_path: Path) -> None:
     made = overlay(document, stamp(), strip_black=True)
     assert made.left_black == {}
     dots, before, after = shown(stamp()), shown(document), shown(made.data)
-    assert dots_alone(after, dots)
+    assert only_dots_are_black(after, dots)
     elsewhere = dots.min(axis=2) == 255
     assert np.abs(after.mean(axis=2) - before.mean(axis=2))[elsewhere].max() < 90
     assert np.abs(after.mean(axis=2) - before.mean(axis=2))[elsewhere].mean() < 14
@@ -423,7 +423,7 @@ def test_the_same_input_gives_the_same_small_file(tmp_path: Path) -> None:
         }
     assert len(fonts) == len(badges) == 1
     for number in (0, 19):
-        assert dots_alone(shown(made.data, number), shown(mark, number))
+        assert only_dots_are_black(shown(made.data, number), shown(mark, number))
 
 
 def annotated(path: Path) -> Path:
@@ -450,7 +450,7 @@ def test_comments_lie_below_the_dots(tmp_path: Path) -> None:
     made = overlay(document, stamp(), strip_black=True)
     assert made.dropped == 1
     picture, dots = shown(made.data), shown(stamp())
-    assert dots_alone(picture, dots)
+    assert only_dots_are_black(picture, dots)
     inside = picture[600 - 260 : 600 - 225, 225:300]
     assert (inside.max(axis=2) < 80).mean() > 0.5
     with pikepdf.open(io.BytesIO(made.data)) as pdf:
@@ -473,7 +473,7 @@ def test_masks_keep_their_meaning(tmp_path: Path) -> None:
     made = overlay(document, stamp(), strip_black=True)
     assert made.left_black == {}
     dots, before, after = shown(stamp()), shown(document), shown(made.data)
-    assert dots_alone(after, dots)
+    assert only_dots_are_black(after, dots)
     elsewhere = dots.min(axis=2) == 255
     assert np.abs(after.astype(int) - before)[elsewhere].max() < FAR
 

@@ -440,7 +440,7 @@ def test_the_list_of_a_large_floor_is_whole() -> None:
     assert sum(text.count("[ ]") for text in said) == 930
 
 
-def nothing_drawn_over(pages: tuple[Page, ...], thin: float) -> float:
+def largest_text_overlap(pages: tuple[Page, ...], thin: float) -> float:
     """The most ink of words on that of lines which are not thinner than ``thin``."""
 
     def only(keep: Callable[[Any], bool]) -> Places:
@@ -473,7 +473,7 @@ def nothing_drawn_over(pages: tuple[Page, ...], thin: float) -> float:
 def test_words_are_not_drawn_over(part: str, size: tuple[float, float]) -> None:
     for origin in ((-0.4, 1.0), (-0.18, -0.36)):
         pages = draw_installation_pack(replace(HALL, origin_m=origin), size, parts=(part,)).pages
-        assert nothing_drawn_over(pages[:1], 0.07) < 0.3
+        assert largest_text_overlap(pages[:1], 0.07) < 0.3
 
 
 @pytest.mark.slow
