@@ -73,7 +73,12 @@ def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
         figures = [*figures, *machine_figures()]
     if as_json:
         console.emit_json(
-            {"system": system, "commit": _commit(), "figures": [_entry(f) for f in figures]}
+            {
+                "version": 1,
+                "system": system,
+                "commit": _commit(),
+                "figures": [_entry(f) for f in figures],
+            }
         )
         return
     console.result(_narrow_table([_row(figure) for figure in figures]))
@@ -145,10 +150,12 @@ def _commit() -> str | None:
     """Return the commit of the checkout that contains this module; None if installed."""
     import subprocess
 
-    folder = Path(__file__).resolve().parent
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():  # An installation may be inside another repository.
+        return None
     try:
         process = subprocess.run(
-            ["git", "-C", str(folder), "rev-parse", "--short=12", "HEAD"],
+            ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"],
             capture_output=True,
             text=True,
             timeout=10,

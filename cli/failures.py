@@ -88,9 +88,15 @@ def report(error: BaseException) -> int:
     return 1
 
 
-def describe(error: LocatkError) -> str:
+def describe(error: LocatkError, *, with_file: bool = True) -> str:
     """Return an error with its hint, as one line without the leading ``Error:``."""
-    return _sentences(str(error), error.hint or system_hint(error))
+    problem = str(error) if with_file else error.message
+    return _sentences(problem, error.hint or system_hint(error))
+
+
+def print_error(error: LocatkError) -> None:
+    """Print an error with its hint on stderr."""
+    _print_error(str(error), error.hint or system_hint(error))
 
 
 def _print_error(problem: str, hint: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -153,11 +154,11 @@ def plan_outputs(
 
 def _unique_stems(paths: tuple[Path, ...]) -> list[str]:
     """Return the stem of each file, with a number if an earlier file has the same."""
-    count: Counter[str] = Counter()
-    stems = []
+    stems: list[str] = []
     for path in paths:
-        count[path.stem] += 1
-        stems.append(path.stem + (f"-{count[path.stem]}" if count[path.stem] > 1 else ""))
+        numbered = (f"{path.stem}-{number}" for number in itertools.count(2))
+        names = itertools.chain([path.stem], numbered)
+        stems.append(next(name for name in names if name not in stems))
     return stems
 
 

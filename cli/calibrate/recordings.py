@@ -27,7 +27,8 @@ def skipping_unusable(path: Path, left_out: dict[str, str], *, alone: bool) -> I
         if alone:
             error.file = error.file or str(path)  # Solvers work on arrays.
             raise
-        left_out[str(path)] = error.message
+        position = "" if error.where is None else f"{error.where}: "
+        left_out[str(path)] = position + failures.describe(error, with_file=False)
 
 
 def print_result(text: str, notes: Iterable[str], left_out: Mapping[str, str]) -> None:

@@ -233,7 +233,7 @@ def _solve_one(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> None:
         console.detail(outcome.traceback.rstrip())
         raise _error(outcome)
     _print_outcome(outcome, jobs[0], as_json)
-    losses = _losses(outcome)
+    losses = [f"{outcome.session}: {loss.message}" for loss in outcome.losses]
     for loss in losses[1:]:
         console.warn(loss)
     if losses:
@@ -261,12 +261,13 @@ def _solve_several(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> N
                 progress.erase()
                 for outcome in ready:
                     _print_outcome(outcome, jobs[printed], as_json)
-                    losses = _losses(outcome)
-                    for loss in losses:
-                        console.warn(loss)
-                    is_failure = isinstance(outcome, pipeline.SolveFailure)
-                    failed += is_failure
-                    incomplete += bool(losses) and not is_failure
+                    if isinstance(outcome, pipeline.SolveFailure):
+                        failures.print_error(_error(outcome))
+                        failed += 1
+                    else:
+                        for loss in outcome.losses:
+                            console.warn(f"{outcome.session}: {loss.message}")
+                        incomplete += bool(outcome.losses)
                     printed += 1
                 progress.show(done)
     except KeyboardInterrupt:
@@ -305,15 +306,6 @@ def _print_outcome(outcome: Outcome, job: SolveJob, as_json: bool) -> None:
     console.result(solve_text.text(outcome))
     for note in solve_text.notes(outcome):
         console.say(note)
-
-
-def _losses(outcome: Outcome) -> list[str]:
-    """Return a line for each loss of a session, or its error."""
-    from locatk.formats import pipeline
-
-    if isinstance(outcome, pipeline.SolveFailure):
-        return [failures.describe(_error(outcome))]
-    return [f"{outcome.session}: {loss.message}" for loss in outcome.losses]
 
 
 def _error(failure: SolveFailure) -> LocatkError:

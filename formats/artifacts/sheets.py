@@ -59,7 +59,8 @@ def _sheet_of(values: Values) -> Sheet:
             "heading_deg",
             "Give both for a tile of a floor, otherwise neither",
         )
-    return Sheet(**{**values, "heading_deg": values["heading_deg"] or 0.0})
+    heading_deg = 0.0 if values["heading_deg"] is None else values["heading_deg"]
+    return Sheet(**{**values, "heading_deg": heading_deg})
 
 
 def check_area(values: Values) -> None:

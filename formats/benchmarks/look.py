@@ -28,13 +28,13 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.timing import (
     FIRST_SEED,
-    SINGLE_THREAD,
     run_command,
     time_call,
     time_command,
 )
 from locatk.formats.exporters.tum import write_tum
 from locatk.formats.importers.tum import read_tum
+from locatk.formats.pipeline.execution import SINGLE_THREAD_ENVIRONMENT
 
 LOCATK = (sys.executable, "-m", "locatk.cli")
 
@@ -229,7 +229,7 @@ def _compare_in_process(figure: Figure, evo: Evo, folder: Path, own_s: float) ->
     if evo.python is None:
         return figure.missing("no Python in the folder of evo")
     files = (str(folder / "truth.tum"), str(folder / "estimate.tum"))
-    output = run_command([evo.python, "-c", EVO_IN_PROCESS, *files], SINGLE_THREAD)
+    output = run_command([evo.python, "-c", EVO_IN_PROCESS, *files], SINGLE_THREAD_ENVIRONMENT)
     evo_s = float(output.split()[-1])
     how = (
         f"{evo_s:.1f} s by {own_s:.3f} s: association, se3, APE and RPE of translation and "

@@ -23,18 +23,13 @@ from typing import cast
 import numpy as np
 
 from locatk.formats.benchmarks.figures import Duration, Figure, Workload
+from locatk.formats.pipeline.execution import SINGLE_THREAD_ENVIRONMENT
 
 FIRST_SEED = 20_000
 """First seed of the benchmarks; no parameter is tuned on these seeds."""
 
 SAMPLE_S = 0.05
 """Duration of one sample of a workload; ten time slices of the scheduler."""
-
-SINGLE_THREAD = {
-    f"{library}_NUM_THREADS": "1"
-    for library in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM", "OPENCV_FOR")
-}
-"""Environment of a process that computes with one thread."""
 
 # ---- workloads
 
@@ -176,7 +171,7 @@ def run_single_threaded(call: str) -> list[float]:
     expression = call.removeprefix(f"{module}.")
     code = f"from locatk.formats.benchmarks.{module} import {name}; print(*{expression})"
     command = [sys.executable, "-c", code]
-    return [float(word) for word in run_command(command, SINGLE_THREAD).split()]
+    return [float(word) for word in run_command(command, SINGLE_THREAD_ENVIRONMENT).split()]
 
 
 def time_command(command: Sequence[str], repeats: int = 1, folder: str | None = None) -> Duration:
@@ -188,7 +183,7 @@ def time_command(command: Sequence[str], repeats: int = 1, folder: str | None = 
     for _ in range(repeats):
         factors.append(machine_factor("Python"))
         start = os.times()
-        run_command(command, SINGLE_THREAD | {"MPLBACKEND": "Agg"}, folder)
+        run_command(command, SINGLE_THREAD_ENVIRONMENT | {"MPLBACKEND": "Agg"}, folder)
         end = os.times()
         user_s = end.children_user - start.children_user
         system_s = end.children_system - start.children_system

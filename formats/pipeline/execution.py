@@ -65,7 +65,7 @@ SINGLE_THREAD_ENVIRONMENT = dict.fromkeys(
     ),
     "1",
 )
-"""Environment of workers, of which there is one per core."""
+"""Environment of a process that computes with one thread."""
 
 
 @dataclass(frozen=True)

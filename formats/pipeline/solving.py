@@ -151,6 +151,8 @@ def solve_file(
         overwrite=overwrite,
         resume=resume,
     )
+    if not resume:
+        file_access.check_writable(job.target, overwrite=overwrite)
     outcome = run_job(job)
     if isinstance(outcome, SolveFailure):
         outcome.error.add_note(outcome.traceback)
@@ -205,7 +207,7 @@ def _run_steps(
     facts = {**provenance.source_facts(path), "options_sha256": job.options_sha256}
 
     def existing_solution() -> tuple[Solution | None, bool]:
-        """Return the solution at the target if it has the same origin; is it replaceable?"""
+        """Return the solution at the target if it is of this job, and if it may be replaced."""
         with file_access.local(job.target, scratch) as old:
             return (
                 provenance.same_solution(old, facts),
@@ -213,7 +215,8 @@ def _run_steps(
             )
 
     overwrite, existing, solve_s = job.overwrite, None, None
-    # Without --resume, the output exists only if an attempt wrote it whose worker was lost.
+    # Callers check the output first: if it exists now, an earlier attempt at this job, whose worker
+    # was lost, may have written it.
     if file_access.exists(job.target) and (job.resume or not overwrite):
         existing, is_replaceable = existing_solution()
         if existing is None:

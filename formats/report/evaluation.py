@@ -113,6 +113,8 @@ def _invalid_poses_note(solution: Solution) -> str:
 
 def why_not_evaluated(subject: Subject) -> str:
     """Return a sentence on why there are no errors."""
+    if subject.obstacle:
+        return f"{subject.obstacle} There are no errors."
     if subject.truth:
         if is_unscaled(subject.solution):
             return (

@@ -38,6 +38,8 @@ class Subject:
         Reference poses; empty if there are none.
     evaluation : Evaluation or None
         Errors with respect to the truth.
+    obstacle : str
+        Problem with the truth for which there is no evaluation; empty without any.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Subject:
     session: Session | None = None
     truth: tuple[Trajectory, ...] = ()
     evaluation: Evaluation | None = None
+    obstacle: str = ""
 
 
 def load_subject(
@@ -87,12 +90,21 @@ def load_subject(
         recording: Session | None = _open_session(session, solution)
     else:
         recording = _find_session(Path(path), facts, solution)
-    if truth is not None:
-        reference = tuple(trajectories.read(Path(truth), role="truth"))
-    else:
-        reference = () if recording is None else _session_truth(recording)
-    evaluation = _evaluate(solution, reference, align, offset_s)
-    return Subject(Path(path).name, solution, facts, recording, reference, evaluation)
+    reference = () if truth is None else tuple(trajectories.read(Path(truth), role="truth"))
+    # The truth of the session may be damaged: the report is on the solution.
+    evaluation, obstacle = None, ""
+    try:
+        if truth is None and recording is not None:
+            reference = tuple(read_truth(recording))
+    except LocatkError as error:
+        obstacle = f"The truth cannot be read: {error.message}."
+    try:
+        evaluation = _evaluate(solution, reference, align, offset_s)
+    except InputError as error:
+        if align != "none" or offset_s != 0.0:
+            raise
+        obstacle = f"The truth cannot be used: {error.message}."
+    return Subject(Path(path).name, solution, facts, recording, reference, evaluation, obstacle)
 
 
 def _sort_devices(solution: Solution) -> Solution:
@@ -137,30 +149,17 @@ def _find_session(path: Path, facts: Mapping[str, str], solution: Solution) -> S
     return session if is_session and overlap_in_time(session, solution) else None
 
 
-def _session_truth(session: Session) -> tuple[Trajectory, ...]:
-    """Return the truth of a session, none if it is damaged: the report is on the solution."""
-    try:
-        return tuple(read_truth(session))
-    except LocatkError:
-        return ()
-
-
 def _evaluate(
     solution: Solution,
     truth: tuple[Trajectory, ...],
     align: str,
     offset_s: float | Literal["auto"],
 ) -> Evaluation | None:
-    """Evaluate the solution; None if no pose has truth, or lengths cannot be compared."""
+    """Evaluate the solution; None if no device has truth, or lengths cannot be compared."""
     if is_unscaled(solution) and not align.startswith("sim"):
         return None
     solved = [t for t in map(with_finite_positions, solution.trajectories) if len(t)]
     pairs, _ = pair_devices(solved, [t for t in map(with_finite_positions, truth) if len(t)])
     if not pairs:
         return None
-    try:
-        return evaluate(pairs, EvaluationOptions(align=align, offset_s=offset_s))
-    except InputError:
-        if align == "none" and offset_s == 0.0:
-            return None
-        raise
+    return evaluate(pairs, EvaluationOptions(align=align, offset_s=offset_s))

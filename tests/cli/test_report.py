@@ -92,6 +92,8 @@ def test_names_of_outputs() -> None:
         None,
         [[Path("x/r-a.svg")], [Path("x/r-a-2.svg")]],
     )
+    _, pictures = plan_outputs((one, two, Path("a-2.mcap")), Path("r.svg"), [])
+    assert pictures == [[Path("r-a.svg")], [Path("r-a-2.svg")], [Path("r-a-2-2.svg")]]
 
 
 @pytest.mark.slow

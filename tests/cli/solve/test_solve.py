@@ -123,7 +123,13 @@ def test_one_bad_session_does_not_stop_the_others(locatk, record, tmp_path: Path
     entries = lines(result)
     assert [entry.get("error") for entry in entries] == [None, "one robot standing still", None]
     assert "\nIncomplete: 1 of 3 sessions could not be solved.\n" in result.stderr
-    assert f"Warning: {sessions[1]}: one robot standing still. Hint: Drive" in result.stderr
+    assert f"Error: {sessions[1]}: one robot standing still. Hint: Drive" in result.stderr
+
+
+def test_quiet_batches_name_failed_sessions(locatk, record, tmp_path: Path) -> None:
+    sessions = [record(tmp_path / f"{name}.mcap") for name in ("one", "still")]
+    result = locatk("solve", *sessions, "-o", tmp_path / "out", "-q")
+    assert f"Error: {sessions[1]}: one robot standing still." in result.stderr
 
 
 def test_all_bad_sessions_are_a_failure(locatk, record, tmp_path: Path) -> None:
@@ -132,7 +138,7 @@ def test_all_bad_sessions_are_a_failure(locatk, record, tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert result.stderr.endswith("Error: none of the 2 sessions could be solved.\n")
     for session in sessions:
-        assert result.stderr.count(f"Warning: {session}: one robot standing still.") == 1
+        assert result.stderr.count(f"Error: {session}: one robot standing still.") == 1
     one = locatk("solve", sessions[0], "-o", tmp_path / "one.mcap")
     assert one.exit_code == 1
     assert one.stderr == (

@@ -168,7 +168,7 @@ def test_json_has_the_scaled_target_and_the_machine_factor(
     result = locatk("bench", "lighthouse", "--data", tmp_path, "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
-    assert report["system"] == "lighthouse"
+    assert (report["version"], report["system"]) == (1, "lighthouse")
     assert [figure["name"] for figure in report["figures"]] == [
         *NAMES_OF_EACH_LENGTH,
         "machine factor, numpy",

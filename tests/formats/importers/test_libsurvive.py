@@ -23,12 +23,12 @@ from locatk.core.lighthouse.demodulation.ootx import encode_frame
 from locatk.core.lighthouse.demodulation.tracker_syncs import fit_rotor
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.libsurvive import rec_file
 from locatk.formats.importers.libsurvive.device import read_stored_calibrations
 from locatk.formats.importers.libsurvive.rec_file import read_rec_file
 from locatk.formats.importers.libsurvive.recording import read_libsurvive
 from locatk.formats.importers.libsurvive.sweeps import assign_planes, read_device_sweeps
-from locatk.formats.importers.lighthouse import ImportedSession
 
 PUBLISHED = "lighthouse/libsurvive/tracker-cal-attempt.rec.gz"
 

@@ -85,11 +85,29 @@ def test_a_session_is_solved_into_a_report(record: Callable[[str], Path], tmp_pa
     ]
     assert not report.is_resumed
     assert read_solution(output).poses == 3
-    with pytest.raises(OutputExistsError):
-        solve_file(session)
+    for request in (None, SolveRequest(method="paper")):
+        with pytest.raises(OutputExistsError):
+            solve_file(session, request=request)
     again = solve_file(session, request=SolveRequest(method="paper"), resume=True)
     assert (again.is_resumed, again.poses, again.losses) == (True, 3, report.losses)
     assert solve_file(session, overwrite=True).method == "bundle"
+
+
+def test_a_file_that_appears_meanwhile_is_neither_replaced_nor_taken_for_the_result(
+    record: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "solved.mcap"
+    known = systems.SYSTEMS["lighthouse"]
+
+    def solve(session: Session, request: SolveRequest) -> SolvedSession:
+        output.write_text("precious")
+        return known(session, request)
+
+    session = record("run")
+    monkeypatch.setitem(systems.SYSTEMS, "lighthouse", solve)
+    with pytest.raises(OutputExistsError):
+        solve_file(session, output)
+    assert output.read_text() == "precious"
 
 
 def test_a_failure_is_an_error_of_the_library(record: Callable[[str], Path]) -> None:

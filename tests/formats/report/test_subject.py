@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from locatk.core.errors import FormatError, InputError, MissingDataError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.tum import write_tum
+from locatk.formats.report.evaluation import why_not_evaluated
 from locatk.formats.report.subject import _find_session, load_subject
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.solutions import write_solution
@@ -77,6 +79,28 @@ def test_truth_is_read_from_the_session_in_the_same_folder(session: Path, tmp_pa
     assert subject.facts["source"] == "run.mcap"
     assert subject.evaluation is not None
     assert subject.evaluation.median == pytest.approx(2e-3)
+
+
+def test_damaged_truth_is_reported(session: Path, tmp_path: Path) -> None:
+    content = bytearray(session.read_bytes())
+    with session.open("rb") as stream:
+        (*_, chunk) = make_reader(stream).get_summary().chunk_indexes  # type: ignore[union-attr]
+    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    session.write_bytes(content)
+    subject = load_subject(solved(tmp_path / "solved.mcap"))
+    assert (subject.truth, subject.evaluation) == ((), None)
+    assert "cannot be read" in why_not_evaluated(subject)
+
+
+def test_truth_that_cannot_be_used_is_reported(tmp_path: Path) -> None:
+    record(tmp_path / "run.mcap")
+    far = track()
+    far = replace(far, position=far.position + 1e150)
+    path = tmp_path / "far.tum"
+    write_tum(path, far)
+    subject = load_subject(solved(tmp_path / "solved.mcap"), truth=path)
+    assert subject.evaluation is None
+    assert "The truth cannot be used" in why_not_evaluated(subject)
 
 
 def test_without_session_there_is_no_truth(tmp_path: Path) -> None:
