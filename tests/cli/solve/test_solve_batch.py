@@ -512,7 +512,7 @@ def test_a_cluster_loses_nothing_when_a_worker_is_killed(
     assert [tmp_path / entry["session"] for entry in told] == sorted(sessions)
     assert [entry["session"] for entry in told if "error" in entry] == ["day/still.mcap"]
     assert stderr == (
-        "Warning: day/still.mcap: one robot standing still. Hint: Drive it around.\n"
+        "Error: day/still.mcap: one robot standing still. Hint: Drive it around.\n"
         "Incomplete: 1 of 7 sessions could not be solved.\n"
     )
     assert calls(sonar).count("slow") == 2

