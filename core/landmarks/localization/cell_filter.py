@@ -1,29 +1,50 @@
-"""Identification of the visited cells of a map: a Bayes filter over cell and heading.
+"""Identification of the visited cells of a map: a hidden Markov model over cell and heading.
 
 The paper compares three patterns in an L with the map (section 4.2). This filter uses every visit
-with the probabilities of all its hypotheses. A landmark may be misread or missing, and odometry
-determines how many cells there are between two visits. The state is a cell and a heading in
-quarter turns, for each hypothesis of the visit, or a position outside of the map. A forward and a
-backward pass give the probabilities given all visits (Rabiner, Proc. IEEE 77 (1989) 257).
+with the probabilities of all its hypotheses. The state of a robot is a cell and a heading in
+quarter turns, for each hypothesis of a visit. Between two visits it changes by what odometry says
+(:mod:`.cell_steps`). Besides:
+
+- a landmark may be misread, may have been missed, or may differ from the map;
+- a wheel may slip, so that odometry is wrong by any distance and angle;
+- a visit may be an *outlier*, whose pose and code are both wrong. The state then stays that of an
+  earlier visit, and the odometry of the next step begins there;
+- the robot may be carried to any other cell, more than once;
+- it may drive off the map, and return.
+
+A forward and a backward pass give the probabilities given all visits (Rabiner, Proc. IEEE 77
+(1989) 257). Beliefs are sparse: states whose probability is negligible are dropped. The backward
+pass runs over blocks of visits, each with the visits that follow it, so that memory does not grow
+with the length of a recording.
+
+Whether the robot is on this floor at all is judged by the same evidence
+(:attr:`CellIdentification.map_probability`): the readings are compared with those of any other
+floor that has the same fraction of each code.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.detection.hypotheses import DetectedVisit, Hypothesis, VisitHypotheses
 from locatk.core.landmarks.detection.trace import OdometryDrift
-from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, rotated
+from locatk.core.landmarks.landmark import CODE_COUNT, rotated
+from locatk.core.landmarks.localization.cell_steps import (
+    MIN_ODOMETRY_LIKELIHOOD,
+    CellSteps,
+    NumberedHypothesis,
+    steps_between,
+)
 from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_code, as_built_codes
 from locatk.core.landmarks.preprocessing import VisitSegment
 
 Array = NDArray[np.float64]
+States = NDArray[np.int64]
 
 MIN_CELL_PROBABILITY = 0.8
 """Posterior probability of a cell of the map from which on it is reported."""
@@ -37,32 +58,43 @@ UNMAPPED_LANDMARK_PROBABILITY = 1e-3
 OUTSIDE_LANDMARK_PROBABILITY = 0.01
 """Probability of a landmark in a cell outside of the map."""
 
-KIDNAP_PROBABILITY = 1e-7
-"""Probability that a robot was carried to any other cell between two visits."""
+CARRIED_PROBABILITY = 1e-6
+"""Probability that a robot was carried to any other cell between two visits, times the density of
+its pose there relative to that of a pose by odometry (about 1e-4)."""
 
 START_OUTSIDE_PROBABILITY = 1e-4
-"""Probability that a recording begins outside of the map: it is of another floor, or all fields
-have the opposite sign."""
+"""Probability that a recording begins outside of the map."""
 
 RETURN_PROBABILITY = 1e-2
 """Probability of entering the map between two visits, from outside of it."""
 
+OTHER_FLOOR_PROBABILITY = 0.5
+"""Probability, before any reading, that the recording is of another floor: nothing is assumed."""
+
 MISSED_LANDMARK_PROBABILITY = 0.02
 """Probability of passing a landmark without a visit."""
 
-LANDMARK_POSITION_SIGMA_M = 3e-3
-"""Standard deviation of the position of a landmark, in addition to that of odometry."""
+OUTLIER_PROBABILITY = 1e-5
+"""Probability that neither pose nor code of a visit can be used (about 1 %), times the density of
+its pose relative to that of a pose that odometry confirms (about 1e-3)."""
 
-HEADING_SIGMA_RAD = math.radians(2)
-"""Standard deviation of the difference of two landmarks' headings, in addition to odometry's."""
+MAX_SUCCESSIVE_OUTLIERS = 3
+"""Outliers in a row after which the position is lost."""
 
 MIN_HYPOTHESIS_PROBABILITY = 1e-4
 """Probability below which a hypothesis of a visit is not followed."""
 
 MAX_FOLLOWED_HYPOTHESES = 6
 
-MAX_STEP_LOG_ODDS = 9.0
-"""Log likelihood behind a perfect fit at which a step of whole cells is dropped."""
+MIN_SLIP_BELIEF = 1e-3
+"""Probability of a state from which on slips are followed: there are 64 steps after each."""
+
+MIN_BELIEF = 1e-16
+"""Probability of a state below which it is dropped."""
+
+BLOCK_VISITS, LOOKAHEAD_VISITS = 64, 24
+"""Visits for which the backward pass runs at once, and those after them that it uses: the
+readings of a dozen landmarks determine a cell beyond doubt."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +112,10 @@ class CellEstimate:
         Of this cell and heading, given all visits.
     filtered_probability : float
         Of this cell and heading, given this visit and the previous ones.
+    outlier_probability : float
+        Probability that neither pose nor code of the visit can be used, given all visits.
+    misread_probability : float
+        Probability that the code differs from that of the map, if the cell is right.
     """
 
     cell: Cell
@@ -87,6 +123,24 @@ class CellEstimate:
     hypothesis: int
     probability: float
     filtered_probability: float
+    outlier_probability: float = 0.0
+    misread_probability: float = 0.0
+
+
+@dataclass(frozen=True)
+class CellIdentification:
+    """Cells of the visits of one robot.
+
+    Attributes
+    ----------
+    estimates : list of CellEstimate
+        The most probable cell and heading of each visit, if the robot is on this floor.
+    map_probability : float
+        Probability that the robot is on this floor and not on any other.
+    """
+
+    estimates: list[CellEstimate]
+    map_probability: float
 
 
 @dataclass(frozen=True)
@@ -129,21 +183,27 @@ class IdentifiedVisit:
 
 def identify_visits(
     visits: Sequence[DetectedVisit], floor: FloorMap | None, *, misread: float, drift: OdometryDrift
-) -> list[IdentifiedVisit]:
+) -> tuple[list[IdentifiedVisit], float]:
     """Identify the cells of all visits of one robot; arguments as of :func:`identify_cells`.
 
     Refused visits are not used. Without a map no visit has a cell.
+
+    Returns
+    -------
+    visits : list of IdentifiedVisit
+    map_probability : float
+        See :class:`CellIdentification`.
     """
     identified = [IdentifiedVisit(visit.segment, visit.hypotheses) for visit in visits]
     if floor is None:
-        return identified
+        return identified, 0.0
     used = [n for n, visit in enumerate(visits) if not visit.hypotheses.refused]
-    estimates = identify_cells(
+    result = identify_cells(
         [visits[n].hypotheses for n in used], floor, misread=misread, drift=drift
     )
-    for n, estimate in zip(used, estimates, strict=True):
+    for n, estimate in zip(used, result.estimates, strict=True):
         identified[n] = replace(identified[n], estimate=estimate)
-    return identified
+    return identified, result.map_probability
 
 
 def select_visits_on_map(
@@ -161,7 +221,7 @@ def select_visits_on_map(
 
 def identify_cells(
     visits: Sequence[VisitHypotheses], floor: FloorMap, *, misread: float, drift: OdometryDrift
-) -> list[CellEstimate]:
+) -> CellIdentification:
     """Identify the cells of the visits of one robot.
 
     Parameters
@@ -173,328 +233,464 @@ def identify_cells(
         Probability that a landmark differs from the map or is misread.
     drift : OdometryDrift
         Of the odometry between visits.
-
-    Returns
-    -------
-    list of CellEstimate
-        The most probable cell and heading of each visit.
     """
     if not visits:
-        return []
-    followed = [_followed_hypotheses(visit) for visit in visits]
-    steps = [
-        _steps_between(first, second, hypotheses, next_hypotheses, floor.pitch_m, drift)
-        for (first, second), (hypotheses, next_hypotheses) in zip(
-            pairwise(visits), pairwise(followed), strict=True
-        )
-    ]
-    codes = as_built_codes(floor)
-    map_likelihood = [_map_likelihood(hypotheses, codes, misread) for hypotheses in followed]
-    likelihood = list(map_likelihood)
-    outside_likelihood = [sum(one.probability for _, one in h) / CODE_COUNT for h in followed]
-    for number, code in _repeated_visits(followed, steps).items():
-        # A repeated visit adds no evidence of the cell: it is the same landmark, whether it
-        # agrees with the map or not.
-        of_code = _code_likelihood(followed[number], code, misread)
-        shape = likelihood[number].shape
-        likelihood[number] = np.broadcast_to(of_code[:, None, None, None], shape)
-        outside_likelihood[number] = float(of_code.sum())
-    miss = miss_likelihood(floor)
+        return CellIdentification([], 0.0)
+    model = CellModel(visits, floor, misread=misread, drift=drift)
+    estimates: list[CellEstimate] = []
+    log_map, log_other = 0.0, 0.0
+    other = OtherFloor(model)
+    beliefs: list[Belief] = []
+    for k in range(len(visits)):
+        belief, evidence = model.first() if k == 0 else model.advance(beliefs[-1], k)
+        beliefs.append(belief)
+        log_map += math.log(evidence)
+        log_other += math.log(other.advance(k))
+        if len(beliefs) == BLOCK_VISITS + LOOKAHEAD_VISITS and k + 1 < len(visits):
+            estimates += model.estimates(beliefs)[:BLOCK_VISITS]
+            beliefs = beliefs[BLOCK_VISITS:]
+    estimates += model.estimates(beliefs)
+    odds = math.log(OTHER_FLOOR_PROBABILITY / (1 - OTHER_FLOOR_PROBABILITY)) + log_other - log_map
+    return CellIdentification(estimates, 1 / (1 + math.exp(min(odds, 700.0))))
 
-    prior = (1 - START_OUTSIDE_PROBABILITY) / (4 * miss.size)
-    start_outside = START_OUTSIDE_PROBABILITY * outside_likelihood[0]
-    forward = [_normalized(likelihood[0] * prior, start_outside)]
-    for step, now, now_outside in zip(steps, likelihood[1:], outside_likelihood[1:], strict=True):
-        belief, outside = predict(*forward[-1], step, len(now), miss)
-        forward.append(_normalized(belief * now, outside * now_outside))
-    backward = [(np.ones_like(likelihood[-1]), 1.0)]
-    for k in range(len(steps) - 1, -1, -1):
-        belief, outside = backward[-1]
-        earlier = predict_backward(
-            belief * likelihood[k + 1],
-            outside * outside_likelihood[k + 1],
-            steps[k],
-            len(followed[k]),
-            miss,
-        )
-        backward.append(_normalized(*earlier))
 
-    estimates = []
-    for hypotheses, own, (past, past_outside), (future, future_outside) in zip(
-        followed, map_likelihood, forward, reversed(backward), strict=True
-    ):
-        posterior, _ = _normalized(past * future, past_outside * future_outside)
-        by_state = posterior.sum(axis=0)
-        quarters, row, column = np.unravel_index(np.argmax(by_state), by_state.shape)
-        # The map contributes to the choice of the hypothesis of a repeated visit as well.
-        number = int(np.argmax((posterior * own)[:, quarters, row, column]))
-        estimates.append(
-            CellEstimate(
-                cell=(int(row) - PAD_CELLS, int(column) - PAD_CELLS),
-                quarters=int(quarters),
-                hypothesis=hypotheses[number][0],
-                probability=float(by_state[quarters, row, column]),
-                filtered_probability=float(past[:, quarters, row, column].sum()),
+# ---- beliefs
+
+
+@dataclass(frozen=True)
+class Component:
+    """States of a robot that have one hypothesis of one visit in common.
+
+    Attributes
+    ----------
+    visit, hypothesis : int
+        The last visit that is no outlier, and its hypothesis by order among the followed ones.
+    states : (n,) int64 ndarray
+        Ascending, see :meth:`CellModel.cells_of`.
+    probability : (n,) ndarray
+    """
+
+    visit: int
+    hypothesis: int
+    states: States
+    probability: Array
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Belief after one visit.
+
+    Attributes
+    ----------
+    visit : int
+    components : list of Component
+        First those of this visit; then those of earlier ones, if this one is an outlier.
+    outside : float
+        Probability of being outside of the map.
+    """
+
+    visit: int
+    components: list[Component]
+    outside: float
+
+
+class CellModel:
+    """Likelihoods of visits and of the steps between them, on one map.
+
+    Parameters are those of :func:`identify_cells`.
+    """
+
+    def __init__(
+        self,
+        visits: Sequence[VisitHypotheses],
+        floor: FloorMap,
+        *,
+        misread: float,
+        drift: OdometryDrift,
+    ) -> None:
+        self.visits, self.pitch_m, self.drift = visits, floor.pitch_m, drift
+        self.misread = misread
+        self.followed = [_followed_hypotheses(visit) for visit in visits]
+        codes = np.pad(as_built_codes(floor), PAD_CELLS, constant_values=HOLE_CODE)
+        self.shape = codes.shape
+        self.cell_count = codes.size
+        self.state_count = 4 * codes.size
+        # Code that is read in each state; holes have codes of their own, by their likelihood.
+        is_inside = np.pad(np.ones(floor.shape, bool), PAD_CELLS)
+        read = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
+        empty = np.where(is_inside, CODE_COUNT, CODE_COUNT + 1)
+        self.read_code = np.where(codes == HOLE_CODE, empty, read).reshape(-1)
+        self.miss = miss_likelihood(floor)
+        self.repeated = self._repeated_visits()
+        self._steps: dict[tuple[int, int, int, int], CellSteps] = {}
+
+    def cells_of(self, states: States) -> tuple[States, States, States]:
+        """Return quarters, row and column of states, on the map with its pad."""
+        quarters, cell = np.divmod(states, self.cell_count)
+        row, column = np.divmod(cell, self.shape[1])
+        return quarters, row, column
+
+    def first(self) -> tuple[Belief, float]:
+        """Return the belief after the first visit, and the probability of its readings."""
+        prior = (1 - START_OUTSIDE_PROBABILITY) / self.state_count
+        predicted = [np.full(self.state_count, prior) for _ in self.followed[0]]
+        return self._observed(0, predicted, START_OUTSIDE_PROBABILITY, [])
+
+    def advance(self, belief: Belief, visit: int) -> tuple[Belief, float]:
+        """Return the belief after the next visit, and the probability of its readings."""
+        followed = self.followed[visit]
+        total = sum(float(each.probability.sum()) for each in belief.components)
+        anywhere = CARRIED_PROBABILITY * total + RETURN_PROBABILITY * belief.outside
+        predicted = [np.full(self.state_count, anywhere / self.state_count) for _ in followed]
+        outside = (1 - RETURN_PROBABILITY) * belief.outside + CARRIED_PROBABILITY * total
+        for component in belief.components:
+            for end in range(len(followed)):
+                for states, weight, arrival in self._transitions(component, visit, end):
+                    leaving = component.probability[states][:, None] * weight
+                    is_on_map = arrival >= 0
+                    predicted[end] += np.bincount(
+                        arrival[is_on_map], leaving[is_on_map], minlength=self.state_count
+                    )
+                    outside += followed[end][1].probability * float(leaving[~is_on_map].sum())
+        carried = [
+            replace(each, probability=each.probability * OUTLIER_PROBABILITY)
+            for each in belief.components
+            if visit - each.visit <= MAX_SUCCESSIVE_OUTLIERS
+        ]
+        return self._observed(visit, predicted, outside, carried)
+
+    def _observed(
+        self, visit: int, predicted: list[Array], outside: float, outliers: list[Component]
+    ) -> tuple[Belief, float]:
+        """Apply the readings of a visit to a predicted belief; drop negligible states."""
+        any_code = self.any_code_likelihood(visit)
+        updated = [
+            each * self.likelihood(visit, number) * (1 - OUTLIER_PROBABILITY)
+            for number, each in enumerate(predicted)
+        ]
+        outliers = [replace(each, probability=each.probability * any_code) for each in outliers]
+        outside *= any_code
+        total = outside + sum(float(each.sum()) for each in updated)
+        total += sum(float(each.probability.sum()) for each in outliers)
+        components = []
+        for number, each in enumerate(updated):
+            states = np.flatnonzero(each > MIN_BELIEF * total)
+            components.append(Component(visit, number, states, each[states] / total))
+        for component in outliers:
+            kept = component.probability > MIN_BELIEF * total
+            if kept.any():
+                components.append(
+                    replace(
+                        component,
+                        states=component.states[kept],
+                        probability=component.probability[kept] / total,
+                    )
+                )
+        return Belief(visit, components, outside / total), total
+
+    def likelihood(self, visit: int, number: int) -> Array:
+        """Return the likelihood of one hypothesis in each state; one number if it is the same."""
+        hypothesis = self.followed[visit][number][1]
+        other = self.misread / (CODE_COUNT - 1)
+        known_code = self.repeated.get(visit)
+        if known_code is not None:
+            # A repeated visit adds no evidence of the cell: it is the same landmark, whether it
+            # agrees with the map or not.
+            of_code = 1 - self.misread if hypothesis.code == known_code else other
+            return np.asarray(hypothesis.probability * of_code)
+        return hypothesis.probability * self._code_likelihood(hypothesis.code)[self.read_code]
+
+    def map_likelihood(self, visit: int, number: int, states: States) -> Array:
+        """Return the likelihood of one hypothesis in some states, of repeated visits as well."""
+        hypothesis = self.followed[visit][number][1]
+        of_code = self._code_likelihood(hypothesis.code)
+        return np.asarray(hypothesis.probability * of_code[self.read_code[states]])
+
+    def _code_likelihood(self, code: int) -> Array:
+        """Return the likelihood of a code by the one on the map, with those of empty cells."""
+        table = np.full(CODE_COUNT + 2, self.misread / (CODE_COUNT - 1))
+        table[code] = 1 - self.misread
+        table[CODE_COUNT] = UNMAPPED_LANDMARK_PROBABILITY / CODE_COUNT
+        table[CODE_COUNT + 1] = OUTSIDE_LANDMARK_PROBABILITY / CODE_COUNT
+        return table
+
+    def any_code_likelihood(self, visit: int) -> float:
+        """Return the likelihood of a visit if its code says nothing of the cell."""
+        if visit in self.repeated:
+            return float(sum(self.likelihood(visit, n) for n in range(len(self.followed[visit]))))
+        return sum(one.probability for _, one in self.followed[visit]) / CODE_COUNT
+
+    # ---- steps
+
+    def steps(self, first: int, start: int, visit: int, end: int) -> CellSteps:
+        """Return the steps from one hypothesis of a visit to one of a later visit."""
+        key = first, start, visit, end
+        if key not in self._steps:
+            self._steps = {k: v for k, v in self._steps.items() if k[2] >= visit - 2}
+            self._steps[key] = steps_between(
+                self.visits[first],
+                self.visits[visit],
+                self.followed[first][start][1],
+                self.followed[visit][end][1],
+                pitch_m=self.pitch_m,
+                drift=self.drift,
             )
+        return self._steps[key]
+
+    def _transitions(
+        self, component: Component, visit: int, end: int
+    ) -> Iterator[tuple[States, Array, States]]:
+        """Yield where the states of a component lead to.
+
+        Slips are followed only from probable states: there are many of them.
+
+        Yields
+        ------
+        rows : (n,) int64 ndarray
+            Indices of states of the component.
+        weight : (n, steps) ndarray
+            Likelihood of each step.
+        arrival : (n, steps) int64 ndarray
+            State after the step; -1 outside of the map.
+        """
+        steps = self.steps(component.visit, component.hypothesis, visit, end)
+        confirmed = steps.that_odometry_confirms()
+        is_probable = component.probability > MIN_SLIP_BELIEF
+        for followed, rows in (
+            (steps, np.flatnonzero(is_probable)),
+            (confirmed, np.flatnonzero(~is_probable)),
+        ):
+            if len(followed) and len(rows):
+                yield rows, *self._arrivals(component.states[rows], followed)
+
+    def _arrivals(self, states: States, steps: CellSteps) -> tuple[Array, States]:
+        """Return likelihood and state (n, steps) after steps; the state is -1 off the map."""
+        quarters, row, column = (each[:, None] for each in self.cells_of(states))
+        x, y = steps.cells.T
+        # Rotated by quarter turns from the frame of the hypothesis to the map.
+        columns = np.stack([x, -y, -x, y])[quarters[:, 0]]
+        rows = np.stack([y, x, -y, -x])[quarters[:, 0]]
+        new_row, new_column = row + rows, column + columns
+        height, width = self.shape
+        is_on_map = (new_row >= 0) & (new_row < height) & (new_column >= 0) & (new_column < width)
+        arrival = ((quarters + steps.quarters) % 4 * height + new_row) * width + new_column
+        weight = steps.likelihood * self._pass_likelihood(row, column, rows, columns)
+        return weight, np.where(is_on_map, arrival, -1)
+
+    def _pass_likelihood(self, row: States, column: States, rows: States, columns: States) -> Array:
+        """Return the likelihood (n, steps) of no visit between both ends of a straight path."""
+        likelihood = np.ones(rows.shape)
+        length = np.maximum(np.abs(rows), np.abs(columns))
+        is_straight = (rows == 0) | (columns == 0)
+        height, width = self.shape
+        for k in range(1, int(length[is_straight].max(initial=0))):
+            between_row = row + np.sign(rows) * k
+            between_column = column + np.sign(columns) * k
+            is_between = is_straight & (k < length)
+            is_between &= (between_row >= 0) & (between_row < height)
+            is_between &= (between_column >= 0) & (between_column < width)
+            likelihood[is_between] *= self.miss[between_row[is_between], between_column[is_between]]
+        return likelihood
+
+    def _repeated_visits(self) -> dict[int, int]:
+        """Find visits that repeat what an earlier or later visit to the same landmark read.
+
+        The visits to one landmark follow from the most likely steps.
+
+        Returns
+        -------
+        dict of int to int
+            Number of a visit to the code of the landmark, in the frame of the visit's most
+            probable hypothesis.
+        """
+        # Chain of visits that odometry connects, cell in the frame of its first visit, heading.
+        path: list[tuple[int, tuple[int, int], int]] = [(0, (0, 0), 0)]
+        for number in range(1, len(self.visits)):
+            steps = steps_between(
+                self.visits[number - 1],
+                self.visits[number],
+                self.followed[number - 1][0][1],
+                self.followed[number][0][1],
+                pitch_m=self.pitch_m,
+                drift=self.drift,
+            )
+            chain, (x, y), heading = path[-1]
+            if len(steps) and steps.odometry_likelihood[0] > MIN_ODOMETRY_LIKELIHOOD:
+                dx, dy = steps.cells[0]
+                for _ in range(heading):
+                    dx, dy = -dy, dx
+                heading = int(heading + steps.quarters[0]) % 4
+                path.append((chain, (x + int(dx), y + int(dy)), heading))
+            else:
+                path.append((number, (0, 0), 0))
+        visits_of: dict[tuple[int, tuple[int, int]], list[int]] = {}
+        for number, (chain, cell, _) in enumerate(path):
+            visits_of.setdefault((chain, cell), []).append(number)
+        repeated: dict[int, int] = {}
+        for numbers in visits_of.values():
+            best = max(numbers, key=lambda n: self.followed[n][0][1].probability)
+            code = int(rotated(self.followed[best][0][1].code, path[best][2]))
+            for n in numbers:
+                code_here = int(rotated(code, -path[n][2]))
+                # A different reading is evidence: the path may be wrong, after a slip.
+                if n != best and self.followed[n][0][1].code == code_here:
+                    repeated[n] = code_here
+        return repeated
+
+    # ---- backward pass
+
+    def estimates(self, beliefs: Sequence[Belief]) -> list[CellEstimate]:
+        """Return the estimates of successive visits from the beliefs after each of them."""
+        last = beliefs[-1]
+        backward = [np.ones(len(each.states)) for each in last.components]
+        outside = 1.0
+        estimates = [self._estimate(last, backward, outside)]
+        for belief, following in zip(beliefs[-2::-1], beliefs[:0:-1], strict=True):
+            backward, outside = self._backward(belief, following, backward, outside)
+            estimates.append(self._estimate(belief, backward, outside))
+        return estimates[::-1]
+
+    def _backward(
+        self, belief: Belief, following: Belief, backward: list[Array], outside: float
+    ) -> tuple[list[Array], float]:
+        """Return the likelihood of all later readings at the states of a belief."""
+        visit = following.visit
+        followed = self.followed[visit]
+        any_code = self.any_code_likelihood(visit)
+        later = [np.zeros(self.state_count) for _ in followed]
+        stays: dict[tuple[int, int], tuple[States, Array]] = {}
+        for component, value in zip(following.components, backward, strict=True):
+            if component.visit == visit:
+                likelihood = self.likelihood(visit, component.hypothesis)
+                if likelihood.ndim:
+                    likelihood = likelihood[component.states]
+                later[component.hypothesis][component.states] = (
+                    value * likelihood * (1 - OUTLIER_PROBABILITY)
+                )
+            else:
+                stays[component.visit, component.hypothesis] = component.states, value
+        outside = outside * any_code
+        anywhere = sum(float(each.sum()) for each in later) / self.state_count
+        values = []
+        for component in belief.components:
+            value = np.full(len(component.states), CARRIED_PROBABILITY * (anywhere + outside))
+            for end in range(len(followed)):
+                for rows, weight, arrival in self._transitions(component, visit, end):
+                    off_map = followed[end][1].probability * outside
+                    after = np.where(arrival >= 0, later[end][arrival], off_map)
+                    value[rows] += (weight * after).sum(axis=1)
+            states, stay = stays.get((component.visit, component.hypothesis), (None, None))
+            if states is not None and stay is not None:
+                rows = np.searchsorted(component.states, states)
+                value[rows] += OUTLIER_PROBABILITY * any_code * stay
+            values.append(value)
+        before_outside = (1 - RETURN_PROBABILITY) * outside + RETURN_PROBABILITY * anywhere
+        scale = max(
+            before_outside, max((float(each.max(initial=0.0)) for each in values), default=0.0)
         )
-    return estimates
+        return [each / scale for each in values], before_outside / scale
+
+    def _estimate(self, belief: Belief, backward: list[Array], outside: float) -> CellEstimate:
+        """Return the most probable cell of a visit."""
+        visit = belief.visit
+        own = [
+            (component, component.probability * value)
+            for component, value in zip(belief.components, backward, strict=True)
+            if component.visit == visit
+        ]
+        total = belief.outside * outside + sum(
+            float((component.probability * value).sum())
+            for component, value in zip(belief.components, backward, strict=True)
+        )
+        by_state = np.zeros(self.state_count)
+        for component, posterior in own:
+            by_state[component.states] += posterior
+        good = float(by_state.sum())
+        state = int(np.argmax(by_state))
+        quarters, row, column = (int(each) for each in self.cells_of(np.int64(state)))
+        # The map contributes to the choice of the hypothesis of a repeated visit as well.
+        weights = np.zeros(len(self.followed[visit]))
+        filtered = 0.0
+        for component, posterior in own:
+            index = int(np.searchsorted(component.states, state))
+            if index < len(component.states) and component.states[index] == state:
+                at_state = np.array([state])
+                weights[component.hypothesis] = posterior[index]
+                if visit in self.repeated:
+                    weights[component.hypothesis] *= self.map_likelihood(
+                        visit, component.hypothesis, at_state
+                    )[0]
+                filtered += float(component.probability[index])
+        best = int(np.argmax(weights))
+        differs = np.array(
+            [one.code != self.read_code[state] for _, one in self.followed[visit]], bool
+        )
+        misread = float(weights[differs].sum() / weights.sum()) if weights.any() else 0.0
+        return CellEstimate(
+            cell=(row - PAD_CELLS, column - PAD_CELLS),
+            quarters=quarters,
+            hypothesis=self.followed[visit][best][0],
+            probability=float(by_state[state]) / total,
+            filtered_probability=filtered,
+            outlier_probability=max(0.0, 1 - (good + belief.outside * outside) / total),
+            misread_probability=misread,
+        )
 
 
-def _normalized(belief: Array, outside: float) -> tuple[Array, float]:
-    """Scale a belief, and the probability of being outside of the map, to the sum 1."""
-    total = float(belief.sum()) + outside
-    return belief / total, outside / total
+class OtherFloor:
+    """Belief of a robot on any other floor that has the same fraction of each code.
+
+    Odometry, slips and outliers cost there what they cost on the map; any cell is as good as any
+    other. Readings depend on the heading only, on a ``compass`` map much and on others little.
+    """
+
+    def __init__(self, model: CellModel) -> None:
+        self.model = model
+        read = model.read_code.reshape(4, -1)
+        self.frequency = np.stack(
+            [np.bincount(codes[codes < CODE_COUNT], minlength=CODE_COUNT) for codes in read]
+        ).astype(float)
+        self.frequency += 1.0  # Codes that this floor lacks may occur on another one.
+        self.frequency /= self.frequency.sum(axis=1, keepdims=True)
+        self.heading_of: dict[int, Array] = {}  # By the last visit that is no outlier.
+
+    def advance(self, visit: int) -> float:
+        """Return the probability of the readings of the next visit."""
+        model = self.model
+        any_code = model.any_code_likelihood(visit)
+        if visit:
+            arriving = CARRIED_PROBABILITY * sum(self.heading_of.values()) / 4
+            for before, heading in self.heading_of.items():
+                steps = model.steps(before, 0, visit, 0)
+                if len(steps):
+                    turned = np.roll(heading, int(steps.quarters[0]))
+                    arriving = arriving + float(steps.likelihood[0]) * turned
+        else:
+            arriving = np.full(4, 0.25)
+        if visit in model.repeated:
+            likelihood = np.full(4, any_code)
+        else:
+            followed = model.followed[visit]
+            likelihood = sum(one.probability * self.frequency[:, one.code] for _, one in followed)
+        belief = {
+            before: OUTLIER_PROBABILITY * any_code * heading
+            for before, heading in self.heading_of.items()
+            if visit - before <= MAX_SUCCESSIVE_OUTLIERS
+        }
+        belief[visit] = (1 - OUTLIER_PROBABILITY) * likelihood * arriving
+        total = float(sum(each.sum() for each in belief.values()))
+        self.heading_of = {before: each / total for before, each in belief.items()}
+        return total
 
 
-def _followed_hypotheses(visit: VisitHypotheses) -> list[tuple[int, Hypothesis]]:
+def _followed_hypotheses(visit: VisitHypotheses) -> list[NumberedHypothesis]:
     """Return the more probable hypotheses with their indices."""
     numbered = list(enumerate(visit.hypotheses))
     kept = [(n, h) for n, h in numbered if n == 0 or h.probability > MIN_HYPOTHESIS_PROBABILITY]
     return kept[:MAX_FOLLOWED_HYPOTHESES]
 
 
-# ---- likelihoods of one visit
-
-
-def _map_likelihood(
-    hypotheses: list[tuple[int, Hypothesis]], codes: NDArray[np.int64], misread: float
-) -> Array:
-    """Return the likelihood (H, 4, rows, columns) of each hypothesis in each state, with pad."""
-    padded = np.pad(codes, PAD_CELLS, constant_values=HOLE_CODE)
-    rotated_codes = np.stack([rotated(np.maximum(padded, 0), -q) for q in range(4)])
-    is_inside = np.pad(np.ones(codes.shape, bool), PAD_CELLS)
-    without_landmark = (
-        np.where(is_inside, UNMAPPED_LANDMARK_PROBABILITY, OUTSIDE_LANDMARK_PROBABILITY)
-        / CODE_COUNT
-    )
-    likelihood = np.empty((len(hypotheses), 4, *padded.shape))
-    for number, (_, one) in enumerate(hypotheses):
-        of_code = np.where(rotated_codes == one.code, 1 - misread, misread / (CODE_COUNT - 1))
-        likelihood[number] = one.probability * np.where(
-            padded == HOLE_CODE, without_landmark, of_code
-        )
-    return likelihood
-
-
-def _code_likelihood(hypotheses: list[tuple[int, Hypothesis]], code: int, misread: float) -> Array:
-    """Return the likelihood (H,) of the hypotheses of a landmark of known code, in any cell."""
-    return np.array(
-        [
-            one.probability * (1 - misread if one.code == code else misread / (CODE_COUNT - 1))
-            for _, one in hypotheses
-        ]
-    )
-
-
 def miss_likelihood(floor: FloorMap) -> Array:
     """Return the likelihood (rows, columns) of passing a cell without a visit, with pad."""
     padded = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE_CODE)
     return np.where(padded == HOLE_CODE, 1.0, MISSED_LANDMARK_PROBABILITY)
-
-
-# ---- steps between visits
-
-
-@dataclass(frozen=True)
-class CellStep:
-    """Step of whole cells from one visit to the next, in the frame of the first hypothesis.
-
-    Attributes
-    ----------
-    before, after : int
-        Hypotheses of both visits, by their order among the followed ones.
-    cells : (int, int)
-        Along x and y.
-    quarters : int
-        Rotation of the frame of the second hypothesis against that of the first.
-    log_odds : float
-        Log likelihood, relative to the most likely step.
-    """
-
-    before: int
-    after: int
-    cells: tuple[int, int]
-    quarters: int
-    log_odds: float
-
-
-def _steps_between(
-    first: VisitHypotheses,
-    second: VisitHypotheses,
-    hypotheses: list[tuple[int, Hypothesis]],
-    next_hypotheses: list[tuple[int, Hypothesis]],
-    pitch_m: float,
-    drift: OdometryDrift,
-) -> list[CellStep]:
-    """Enumerate the steps of whole cells that agree with the odometry between two visits."""
-    shift = second.odometry[:2] - first.odometry[:2]
-    rotation = float(second.odometry[2] - first.odometry[2])
-    cos, sin = math.cos(-first.odometry[2]), math.sin(-first.odometry[2])
-    own_shift = np.array([cos * shift[0] - sin * shift[1], sin * shift[0] + cos * shift[1]])
-    length = float(np.hypot(*own_shift))
-    heading_sigma = math.hypot(
-        drift.curvature_rad_per_m * length, drift.rotation_scale * abs(rotation), drift.walk_rad
-    )
-    frame_sigma = np.hypot(heading_sigma, HEADING_SIGMA_RAD)
-    steps = []
-    for i, (_, start) in enumerate(hypotheses):
-        for j, (_, end) in enumerate(next_hypotheses):
-            frame_rotation = start.pose[2] + rotation - end.pose[2]
-            quarters = round(frame_rotation / HALF_PI_RAD)
-            misalignment = frame_rotation - quarters * HALF_PI_RAD
-            cos, sin = math.cos(start.pose[2]), math.sin(start.pose[2])
-            position = start.pose[:2] + [
-                cos * own_shift[0] - sin * own_shift[1],
-                sin * own_shift[0] + cos * own_shift[1],
-            ]
-            c, s = math.cos(quarters * HALF_PI_RAD), math.sin(quarters * HALF_PI_RAD)
-            x, y = end.pose[:2]
-            cells = (position - [c * x - s * y, s * x + c * y]) / pitch_m
-            sigma_cells = (
-                math.hypot(
-                    LANDMARK_POSITION_SIGMA_M,
-                    drift.scale * length,
-                    heading_sigma * length,
-                    _position_sigma(start),
-                    _position_sigma(end),
-                )
-                / pitch_m
-            )
-            low_x, low_y = math.floor(cells[0]), math.floor(cells[1])
-            for a in (low_x, low_x + 1):
-                for b in (low_y, low_y + 1):
-                    squared = ((cells[0] - a) ** 2 + (cells[1] - b) ** 2) / sigma_cells**2
-                    log_odds = -(squared + (misalignment / frame_sigma) ** 2) / 2
-                    if log_odds > -MAX_STEP_LOG_ODDS:
-                        steps.append(CellStep(i, j, (a, b), quarters, log_odds))
-    # The quality of the odometry is no evidence of the cell: the best step counts in full.
-    best = max((step.log_odds for step in steps), default=0.0)
-    return [replace(step, log_odds=step.log_odds - best) for step in steps]
-
-
-def _position_sigma(hypothesis: Hypothesis) -> float:
-    """Return the standard deviation of the position of a hypothesis, in metres."""
-    variance = float(np.trace(hypothesis.covariance[:2, :2]))
-    return math.sqrt(variance) if math.isfinite(variance) else 2 * LANDMARK_POSITION_SIGMA_M
-
-
-def _repeated_visits(
-    followed: list[list[tuple[int, Hypothesis]]], steps: list[list[CellStep]]
-) -> dict[int, int]:
-    """Find visits to landmarks that another visit determines better.
-
-    The visits to one landmark follow from the most likely steps.
-
-    Returns
-    -------
-    dict of int to int
-        Number of a visit to the code by the better visit, in the frame of the visit's most
-        probable hypothesis.
-    """
-    # Chain of visits that are connected by steps, cell in the frame of its first visit, heading.
-    path: list[tuple[int, tuple[int, int], int]] = [(0, (0, 0), 0)]
-    for number, candidates in enumerate(steps, 1):
-        chain, (x, y), heading = path[-1]
-        of_best = [step for step in candidates if step.before == 0 and step.after == 0]
-        if of_best:
-            step = max(of_best, key=lambda one: one.log_odds)
-            rows, columns = _rotate_step(step.cells, heading)
-            path.append((chain, (x + columns, y + rows), (heading + step.quarters) % 4))
-        else:
-            path.append((number, (0, 0), 0))
-    visits_of: dict[tuple[int, tuple[int, int]], list[int]] = {}
-    for number, (chain, cell, _) in enumerate(path):
-        visits_of.setdefault((chain, cell), []).append(number)
-    repeated: dict[int, int] = {}
-    for numbers in visits_of.values():
-        best = max(numbers, key=lambda n: followed[n][0][1].probability)
-        code = int(rotated(followed[best][0][1].code, path[best][2]))
-        repeated |= {n: int(rotated(code, -path[n][2])) for n in numbers if n != best}
-    return repeated
-
-
-def predict(
-    belief: Array, outside: float, steps: list[CellStep], count: int, miss: Array
-) -> tuple[Array, float]:
-    """Predict the belief at the next visit.
-
-    Parameters
-    ----------
-    belief : (H, 4, rows, columns) ndarray
-    outside : float
-        Probability of being outside of the map.
-    steps : list of CellStep
-    count : int
-        Number of hypotheses of the next visit.
-    miss : (rows, columns) ndarray
-
-    Returns
-    -------
-    belief : (count, 4, rows, columns) ndarray
-    outside : float
-    """
-    total = float(belief.sum())
-    anywhere = KIDNAP_PROBABILITY * total + RETURN_PROBABILITY * outside
-    predicted = np.full((count, *belief.shape[1:]), anywhere / belief[0].size / count)
-    outside = (1 - RETURN_PROBABILITY) * outside + KIDNAP_PROBABILITY * total
-    for step in steps:
-        weight = math.exp(step.log_odds)
-        for quarters in range(4):
-            rows, columns = _rotate_step(step.cells, quarters)
-            leaving = weight * belief[step.before, quarters] * _pass_likelihood(miss, rows, columns)
-            arriving = _shifted(leaving, rows, columns)
-            predicted[step.after, (quarters + step.quarters) % 4] += arriving
-            outside += float(leaving.sum() - arriving.sum())
-    return predicted, max(outside, 0.0)
-
-
-def predict_backward(
-    belief: Array, outside: float, steps: list[CellStep], count: int, miss: Array
-) -> tuple[Array, float]:
-    """Apply the transpose of :func:`predict`."""
-    total = float(belief.sum()) / belief[0].size / len(belief)
-    predicted = np.full((count, *belief.shape[1:]), KIDNAP_PROBABILITY * (total + outside))
-    for step in steps:
-        weight = math.exp(step.log_odds)
-        for quarters in range(4):
-            rows, columns = _rotate_step(step.cells, quarters)
-            arriving = belief[step.after, (quarters + step.quarters) % 4]
-            leaving = _shifted(arriving, -rows, -columns, fill=outside)
-            predicted[step.before, quarters] += (
-                weight * _pass_likelihood(miss, rows, columns) * leaving
-            )
-    return predicted, (1 - RETURN_PROBABILITY) * outside + RETURN_PROBABILITY * total
-
-
-def _rotate_step(cells: tuple[int, int], quarters: int) -> tuple[int, int]:
-    """Return (rows, columns) of a step of (x, y) cells in a frame rotated by quarter turns."""
-    x, y = cells
-    for _ in range(quarters % 4):
-        x, y = -y, x
-    return y, x
-
-
-def _pass_likelihood(miss: Array, rows: int, columns: int) -> Array:
-    """Return the likelihood, by cell of departure, of no visit on a straight path."""
-    likelihood = np.ones_like(miss)
-    if rows and columns:
-        return likelihood
-    length = max(abs(rows), abs(columns))
-    for k in range(1, length):
-        likelihood *= _shifted(miss, -rows * k // length, -columns * k // length, fill=1.0)
-    return likelihood
-
-
-def _shifted(values: Array, rows: int, columns: int, fill: float = 0.0) -> Array:
-    """Shift values (rows, columns) by whole cells."""
-    shifted = np.full_like(values, fill)
-    height, width = values.shape
-    if abs(rows) < height and abs(columns) < width:
-        source = (_overlap(-rows, height), _overlap(-columns, width))
-        target = (_overlap(rows, height), _overlap(columns, width))
-        shifted[target] = values[source]
-    return shifted
-
-
-def _overlap(shift: int, size: int) -> slice:
-    return slice(max(shift, 0), size + min(shift, 0))

@@ -212,7 +212,7 @@ def warn_of_opposite_polarity(
         for visit in visits
         if not visit.hypotheses.refused
     ]
-    estimates = identify_cells(opposite, floor, misread=misread, drift=drift)
+    estimates = identify_cells(opposite, floor, misread=misread, drift=drift).estimates
     if max((one.probability for one in estimates), default=0.0) < CERTAIN_PROBABILITY:
         return []
     message = (

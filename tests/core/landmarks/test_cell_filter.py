@@ -15,15 +15,12 @@ from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, rotated
 from locatk.core.landmarks.localization import cell_filter
 from locatk.core.landmarks.localization.cell_filter import (
-    KIDNAP_PROBABILITY,
+    CARRIED_PROBABILITY,
     OUTSIDE_LANDMARK_PROBABILITY,
     PAD_CELLS,
     CellEstimate,
-    CellStep,
     IdentifiedVisit,
     identify_cells,
-    predict,
-    predict_backward,
     select_visits_on_map,
 )
 from locatk.core.landmarks.map.floor import HOLE_CODE, STEPS, Cell, FloorMap
@@ -90,7 +87,7 @@ def visits_of(
 
 
 def identify(floor: FloorMap, observed: Sequence[VisitHypotheses]) -> list[CellEstimate]:
-    return identify_cells(observed, floor, misread=MISREAD, drift=OdometryDrift())
+    return identify_cells(observed, floor, misread=MISREAD, drift=OdometryDrift()).estimates
 
 
 def on_map(floor: FloorMap, path: Sequence[State]) -> list[int]:
@@ -308,28 +305,3 @@ def test_repeated_visits_are_no_evidence_of_the_cell() -> None:
         largest.append(max(one.probability for one in identify(floor, visits)))
     assert largest[0] < 0.9
     assert largest[1] == pytest.approx(largest[0], rel=0.05)
-
-
-def test_kidnapped_robot_may_be_anywhere() -> None:
-    belief = np.zeros((1, 4, 8, 8))
-    belief[0, 1, 3, 3] = 1.0
-    predicted, outside = predict(belief, 0.0, [], 2, np.ones((8, 8)))
-    assert predicted == pytest.approx(KIDNAP_PROBABILITY / predicted.size)
-    assert outside == pytest.approx(KIDNAP_PROBABILITY)
-    assert predicted.min() > 0
-
-
-def test_backward_prediction_is_the_transpose() -> None:
-    random = np.random.default_rng(3)
-    miss = random.uniform(0.1, 1.0, (9, 8))
-    steps = [
-        CellStep(0, 1, (2, 0), 1, -0.3),
-        CellStep(1, 0, (0, -3), 0, 0.0),
-        CellStep(1, 1, (1, 1), 3, -2.0),
-    ]
-    before, after = random.uniform(0, 1, (2, 4, 9, 8)), random.uniform(0, 1, (3, 4, 9, 8))
-    predicted, outside = predict(before, 0.4, steps, 3, miss)
-    earlier, earlier_outside = predict_backward(after, 0.7, steps, 2, miss)
-    assert (predicted * after).sum() + 0.7 * outside == pytest.approx(
-        (before * earlier).sum() + 0.4 * earlier_outside, rel=1e-12
-    )
