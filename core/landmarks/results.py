@@ -69,9 +69,14 @@ class RobotFacts:
     ----------
     localised : bool
         Whether the robot has poses on the map.
+    provisional : bool
+        Whether these poses may be wrong: :attr:`probability` is below 0.999.
     probability : float, optional
-        Posterior probability of the least certain cell that is reported, or of the most certain
-        one if none is; unknown with ``--method paper``.
+        Posterior probability that the robot is on this floor, and that the least certain cell that
+        is reported (or the most certain one if none is) is right; unknown with
+        ``--method paper``.
+    map_probability : float, optional
+        Posterior probability that the robot is on this floor and not on any other.
     landmarks_seen : int
         Landmarks that were read.
     landmarks_to_localise : int or None
@@ -82,7 +87,9 @@ class RobotFacts:
     """
 
     localised: bool
+    provisional: bool = False
     probability: float | None = None
+    map_probability: float | None = None
     landmarks_seen: int
     landmarks_to_localise: int | None = field(default=None, metadata={"json_null": True})
     misfit_sigma: float | None = None

@@ -18,14 +18,13 @@ from locatk.core.landmarks.localization.cell_filter import (
     select_visits_on_map,
 )
 from locatk.core.landmarks.localization.consistency import (
-    CERTAIN_PROBABILITY,
     NO_MAP_WARNING,
+    PROVISIONAL_PROBABILITY,
     describe_visit,
     find_displaced_landmarks,
     is_map_contradicted,
     warn_of_missing_pose,
     warn_of_opposite_polarity,
-    warn_of_uncertain_cell,
 )
 from locatk.core.landmarks.localization.smoothing import (
     DISPLACED_LANDMARK_SIGMA,
@@ -157,12 +156,15 @@ class IdentifiedRecording:
         With the noise of the recording.
     visits : list of IdentifiedVisit
         In order of time, refused ones included.
+    map_probability : float
+        Probability that the robot is on this floor and not on any other.
     """
 
     recording: HallRecording
     odometry: Trajectory
     priors: ModelPriors
     visits: list[IdentifiedVisit]
+    map_probability: float
 
     @property
     def device(self) -> str:
@@ -189,9 +191,11 @@ def identify_recording(
     check_odometry(recording, geometry)
     priors = replace(options.priors, noise_t=recording.noise_t)
     recording, detected = detect_landmarks(recording, geometry, priors, pitch_m)
-    visits = identify_visits(detected, floor, misread=options.misread, drift=priors.drift)
+    visits, map_probability = identify_visits(
+        detected, floor, misread=options.misread, drift=priors.drift
+    )
     assert odometry is not None  # preprocess() requires it
-    return IdentifiedRecording(recording, odometry, priors, visits)
+    return IdentifiedRecording(recording, odometry, priors, visits, map_probability)
 
 
 @dataclass(frozen=True)
@@ -219,7 +223,7 @@ def localize_robot(
     """Estimate the poses of one robot on the map, or explain why there are none."""
     recording, visits = identified.recording, identified.visits
     on_map = select_visits_on_map(visits, floor) if floor is not None else []
-    facts = _cell_facts(visits, on_map)
+    facts = _cell_facts(identified, on_map)
     unlocalized = LocalizedRobot(identified, facts, recording.warnings)
     if floor is None:
         return _with_warnings(unlocalized, NO_MAP_WARNING.about(identified.device))
@@ -242,9 +246,6 @@ def localize_robot(
         )
         reason = warn_of_missing_pose(recording, visits, probability)
         return _with_warnings(unlocalized, reason, *polarity)
-    uncertain = warn_of_uncertain_cell(probability, facts.landmarks_to_localise)
-    if uncertain is not None:
-        unlocalized = _with_warnings(unlocalized, uncertain.about(identified.device))
     smoothed, warnings = smooth_robot(identified, on_map, floor)
     facts = replace(facts, misfit_sigma=smoothed.residual_sigma)
     robot = _with_warnings(replace(unlocalized, facts=facts), *warnings)
@@ -288,16 +289,21 @@ def smooth_robot(
     return smoothed, [warning.about(identified.device) for warning in warnings]
 
 
-def _cell_facts(visits: Sequence[IdentifiedVisit], on_map: Sequence[IdentifiedVisit]) -> RobotFacts:
+def _cell_facts(identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit]) -> RobotFacts:
     """Return the facts of a robot that follow from its cells."""
-    estimates = [visit.estimate for visit in visits if visit.estimate is not None]
+    estimates = [visit.estimate for visit in identified.visits if visit.estimate is not None]
     reported = [visit.estimate.probability for visit in on_map if visit.estimate is not None]
-    is_certain = [one.filtered_probability >= CERTAIN_PROBABILITY for one in estimates]
+    if reported:
+        of_cell = min(reported)
+    else:
+        of_cell = max((one.probability for one in estimates), default=0.0)
+    probability = identified.map_probability * of_cell
+    is_certain = [one.filtered_probability >= PROVISIONAL_PROBABILITY for one in estimates]
     return RobotFacts(
         localised=bool(on_map),
-        probability=min(reported)
-        if reported
-        else max((one.probability for one in estimates), default=0.0),
+        provisional=bool(on_map) and probability < PROVISIONAL_PROBABILITY,
+        probability=probability,
+        map_probability=identified.map_probability,
         landmarks_seen=len(estimates),
         landmarks_to_localise=is_certain.index(True) + 1 if any(is_certain) else None,
     )

@@ -62,7 +62,8 @@ class SolveReport:
         As in :class:`locatk.core.solution.Solution`.
     losses : tuple of SolverWarning
         Devices and observations that are unsolved; the codes are ``no_pose``,
-        ``not_localised``, ``not_read``, ``refused``, ``misread`` and ``few_poses``.
+        ``not_localised``, ``provisional``, ``not_read``, ``refused``, ``misread`` and
+        ``few_poses``.
     is_metric : bool
         False if the poses are in units of a scene without scale.
     """
@@ -209,6 +210,8 @@ def _unlocalized_robots(solution: Solution) -> list[SolverWarning]:
     robots: dict[str, RobotFacts] = {} if solution.facts is None else solution.facts.robots
     for device, facts in robots.items():
         if facts.localised:
+            if facts.provisional:
+                losses.append(_provisional_poses(device, facts))
             continue
         if solution.artifact is None:
             reason = ": no map of the floor"
@@ -220,6 +223,13 @@ def _unlocalized_robots(solution: Solution) -> list[SolverWarning]:
             reason = ""
         losses.append(SolverWarning("not_localised", f"{device} is not localised{reason}"))
     return losses
+
+
+def _provisional_poses(device: str, facts: RobotFacts) -> SolverWarning:
+    """Return the loss of a robot that may be on another floor or in another cell."""
+    text = f"the poses of {device} are provisional: they are right with a probability of "
+    text += f"{facts.probability:.4g}" if facts.probability is not None else "unknown"
+    return SolverWarning("provisional", f"{text}; visit more landmarks")
 
 
 def _refused_tags(detections: Sequence[TagDetection]) -> list[SolverWarning]:

@@ -89,8 +89,12 @@ MAX_FOLLOWED_HYPOTHESES = 6
 MIN_SLIP_BELIEF = 1e-3
 """Probability of a state from which on slips are followed: there are 64 steps after each."""
 
-MIN_BELIEF = 1e-16
-"""Probability of a state below which it is dropped."""
+MIN_CARRIED_FRACTION = 0.02
+"""Probability of a state below which it is dropped, relative to that of a robot that was carried
+there: below that of one that was carried, and read nothing wrong since."""
+
+MAX_STATES_AT_ONCE = 20_000
+"""States for which steps are computed at once, in order to bound the memory."""
 
 BLOCK_VISITS, LOOKAHEAD_VISITS = 64, 24
 """Visits for which the backward pass runs at once, and those after them that it uses: the
@@ -333,51 +337,52 @@ class CellModel:
     def first(self) -> tuple[Belief, float]:
         """Return the belief after the first visit, and the probability of its readings."""
         prior = (1 - START_OUTSIDE_PROBABILITY) / self.state_count
-        predicted = [np.full(self.state_count, prior) for _ in self.followed[0]]
-        return self._observed(0, predicted, START_OUTSIDE_PROBABILITY, [])
+        updated = [prior * self.likelihood(0, n) for n in range(len(self.followed[0]))]
+        outside = START_OUTSIDE_PROBABILITY * self.any_code_likelihood(0)
+        return self._normalized(0, updated, outside, [])
 
     def advance(self, belief: Belief, visit: int) -> tuple[Belief, float]:
         """Return the belief after the next visit, and the probability of its readings."""
         followed = self.followed[visit]
         total = sum(float(each.probability.sum()) for each in belief.components)
         anywhere = CARRIED_PROBABILITY * total + RETURN_PROBABILITY * belief.outside
-        predicted = [np.full(self.state_count, anywhere / self.state_count) for _ in followed]
+        any_code = self.any_code_likelihood(visit)
         outside = (1 - RETURN_PROBABILITY) * belief.outside + CARRIED_PROBABILITY * total
-        for component in belief.components:
-            for end in range(len(followed)):
-                for states, weight, arrival in self._transitions(component, visit, end):
-                    leaving = component.probability[states][:, None] * weight
+        updated = []
+        for end, (_, hypothesis) in enumerate(followed):
+            predicted = np.zeros(self.state_count)
+            for component in belief.components:
+                for rows, weight, arrival in self._transitions(component, visit, end):
+                    leaving = component.probability[rows][:, None] * weight
                     is_on_map = arrival >= 0
-                    predicted[end] += np.bincount(
+                    predicted += np.bincount(
                         arrival[is_on_map], leaving[is_on_map], minlength=self.state_count
                     )
-                    outside += followed[end][1].probability * float(leaving[~is_on_map].sum())
-        carried = [
-            replace(each, probability=each.probability * OUTLIER_PROBABILITY)
+                    outside += hypothesis.probability * float(leaving[~is_on_map].sum())
+            arrived = (anywhere / self.state_count) * self.map_likelihood(visit, end)
+            updated.append(
+                (1 - OUTLIER_PROBABILITY) * (predicted * self.likelihood(visit, end) + arrived)
+            )
+        outliers = [
+            replace(each, probability=each.probability * (OUTLIER_PROBABILITY * any_code))
             for each in belief.components
             if visit - each.visit <= MAX_SUCCESSIVE_OUTLIERS
         ]
-        return self._observed(visit, predicted, outside, carried)
+        return self._normalized(visit, updated, any_code * outside, outliers)
 
-    def _observed(
-        self, visit: int, predicted: list[Array], outside: float, outliers: list[Component]
+    def _normalized(
+        self, visit: int, updated: list[Array], outside: float, outliers: list[Component]
     ) -> tuple[Belief, float]:
-        """Apply the readings of a visit to a predicted belief; drop negligible states."""
-        any_code = self.any_code_likelihood(visit)
-        updated = [
-            each * self.likelihood(visit, number) * (1 - OUTLIER_PROBABILITY)
-            for number, each in enumerate(predicted)
-        ]
-        outliers = [replace(each, probability=each.probability * any_code) for each in outliers]
-        outside *= any_code
+        """Return a belief of the sum 1 without negligible states, and the sum before."""
         total = outside + sum(float(each.sum()) for each in updated)
         total += sum(float(each.probability.sum()) for each in outliers)
+        least = MIN_CARRIED_FRACTION * CARRIED_PROBABILITY / self.state_count * total
         components = []
         for number, each in enumerate(updated):
-            states = np.flatnonzero(each > MIN_BELIEF * total)
+            states = np.flatnonzero(each > least)
             components.append(Component(visit, number, states, each[states] / total))
         for component in outliers:
-            kept = component.probability > MIN_BELIEF * total
+            kept = component.probability > least
             if kept.any():
                 components.append(
                     replace(
@@ -389,22 +394,24 @@ class CellModel:
         return Belief(visit, components, outside / total), total
 
     def likelihood(self, visit: int, number: int) -> Array:
-        """Return the likelihood of one hypothesis in each state; one number if it is the same."""
-        hypothesis = self.followed[visit][number][1]
-        other = self.misread / (CODE_COUNT - 1)
-        known_code = self.repeated.get(visit)
-        if known_code is not None:
-            # A repeated visit adds no evidence of the cell: it is the same landmark, whether it
-            # agrees with the map or not.
-            of_code = 1 - self.misread if hypothesis.code == known_code else other
-            return np.asarray(hypothesis.probability * of_code)
-        return hypothesis.probability * self._code_likelihood(hypothesis.code)[self.read_code]
+        """Return the likelihood (states,) of one hypothesis, for a robot that was not carried.
 
-    def map_likelihood(self, visit: int, number: int, states: States) -> Array:
-        """Return the likelihood of one hypothesis in some states, of repeated visits as well."""
+        A repeated visit adds no evidence of the cell: it is the same landmark, whether it agrees
+        with the map or not.
+        """
+        hypothesis = self.followed[visit][number][1]
+        known_code = self.repeated.get(visit)
+        if known_code is None:
+            return self.map_likelihood(visit, number)
+        other = self.misread / (CODE_COUNT - 1)
+        of_code = 1 - self.misread if hypothesis.code == known_code else other
+        return np.full(self.state_count, hypothesis.probability * of_code)
+
+    def map_likelihood(self, visit: int, number: int) -> Array:
+        """Return the likelihood (states,) of one hypothesis by the codes of the map."""
         hypothesis = self.followed[visit][number][1]
         of_code = self._code_likelihood(hypothesis.code)
-        return np.asarray(hypothesis.probability * of_code[self.read_code[states]])
+        return np.asarray(hypothesis.probability * of_code[self.read_code])
 
     def _code_likelihood(self, code: int) -> Array:
         """Return the likelihood of a code by the one on the map, with those of empty cells."""
@@ -417,7 +424,8 @@ class CellModel:
     def any_code_likelihood(self, visit: int) -> float:
         """Return the likelihood of a visit if its code says nothing of the cell."""
         if visit in self.repeated:
-            return float(sum(self.likelihood(visit, n) for n in range(len(self.followed[visit]))))
+            count = len(self.followed[visit])
+            return float(sum(self.likelihood(visit, n)[0] for n in range(count)))
         return sum(one.probability for _, one in self.followed[visit]) / CODE_COUNT
 
     # ---- steps
@@ -460,8 +468,9 @@ class CellModel:
             (steps, np.flatnonzero(is_probable)),
             (confirmed, np.flatnonzero(~is_probable)),
         ):
-            if len(followed) and len(rows):
-                yield rows, *self._arrivals(component.states[rows], followed)
+            for start in range(0, len(rows) if len(followed) else 0, MAX_STATES_AT_ONCE):
+                some = rows[start : start + MAX_STATES_AT_ONCE]
+                yield some, *self._arrivals(component.states[some], followed)
 
     def _arrivals(self, states: States, steps: CellSteps) -> tuple[Array, States]:
         """Return likelihood and state (n, steps) after steps; the state is -1 off the map."""
@@ -558,19 +567,18 @@ class CellModel:
         followed = self.followed[visit]
         any_code = self.any_code_likelihood(visit)
         later = [np.zeros(self.state_count) for _ in followed]
+        anywhere = 0.0
         stays: dict[tuple[int, int], tuple[States, Array]] = {}
         for component, value in zip(following.components, backward, strict=True):
             if component.visit == visit:
-                likelihood = self.likelihood(visit, component.hypothesis)
-                if likelihood.ndim:
-                    likelihood = likelihood[component.states]
-                later[component.hypothesis][component.states] = (
-                    value * likelihood * (1 - OUTLIER_PROBABILITY)
-                )
+                states, number = component.states, component.hypothesis
+                value = value * (1 - OUTLIER_PROBABILITY)
+                later[number][states] = value * self.likelihood(visit, number)[states]
+                anywhere += float(value @ self.map_likelihood(visit, number)[states])
             else:
                 stays[component.visit, component.hypothesis] = component.states, value
+        anywhere /= self.state_count
         outside = outside * any_code
-        anywhere = sum(float(each.sum()) for each in later) / self.state_count
         values = []
         for component in belief.components:
             value = np.full(len(component.states), CARRIED_PROBABILITY * (anywhere + outside))
@@ -579,8 +587,9 @@ class CellModel:
                     off_map = followed[end][1].probability * outside
                     after = np.where(arrival >= 0, later[end][arrival], off_map)
                     value[rows] += (weight * after).sum(axis=1)
-            states, stay = stays.get((component.visit, component.hypothesis), (None, None))
-            if states is not None and stay is not None:
+            staying = stays.get((component.visit, component.hypothesis))
+            if staying is not None:
+                states, stay = staying
                 rows = np.searchsorted(component.states, states)
                 value[rows] += OUTLIER_PROBABILITY * any_code * stay
             values.append(value)
@@ -607,19 +616,18 @@ class CellModel:
             by_state[component.states] += posterior
         good = float(by_state.sum())
         state = int(np.argmax(by_state))
-        quarters, row, column = (int(each) for each in self.cells_of(np.int64(state)))
+        quarters, row, column = (int(each) for each in self.cells_of(np.array(state)))
         # The map contributes to the choice of the hypothesis of a repeated visit as well.
         weights = np.zeros(len(self.followed[visit]))
         filtered = 0.0
         for component, posterior in own:
             index = int(np.searchsorted(component.states, state))
             if index < len(component.states) and component.states[index] == state:
-                at_state = np.array([state])
                 weights[component.hypothesis] = posterior[index]
                 if visit in self.repeated:
                     weights[component.hypothesis] *= self.map_likelihood(
-                        visit, component.hypothesis, at_state
-                    )[0]
+                        visit, component.hypothesis
+                    )[state]
                 filtered += float(component.probability[index])
         best = int(np.argmax(weights))
         differs = np.array(
@@ -671,7 +679,9 @@ class OtherFloor:
             likelihood = np.full(4, any_code)
         else:
             followed = model.followed[visit]
-            likelihood = sum(one.probability * self.frequency[:, one.code] for _, one in followed)
+            likelihood = np.zeros(4)
+            for _, one in followed:
+                likelihood += one.probability * self.frequency[:, one.code]
         belief = {
             before: OUTLIER_PROBABILITY * any_code * heading
             for before, heading in self.heading_of.items()

@@ -23,11 +23,14 @@ from locatk.core.landmarks.preprocessing import HallRecording
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import SolverWarning
 
-CERTAIN_PROBABILITY = 0.99999
-"""Probability of a cell from which on no warning is given."""
+PROVISIONAL_PROBABILITY = 0.999
+"""Probability below which poses are provisional."""
 
-NEARLY_CERTAIN_PROBABILITY = 0.999
-"""Probability of a cell from which on the warning asks for no further landmark."""
+MIN_MISREAD_PROBABILITY = 0.99
+"""Probability from which on a landmark is reported to differ from the map."""
+
+MIN_OUTLIER_PROBABILITY = 0.5
+"""Probability from which on a visit counts as an outlier."""
 
 MIN_LANDMARKS_FOR_DISPLACEMENT = 3
 """Number of landmarks from which on the displacement of one of them can be recognized."""
@@ -86,10 +89,15 @@ def describe_visit(
             if code_on_map == HOLE_CODE:
                 cell = None
                 refused = "off_map"
-            elif code_on_map != rotated(best.code, quarters):
+            elif estimate.misread_probability >= MIN_MISREAD_PROBABILITY:
                 refused = "misread"
+            elif code_on_map != rotated(best.code, quarters):
+                refused = "uncertain"
     elif floor is not None and not visit.refused:
-        refused = "not_localised"
+        is_outlier = estimate is not None and (
+            estimate.outlier_probability >= MIN_OUTLIER_PROBABILITY
+        )
+        refused = "inconsistent" if is_outlier else "not_localised"
     code = int(rotated(best.code, quarters))
     rotation = quarters * HALF_PI_RAD
     cos, sin = np.cos(rotation), np.sin(rotation)
@@ -111,26 +119,6 @@ def describe_visit(
         strength=tuple(float(v) for v in np.roll(best.strength, quarters)),
         refused=refused,
     )
-
-
-def warn_of_uncertain_cell(probability: float, first_certain: int | None) -> SolverWarning | None:
-    """Return a warning if the cells are uncertain, else None.
-
-    Parameters
-    ----------
-    probability : float
-        Of the least certain cell.
-    first_certain : int or None
-        Number of the landmark at which the cell was certain; None if it never was.
-    """
-    if probability >= CERTAIN_PROBABILITY:
-        return None
-    if probability >= NEARLY_CERTAIN_PROBABILITY:
-        message = f"its cell on the map is almost certain ({probability:.5f})"
-    else:
-        end = "; visit one more landmark" if first_certain is None else " at one landmark"
-        message = f"its cell on the map has a probability of {probability:.5f}{end}"
-    return SolverWarning("localization_uncertain", message)
 
 
 def find_displaced_landmarks(
@@ -213,7 +201,7 @@ def warn_of_opposite_polarity(
         if not visit.hypotheses.refused
     ]
     estimates = identify_cells(opposite, floor, misread=misread, drift=drift).estimates
-    if max((one.probability for one in estimates), default=0.0) < CERTAIN_PROBABILITY:
+    if max((one.probability for one in estimates), default=0.0) < PROVISIONAL_PROBABILITY:
         return []
     message = (
         "with N and S exchanged it would be localised; are the sensors or all bars mounted upside "

@@ -20,7 +20,7 @@ from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypothes
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, code_of, rotated
 from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY, identify_cells
-from locatk.core.landmarks.localization.consistency import CERTAIN_PROBABILITY
+from locatk.core.landmarks.localization.consistency import PROVISIONAL_PROBABILITY
 from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.map.windows import window_path, window_readings
 from locatk.core.landmarks.simulation.options import Errors
@@ -223,7 +223,8 @@ def localize_stops(
     drift, misread = OdometryDrift(), SolveOptions().misread
     current, estimates = [], []
     for count in range(1, len(observations) + 1):
-        estimates = identify_cells(observations[:count], floor, misread=misread, drift=drift)
+        result = identify_cells(observations[:count], floor, misread=misread, drift=drift)
+        estimates = result.estimates
         last = estimates[-1]
         current.append((last.cell, last.quarters, last.probability))
     return current, [(each.cell, each.quarters, each.probability) for each in estimates]
@@ -273,10 +274,10 @@ def misread_figures(floor: FloorMap, source: str) -> list[Figure]:
         current, final = localize_stops(floor, simulate_observations(floor, walk, misread, rng))
         estimates = zip([*current, *final], [*walk.stops, *walk.stops], strict=True)
         wrong = max((p for (cell, q, p), stop in estimates if (cell, q) != stop), default=0.0)
-        if wrong >= CERTAIN_PROBABILITY:
+        if wrong >= PROVISIONAL_PROBABILITY:
             silently_wrong.append(number)
-        remarked += MIN_CELL_PROBABILITY <= wrong < CERTAIN_PROBABILITY
-        certain = (n for n, (_, _, p) in enumerate(current, 1) if p >= CERTAIN_PROBABILITY)
+        remarked += MIN_CELL_PROBABILITY <= wrong < PROVISIONAL_PROBABILITY
+        certain = (n for n, (_, _, p) in enumerate(current, 1) if p >= PROVISIONAL_PROBABILITY)
         landmarks_needed.append(next(certain, math.inf))
     localized = [n for n in landmarks_needed if math.isfinite(n)] or [math.nan]
     how = (
@@ -287,14 +288,14 @@ def misread_figures(floor: FloorMap, source: str) -> list[Figure]:
     listed = ", ".join(map(str, silently_wrong[:MAX_LISTED_WALKS]))
     return [
         Figure("5 % misread: wrong silently", float(len(silently_wrong)), "walks",
-               f"{how}: a wrong cell or heading at a probability of {CERTAIN_PROBABILITY} or "
+               f"{how}: a wrong cell or heading at a probability of {PROVISIONAL_PROBABILITY} or "
                f"more, after any of the landmarks or at the end{listed and f'; walks {listed}'}",
                0.0),
         Figure("5 % misread: wrong with a remark", 100 * remarked / len(walks), "%",
-               f"of the same walks, at {MIN_CELL_PROBABILITY} to {CERTAIN_PROBABILITY}: poses are "
+               f"of the same walks, at {MIN_CELL_PROBABILITY} to {PROVISIONAL_PROBABILITY}: poses are "
                "reported with their probability"),
         Figure("5 % misread: landmarks needed", float(np.mean(localized)), "landmarks",
-               f"mean until {CERTAIN_PROBABILITY} is reached; 99 % within "
+               f"mean until {PROVISIONAL_PROBABILITY} is reached; 99 % within "
                f"{np.quantile(localized, 0.99):.0f}", peer="paper, no fault", peer_value=3.0),
         Figure(f"5 % misread: certain within {WALK_LANDMARKS} landmarks",
                100 * float(np.mean(np.isfinite(landmarks_needed))), "%", "of the same walks",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.localization.consistency import CERTAIN_PROBABILITY
+from locatk.core.landmarks.localization.consistency import PROVISIONAL_PROBABILITY
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.published.driver import published_driver
 from locatk.core.landmarks.simulation.closed_loop import Approach
@@ -144,7 +144,7 @@ def session_figures(folder: Path) -> list[Figure]:
         Figure("sessions with 5 % misread landmarks: wrong silently", float(len(silent)),
                "sessions", f"of {SIMULATED_SESSIONS} with {MISREAD_SESSION_LANDMARKS} landmarks "
                "each: a wrong cell, or poses of another position, at a probability of "
-               f"{CERTAIN_PROBABILITY} or more{hard_failures}", 0.0),
+               f"{PROVISIONAL_PROBABILITY} or more{hard_failures}", 0.0),
         Figure("sessions with 5 % misread landmarks: right, and poses given", right_percent(hard),
                "%", "of the same sessions", better="higher"),
     ]  # fmt: skip
@@ -196,7 +196,7 @@ def score_session(session: SimulatedSession, solution: Solution) -> SessionResul
         wrong_cells += bool(distance > session.floor.pitch_m / 2)
     (facts,) = solution.facts.robots.values()
     # The published method reports no probability.
-    is_certain = facts.probability is None or facts.probability >= CERTAIN_PROBABILITY
+    is_certain = facts.probability is None or facts.probability >= PROVISIONAL_PROBABILITY
     if not solution.trajectories:
         return SessionResult(False, is_certain, wrong_cells, *(np.empty(0),) * 3)
     track = solution.trajectories[0]

@@ -88,7 +88,7 @@ def test_a_flipped_bar_that_is_known_does_not_count_against_a_place() -> None:
     ]  # fmt: skip
     sure = {}
     for floor in (FloorMap(CODES), FloorMap(CODES, built=flip)):
-        reported = identify_cells(sightings, floor, misread=0.01, drift=OdometryDrift())
+        reported = identify_cells(sightings, floor, misread=0.01, drift=OdometryDrift()).estimates
         sure[bool(floor.built)] = reported[-1].probability
         if floor.built:
             assert [one.cell for one in reported] == [cell for cell, _ in tour]

@@ -15,7 +15,6 @@ from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, rotated
 from locatk.core.landmarks.localization import cell_filter
 from locatk.core.landmarks.localization.cell_filter import (
-    CARRIED_PROBABILITY,
     OUTSIDE_LANDMARK_PROBABILITY,
     PAD_CELLS,
     CellEstimate,
