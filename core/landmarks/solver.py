@@ -228,7 +228,7 @@ def localize_robot(
     if floor is None:
         return _with_warnings(unlocalized, NO_MAP_WARNING.about(identified.device))
     probability = facts.probability if facts.probability is not None else math.nan
-    if is_map_contradicted(visits, on_map, floor):
+    if is_map_contradicted(visits, on_map, identified.map_probability):
         message = (
             "not localised; too many of its landmarks differ from the map: is it the map of this "
             "floor, and does the odometry have the right sign?"

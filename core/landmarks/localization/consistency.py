@@ -41,8 +41,11 @@ which on it counts as displaced."""
 
 MIN_CONTRADICTIONS = 2
 MAX_CONTRADICTED_FRACTION = 1 / 3
-"""A map is rejected if at least so many landmarks, and more than this fraction of all, are misread
-or unexplained."""
+"""A map is rejected if at least so many landmarks, and more than this fraction of all, are expected
+to be misread, or are unexplained."""
+
+MIN_MAP_PROBABILITY = 0.05
+"""Probability of being on the floor below which its map is rejected."""
 
 NO_MAP_WARNING = SolverWarning("no_map", "no map, so that its landmarks have no cells")
 
@@ -136,7 +139,7 @@ def find_displaced_landmarks(
 
 
 def is_map_contradicted(
-    visits: Sequence[IdentifiedVisit], on_map: Sequence[IdentifiedVisit], floor: FloorMap
+    visits: Sequence[IdentifiedVisit], on_map: Sequence[IdentifiedVisit], map_probability: float
 ) -> bool:
     """Return whether too many landmarks differ from the map.
 
@@ -146,11 +149,15 @@ def is_map_contradicted(
         All visits of a robot.
     on_map : sequence of IdentifiedVisit
         Those whose cell is known.
-    floor : FloorMap
+    map_probability : float
+        Probability that the robot is on this floor, by its readings.
     """
+    if any(visit.estimate is not None for visit in visits) and (
+        map_probability < MIN_MAP_PROBABILITY
+    ):
+        return True
     misread = sum(
-        describe_visit(visit.hypotheses, visit.estimate, floor).refused == "misread"
-        for visit in on_map
+        visit.estimate.misread_probability for visit in on_map if visit.estimate is not None
     )
     unexplained = sum(visit.hypotheses.refused == "not_explained" for visit in visits)
     contradictions = misread + unexplained

@@ -292,8 +292,8 @@ def misread_figures(floor: FloorMap, source: str) -> list[Figure]:
                f"more, after any of the landmarks or at the end{listed and f'; walks {listed}'}",
                0.0),
         Figure("5 % misread: wrong with a remark", 100 * remarked / len(walks), "%",
-               f"of the same walks, at {MIN_CELL_PROBABILITY} to {PROVISIONAL_PROBABILITY}: poses are "
-               "reported with their probability"),
+               f"of the same walks, at {MIN_CELL_PROBABILITY} to {PROVISIONAL_PROBABILITY}: poses "
+               "are provisional"),
         Figure("5 % misread: landmarks needed", float(np.mean(localized)), "landmarks",
                f"mean until {PROVISIONAL_PROBABILITY} is reached; 99 % within "
                f"{np.quantile(localized, 0.99):.0f}", peer="paper, no fault", peer_value=3.0),

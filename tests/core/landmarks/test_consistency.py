@@ -25,7 +25,7 @@ from locatk.core.landmarks.simulation.session import (
     simulate,
 )
 from locatk.core.landmarks.solver import solve
-from locatk.core.solution import Solution, SolverWarning
+from locatk.core.solution import Solution
 
 CODES = np.random.default_rng(11).integers(0, 16, (12, 12))
 
@@ -74,27 +74,6 @@ def test_contradicted_map_is_rejected(wrong: int, accepted: bool) -> None:
     assert ("map_contradicted" in [each.code for each in result.warnings]) != accepted
 
 
-@pytest.mark.parametrize(
-    ("probability", "first", "message"),
-    [
-        (0.999990, 3, None),
-        (1.0, None, None),
-        (0.99998, None, "its cell on the map is almost certain (0.99998)"),
-        (0.99900, 2, "its cell on the map is almost certain (0.99900)"),
-        (0.96, None, "its cell on the map has a probability of 0.96000; visit one more landmark"),
-        (0.96, 2, "its cell on the map has a probability of 0.96000 at one landmark"),
-    ],
-)  # fmt: skip
-def test_uncertain_cells_are_reported(
-    probability: float, first: int | None, message: str | None
-) -> None:
-    warning = consistency.warn_of_uncertain_cell(probability, first)
-    if message is None:
-        assert warning is None
-    else:
-        assert warning == SolverWarning("localization_uncertain", message)
-
-
 # ---- guards
 
 
@@ -109,9 +88,10 @@ def visits_of(misread: int, unexplained: int, correct: int) -> list[IdentifiedVi
         for read in codes:
             one = Hypothesis(read, 1.0, np.zeros(3), np.eye(3), np.ones(4), np.ones(4))
             hypotheses = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (one,), refused=refused)
-            estimate = None if refused else CellEstimate((2, 2), 0, 0, 1.0, 1.0)
+            misread_probability = float(read != code)
+            estimate = CellEstimate((2, 2), 0, 0, 1.0, 1.0, misread_probability=misread_probability)
             segment = VisitSegment(0, 5, np.arange(5), None, np.zeros(3))  # type: ignore[arg-type]
-            visits.append(IdentifiedVisit(segment, hypotheses, estimate))
+            visits.append(IdentifiedVisit(segment, hypotheses, None if refused else estimate))
     return visits
 
 
@@ -124,7 +104,7 @@ def test_contradictions_are_counted(
 ) -> None:
     visits = visits_of(misread, unexplained, correct)
     on_map = [visit for visit in visits if visit.estimate is not None]
-    assert consistency.is_map_contradicted(visits, on_map, FLOOR) == contradicted
+    assert consistency.is_map_contradicted(visits, on_map, 1.0) == contradicted
 
 
 @pytest.mark.parametrize(
