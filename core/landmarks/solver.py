@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -227,16 +226,17 @@ def localize_robot(
     unlocalized = LocalizedRobot(identified, facts, recording.warnings)
     if floor is None:
         return _with_warnings(unlocalized, NO_MAP_WARNING.about(identified.device))
-    probability = facts.probability if facts.probability is not None else math.nan
     if is_map_contradicted(visits, on_map, identified.map_probability):
         message = (
             "not localised; too many of its landmarks differ from the map: is it the map of this "
             "floor, and does the odometry have the right sign?"
         )
-        warning = SolverWarning("map_contradicted", message).about(identified.device)
-        not_localised = replace(facts, localised=False)
-        return _with_warnings(replace(unlocalized, facts=not_localised), warning)
-    if not on_map:
+        obstacle = SolverWarning("map_contradicted", message).about(identified.device)
+    elif not on_map:
+        obstacle = warn_of_missing_pose(recording, visits, facts.probability or 0.0)
+    else:
+        obstacle = None
+    if obstacle is not None:
         polarity = warn_of_opposite_polarity(
             identified.device,
             visits,
@@ -244,8 +244,8 @@ def localize_robot(
             misread=options.misread,
             drift=identified.priors.drift,
         )
-        reason = warn_of_missing_pose(recording, visits, probability)
-        return _with_warnings(unlocalized, reason, *polarity)
+        not_localised = replace(facts, localised=False, provisional=False)
+        return _with_warnings(replace(unlocalized, facts=not_localised), obstacle, *polarity)
     smoothed, warnings = smooth_robot(identified, on_map, floor)
     facts = replace(facts, misfit_sigma=smoothed.residual_sigma)
     robot = _with_warnings(replace(unlocalized, facts=facts), *warnings)
