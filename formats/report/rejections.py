@@ -254,10 +254,10 @@ def _landmarks_reasons() -> dict[str, Reason]:
         f"probability below {cell_filter.MIN_CELL_PROBABILITY:g}.",
         "misread": "The position is known, and the map has another landmark there: it was built "
         "incorrectly or misread. It is used as it was read.",
-        "uncertain": "The position is known, and the map has another landmark there than the one that "
-        "was read, with too little evidence to call it misread: the robot grazed it.",
-        "inconsistent": "Position and code contradict the odometry and the visits before and after: "
-        "the visit is not used.",
+        "uncertain": "The position is known, and the map has another landmark there than the one "
+        "that was read, with too little evidence to call it misread: the robot grazed it.",
+        "inconsistent": "Position and code contradict the odometry and the visits before and "
+        "after: the visit is not used.",
         "off_map": "By odometry the landmark is at a position where the map has none.",
         "not_explained": "The residuals of every landmark are "
         f"{hypotheses.MAX_RESIDUAL_SIGMAS:g} standard deviations or more: iron, a tool, broken "
