@@ -62,9 +62,6 @@ CARRIED_PROBABILITY = 1e-6
 """Probability that a robot was carried to any other cell between two visits, times the density of
 its pose there relative to that of a pose by odometry (about 1e-4)."""
 
-START_OUTSIDE_PROBABILITY = 1e-4
-"""Probability that a recording begins outside of the map."""
-
 RETURN_PROBABILITY = 1e-2
 """Probability of entering the map between two visits, from outside of it."""
 
@@ -336,10 +333,9 @@ class CellModel:
 
     def first(self) -> tuple[Belief, float]:
         """Return the belief after the first visit, and the probability of its readings."""
-        prior = (1 - START_OUTSIDE_PROBABILITY) / self.state_count
-        updated = [prior * self.likelihood(0, n) for n in range(len(self.followed[0]))]
-        outside = START_OUTSIDE_PROBABILITY * self.any_code_likelihood(0)
-        return self._normalized(0, updated, outside, [])
+        count = len(self.followed[0])
+        updated = [self.likelihood(0, n) / self.state_count for n in range(count)]
+        return self._normalized(0, updated, 0.0, [])
 
     def advance(self, belief: Belief, visit: int) -> tuple[Belief, float]:
         """Return the belief after the next visit, and the probability of its readings."""
@@ -368,7 +364,8 @@ class CellModel:
             for each in belief.components
             if visit - each.visit <= MAX_SUCCESSIVE_OUTLIERS
         ]
-        return self._normalized(visit, updated, any_code * outside, outliers)
+        outside *= self.outside_likelihood(visit)
+        return self._normalized(visit, updated, outside, outliers)
 
     def _normalized(
         self, visit: int, updated: list[Array], outside: float, outliers: list[Component]
@@ -427,6 +424,10 @@ class CellModel:
             count = len(self.followed[visit])
             return float(sum(self.likelihood(visit, n)[0] for n in range(count)))
         return sum(one.probability for _, one in self.followed[visit]) / CODE_COUNT
+
+    def outside_likelihood(self, visit: int) -> float:
+        """Return the likelihood of a visit to a landmark outside of the map."""
+        return OUTSIDE_LANDMARK_PROBABILITY * self.any_code_likelihood(visit)
 
     # ---- steps
 
@@ -578,7 +579,7 @@ class CellModel:
             else:
                 stays[component.visit, component.hypothesis] = component.states, value
         anywhere /= self.state_count
-        outside = outside * any_code
+        outside *= self.outside_likelihood(visit)
         values = []
         for component in belief.components:
             value = np.full(len(component.states), CARRIED_PROBABILITY * (anywhere + outside))

@@ -3,11 +3,13 @@
 Odometry is right up to its drift, or a wheel slipped. A step therefore has the likelihood of a
 mixture: a normal distribution of the difference from the odometry, and a Cauchy distribution of
 distance and angle, whose long tails are those of a slip (Lange, Little and Taylor, J. Am. Stat.
-Assoc. 84 (1989) 881). Likelihoods are relative to the peak of the normal distribution.
+Assoc. 84 (1989) 881). Likelihoods are relative to the peak of the normal distribution, as long as
+odometry determines the cell.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,9 +36,12 @@ SLIP_PROBABILITY = 0.01
 SLIP_SCALE_M, SLIP_SCALE_RAD = 0.03, math.radians(10)
 """Scales of the Cauchy distributions of a slip: half of all slips are smaller."""
 
-NEARBY_CELLS = np.array([(x, y) for x in range(-1, 3) for y in range(-1, 3)])
-"""Cells that a slip may lead to, relative to the one at the lower left of a position: the nearest
-ones and one more on each side."""
+MIN_RANGE_CELLS, MAX_RANGE_CELLS = 1, 4
+"""Range of cells that are considered beyond the nearest ones on each side: at least those that a
+slip leads to, and at most those of odometry over several metres."""
+
+RANGE_SIGMAS = 2.0
+"""The same in standard deviations of the odometry."""
 
 MIN_STEP_LIKELIHOOD = 1e-9
 """Likelihood below which a step is not followed."""
@@ -118,14 +123,20 @@ def steps_between(
     )
     frame_rotation = start.pose[2] + rotation - end.pose[2]
     nearest = round(frame_rotation / HALF_PI_RAD)
+    reach = math.ceil(RANGE_SIGMAS * position_sigma_m / pitch_m)
+    reach = min(max(reach, MIN_RANGE_CELLS), MAX_RANGE_CELLS)
+    nearby = np.array(list(itertools.product(range(-reach, reach + 2), repeat=2)))
     # All rotations (4, 1, 2) times all cells near the position (1, n, 2).
     quarters = np.arange(nearest - 1, nearest + 3)
     angle = np.remainder(frame_rotation - quarters * HALF_PI_RAD + math.pi, math.tau) - math.pi
     robot = np.stack([_rotated(end.pose[:2], each * HALF_PI_RAD) for each in quarters.tolist()])
     expected = ((position - robot) / pitch_m)[:, None]
-    cells = np.floor(expected).astype(np.int64) + NEARBY_CELLS
+    cells = np.floor(expected).astype(np.int64) + nearby
     distance_m = pitch_m * np.hypot(*np.moveaxis(expected - cells, 2, 0))
-    by_odometry = np.exp(
+    # Odometry over a long distance leaves many cells and headings open, and none is likely.
+    peak = min(1.0, pitch_m**2 / (math.tau * position_sigma_m**2))
+    peak *= min(1.0, HALF_PI_RAD / (math.sqrt(math.tau) * frame_sigma))
+    by_odometry = peak * np.exp(
         -((distance_m / position_sigma_m) ** 2 + (angle[:, None] / frame_sigma) ** 2) / 2
     )
     slip = _slip_likelihood(distance_m, angle[:, None], position_sigma_m, frame_sigma)
@@ -134,7 +145,7 @@ def steps_between(
     order = order[likelihood[order] > MIN_STEP_LIKELIHOOD]
     return CellSteps(
         cells.reshape(-1, 2)[order],
-        np.repeat(quarters, len(NEARBY_CELLS))[order],
+        np.repeat(quarters, len(nearby))[order],
         likelihood[order],
         by_odometry.ravel()[order],
     )
