@@ -35,7 +35,6 @@ from locatk.core.landmarks.detection.hypotheses import DetectedVisit, Hypothesis
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, rotated
 from locatk.core.landmarks.localization.cell_steps import (
-    MIN_ODOMETRY_LIKELIHOOD,
     CellSteps,
     NumberedHypothesis,
     steps_between,
@@ -525,7 +524,7 @@ class CellModel:
                 drift=self.drift,
             )
             chain, (x, y), heading = path[-1]
-            if len(steps) and steps.odometry_likelihood[0] > MIN_ODOMETRY_LIKELIHOOD:
+            if len(steps):
                 dx, dy = steps.cells[0]
                 for _ in range(heading):
                     dx, dy = -dy, dx
