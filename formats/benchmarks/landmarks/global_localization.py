@@ -19,7 +19,11 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, code_of, rotated
-from locatk.core.landmarks.localization.cell_filter import MIN_CELL_PROBABILITY, identify_cells
+from locatk.core.landmarks.localization.cell_filter import (
+    MIN_CELL_PROBABILITY,
+    CellEstimate,
+    CellModel,
+)
 from locatk.core.landmarks.localization.consistency import PROVISIONAL_PROBABILITY
 from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.map.windows import window_path, window_readings
@@ -220,14 +224,16 @@ def localize_stops(
     floor: FloorMap, observations: Sequence[VisitHypotheses]
 ) -> tuple[list[tuple[Cell, int, float]], list[tuple[Cell, int, float]]]:
     """Return cell, heading and probability of each stop: after this stop, and after all stops."""
-    drift, misread = OdometryDrift(), SolveOptions().misread
-    current, estimates = [], []
-    for count in range(1, len(observations) + 1):
-        result = identify_cells(observations[:count], floor, misread=misread, drift=drift)
-        estimates = result.estimates
-        last = estimates[-1]
-        current.append((last.cell, last.quarters, last.probability))
-    return current, [(each.cell, each.quarters, each.probability) for each in estimates]
+    model = CellModel(observations, floor, misread=SolveOptions().misread, drift=OdometryDrift())
+    beliefs = [model.first()[0]]
+    for number in range(1, len(observations)):
+        beliefs.append(model.advance(beliefs[-1], number)[0])
+    current = [estimate for belief in beliefs for estimate in model.estimates([belief])]
+    return _cells(current), _cells(model.estimates(beliefs))
+
+
+def _cells(estimates: Sequence[CellEstimate]) -> list[tuple[Cell, int, float]]:
+    return [(each.cell, each.quarters, each.probability) for each in estimates]
 
 
 # ---- figures
