@@ -250,8 +250,13 @@ def identify_cells(
             estimates += model.estimates(beliefs)[:BLOCK_VISITS]
             beliefs = beliefs[BLOCK_VISITS:]
     estimates += model.estimates(beliefs)
-    odds = math.log(OTHER_FLOOR_PROBABILITY / (1 - OTHER_FLOOR_PROBABILITY)) + log_other - log_map
-    return CellIdentification(estimates, 1 / (1 + math.exp(min(odds, 700.0))))
+    return CellIdentification(estimates, map_probability(log_map - log_other))
+
+
+def map_probability(log_evidence_ratio: float) -> float:
+    """Return the probability of a map by the evidence for it against that for any other floor."""
+    prior_odds = OTHER_FLOOR_PROBABILITY / (1 - OTHER_FLOOR_PROBABILITY)
+    return 1 / (1 + prior_odds * math.exp(min(-log_evidence_ratio, 700.0)))
 
 
 # ---- beliefs

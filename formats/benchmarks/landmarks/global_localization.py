@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ from locatk.core.landmarks.localization.cell_filter import (
     MIN_CELL_PROBABILITY,
     CellEstimate,
     CellModel,
+    OtherFloor,
+    map_probability,
 )
 from locatk.core.landmarks.localization.consistency import PROVISIONAL_PROBABILITY
 from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
@@ -220,20 +223,37 @@ def random_misreadings(floor: FloorMap, rng: np.random.Generator) -> dict[Cell, 
     }
 
 
+class LocalizedStop(NamedTuple):
+    """Estimated cell and heading, and the probabilities of both and of the floor."""
+
+    cell: Cell
+    quarters: int
+    probability: float
+    map_probability: float
+
+    @property
+    def pose(self) -> tuple[Cell, int]:
+        return self.cell, self.quarters
+
+
 def localize_stops(
     floor: FloorMap, observations: Sequence[VisitHypotheses]
-) -> tuple[list[tuple[Cell, int, float]], list[tuple[Cell, int, float]]]:
-    """Return cell, heading and probability of each stop: after this stop, and after all stops."""
+) -> tuple[list[LocalizedStop], list[LocalizedStop]]:
+    """Return the estimate of each stop: after this stop, and after all stops."""
     model = CellModel(observations, floor, misread=SolveOptions().misread, drift=OdometryDrift())
-    beliefs = [model.first()[0]]
-    for number in range(1, len(observations)):
-        beliefs.append(model.advance(beliefs[-1], number)[0])
-    current = [estimate for belief in beliefs for estimate in model.estimates([belief])]
-    return _cells(current), _cells(model.estimates(beliefs))
+    other, log_ratio = OtherFloor(model), 0.0
+    beliefs, current = [], []
+    for number in range(len(observations)):
+        belief, evidence = model.advance(beliefs[-1], number) if number else model.first()
+        log_ratio += math.log(evidence / other.advance(number))
+        beliefs.append(belief)
+        current += _stops(model.estimates([belief]), log_ratio)
+    return current, _stops(model.estimates(beliefs), log_ratio)
 
 
-def _cells(estimates: Sequence[CellEstimate]) -> list[tuple[Cell, int, float]]:
-    return [(each.cell, each.quarters, each.probability) for each in estimates]
+def _stops(estimates: Sequence[CellEstimate], log_ratio: float) -> list[LocalizedStop]:
+    of_map = map_probability(log_ratio)
+    return [LocalizedStop(each.cell, each.quarters, each.probability, of_map) for each in estimates]
 
 
 # ---- figures
@@ -246,8 +266,8 @@ def perfect_figures(floor: FloorMap, source: str) -> list[Figure]:
     correct, probability = [], []
     for walk in walks:
         _, stops = localize_stops(floor, simulate_observations(floor, walk, {}, rng))
-        correct.append([(cell, quarters) for cell, quarters, _ in stops] == walk.stops)
-        probability.append(stops[-1][2])
+        correct.append([stop.pose for stop in stops] == walk.stops)
+        probability.append(stops[-1].probability)
     smallest, mean = min(probability), float(np.mean(probability))
     has_poses = [c and p >= MIN_CELL_PROBABILITY for c, p in zip(correct, probability, strict=True)]
     how = (
@@ -278,12 +298,22 @@ def misread_figures(floor: FloorMap, source: str) -> list[Figure]:
         misread = random_misreadings(floor, rng)
         walks_with_misreadings += any(cell in misread for cell in walk.cells)
         current, final = localize_stops(floor, simulate_observations(floor, walk, misread, rng))
-        estimates = zip([*current, *final], [*walk.stops, *walk.stops], strict=True)
-        wrong = max((p for (cell, q, p), stop in estimates if (cell, q) != stop), default=0.0)
+        wrong = max(
+            (
+                each.probability * each.map_probability
+                for each, true in zip([*current, *final], [*walk.stops, *walk.stops], strict=True)
+                if each.pose != true
+            ),
+            default=0.0,
+        )
         if wrong >= PROVISIONAL_PROBABILITY:
             silently_wrong.append(number)
         remarked += MIN_CELL_PROBABILITY <= wrong < PROVISIONAL_PROBABILITY
-        certain = (n for n, (_, _, p) in enumerate(current, 1) if p >= PROVISIONAL_PROBABILITY)
+        certain = (
+            number
+            for number, each in enumerate(current, 1)
+            if each.probability * each.map_probability >= PROVISIONAL_PROBABILITY
+        )
         landmarks_needed.append(next(certain, math.inf))
     localized = [n for n in landmarks_needed if math.isfinite(n)] or [math.nan]
     how = (
