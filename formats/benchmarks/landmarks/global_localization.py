@@ -22,6 +22,7 @@ from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, code_of, rotated
 from locatk.core.landmarks.localization.cell_filter import (
     MIN_CELL_PROBABILITY,
+    Belief,
     CellEstimate,
     CellModel,
     OtherFloor,
@@ -242,7 +243,8 @@ def localize_stops(
     """Return the estimate of each stop: after this stop, and after all stops."""
     model = CellModel(observations, floor, misread=SolveOptions().misread, drift=OdometryDrift())
     other, log_ratio = OtherFloor(model), 0.0
-    beliefs, current = [], []
+    beliefs: list[Belief] = []
+    current: list[LocalizedStop] = []
     for number in range(len(observations)):
         belief, evidence = model.advance(beliefs[-1], number) if number else model.first()
         log_ratio += math.log(evidence / other.advance(number))
