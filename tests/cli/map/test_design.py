@@ -210,6 +210,12 @@ def test_impossible_designs_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_hint_names_changes_and_not_what_is_set(locatk, tmp_path: Path) -> None:
+    result = locatk("map", "design", "34x34", "--window", "L", "-o", tmp_path / "map.toml")
+    assert result.exit_code == 1
+    assert result.stderr.endswith("Hint: Use --window 2x2, or a floor of 25x25.\n")
+
+
 # ---- design --landmark
 
 
