@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,7 +50,9 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
 
     proved: list[tuple[Path, FloorMap, MapProof]] = []
     floors = [(path, read_map(path)) for path in maps]
-    with console.progress(floors, "Proving") as bar:
+    # A bar of one step shows nothing.
+    shown = console.working("Proving") if len(floors) == 1 else contextlib.nullcontext()
+    with shown, console.progress(floors, "Proving") as bar:
         for path, floor in bar:
             proved.append((path, floor, prove_map(replace(floor, codes=as_built_codes(floor)))))
     for number, (path, floor, proof) in enumerate(proved):

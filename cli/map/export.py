@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 ENDINGS = {".csv": "csv", ".json": "lif", ".lif": "lif", ".yaml": "ros", ".svg": "svg"}
 ENDINGS |= {".yml": "ros", ".dxf": "dxf"}
 FORMATS = ("csv", "lif", "ros", "svg", "dxf")
+LIF_VERSIONS = ("1.0.0", "2.0.0")
 
 
 def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
@@ -48,6 +49,18 @@ def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
     metavar="MM",
     help="--format ros: side of a pixel.",
 )
+@click.option(
+    "--lif-version",
+    type=click.Choice(LIF_VERSIONS),
+    help="--format lif: version of the format; 2.0.0 (September 2026) is not compatible with 1.0.0."
+    "  [default: 1.0.0]",
+)
+@click.option(
+    "--unique-codes",
+    is_flag=True,
+    help="--format csv: give each landmark a code of its own, for controllers that look up "
+    "positions by code.  [default: the code of its bars, 0 to 15, which repeats]",
+)
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -56,20 +69,24 @@ def command(
     format_name: str | None,
     output: Path,
     resolution_mm: float,
+    lif_version: str | None,
+    unique_codes: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Write the landmarks of MAP_FILE for other tools.
 
     `csv` is the table No;Code;X mm;Y mm;Attr1;..;Attr4 of vehicle controllers (Goetting), `lif` the
-    Layout Interchange Format 1.0.0 of VDMA for master controls, `ros` the YAML and PGM of
+    Layout Interchange Format of VDMA for master controls, `ros` the YAML and PGM of
     map_server, `svg` and `dxf` a drawing of the floor at true size, in layers. If the map contains
     positions as built, these are written.
 
     \b
     Examples:
       locatk map export map.toml -o map.csv
+      locatk map export map.toml -o transponders.csv --unique-codes
       locatk map export map.toml --format lif -o layout.json
+      locatk map export map.toml --format lif --lif-version 2.0.0 -o layout.json
       locatk map export map.toml --format ros -o floor.yaml --resolution 5
       locatk map export map.toml -o floor.dxf
     """
@@ -77,6 +94,10 @@ def command(
     from locatk.formats.output import atomic_write
 
     format_name = format_of(output, format_name, FORMATS)
+    if lif_version is not None and format_name != "lif":
+        raise click.UsageError(f"--lif-version is of --format lif, not of {format_name}.")
+    if unique_codes and format_name != "csv":
+        raise click.UsageError(f"--unique-codes is of --format csv, not of {format_name}.")
     files = [output, output.with_suffix(".pgm")] if format_name == "ros" else [output]
     if len(set(files)) < len(files):
         raise click.UsageError("The image of `ros` is the .pgm; end the output with .yaml.")
@@ -84,7 +105,17 @@ def command(
         options.guard_output(path, overwrite=overwrite, inputs=[map_file])
     floor = read_map(map_file)
     with console.working("Drawing"):
-        contents = _render(floor, format_name, files, resolution_mm, _stamp(map_file))
+        if format_name == "csv":
+            from locatk.formats.exporters.map_csv import dumps_csv
+
+            contents = [dumps_csv(floor, unique_codes).encode()]
+        elif format_name == "lif":
+            from locatk.formats.exporters.map_lif import dumps_lif
+
+            version = lif_version or LIF_VERSIONS[0]
+            contents = [dumps_lif(floor, _stamp(map_file), version).encode()]
+        else:
+            contents = _draw(floor, format_name, files, resolution_mm)
     with contextlib.ExitStack() as stack:
         for path, data in zip(files, contents, strict=True):
             stack.enter_context(atomic_write(path, overwrite=overwrite)).write(data)
@@ -105,18 +136,10 @@ def command(
         )
 
 
-def _render(
-    floor: FloorMap, format_name: str, files: list[Path], resolution_mm: float, stamp: datetime
+def _draw(
+    floor: FloorMap, format_name: str, files: list[Path], resolution_mm: float
 ) -> list[bytes]:
-    """Return the content of each file."""
-    if format_name == "csv":
-        from locatk.formats.exporters.map_csv import dumps_csv
-
-        return [dumps_csv(floor).encode()]
-    if format_name == "lif":
-        from locatk.formats.exporters.map_lif import dumps_lif
-
-        return [dumps_lif(floor, stamp).encode()]
+    """Return the content of each file of a drawing."""
     if format_name == "svg":
         from locatk.formats.exporters import map_svg
 

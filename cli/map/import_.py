@@ -73,7 +73,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write a map of the landmarks in SOURCE, a table as of `locatk map export` or a LIF layout.
+    """Write a map of the landmarks in SOURCE, a table of `locatk map export` or a LIF layout.
 
     Pitch, rows and columns are estimated from the positions. If a landmark deviates from its cell,
     its position is imported as built; a deviation beyond the tolerance is an error. Such files do

@@ -15,6 +15,8 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import DegenerateError, InputError
+from locatk.core.landmarks.design.alternatives import DesignAdvisor
 from locatk.core.landmarks.design.generation import (
     DesignOptions,
     design_map,
@@ -84,10 +86,8 @@ def crop_map(options: DesignOptions) -> FloorMap | None:
     random = np.random.RandomState(options.seed % 2**32)
     size = (options.rows, options.columns)
     for entry in library_maps():
-        if (entry.alphabet, entry.window) != (options.alphabet, options.window):
-            continue
-        rotations = [quarters for quarters in range(4) if _fits(size, entry, quarters)]
-        if entry.detect < options.detect or not rotations:
+        rotations = _fitting_rotations(options, entry)
+        if not rotations:
             continue
         quarters = rotations[random.randint(len(rotations))]
         codes = rotated_map(entry.codes(), quarters, options.alphabet)
@@ -113,17 +113,35 @@ def design_or_crop(
     Raises
     ------
     InputError, DegenerateError
-        See :func:`locatk.core.landmarks.design.generation.design_map`.
+        See :func:`locatk.core.landmarks.design.generation.design_map`; the hint names changes of
+        the options with which a map is found.
     """
     floor = crop_map(options)
-    return design_map(options, progress) if floor is None else floor
+    if floor is not None:
+        return floor
+    try:
+        return design_map(options, progress)
+    except (InputError, DegenerateError) as error:
+        changes = list(DesignAdvisor(options, _is_in_library).iter_changes())
+        error.hint = f"use {', or '.join(changes)}" if changes else error.hint
+        raise
 
 
-def _fits(size: tuple[int, int], entry: LibraryMap, quarters: int) -> bool:
-    rows, columns = (
-        (entry.rows, entry.columns) if quarters % 2 == 0 else (entry.columns, entry.rows)
-    )
-    return size[0] <= rows and size[1] <= columns
+def _is_in_library(options: DesignOptions) -> bool:
+    return any(_fitting_rotations(options, entry) for entry in library_maps())
+
+
+def _fitting_rotations(options: DesignOptions, entry: LibraryMap) -> list[int]:
+    """Return the rotations of a map of the library in which it contains the floor."""
+    is_suitable = (entry.alphabet, entry.window) == (options.alphabet, options.window)
+    if not is_suitable or entry.detect < options.detect:
+        return []
+    shapes = [(entry.rows, entry.columns), (entry.columns, entry.rows)]
+    return [
+        quarters
+        for quarters in range(4)
+        if options.rows <= shapes[quarters % 2][0] and options.columns <= shapes[quarters % 2][1]
+    ]
 
 
 def rotated_map(codes: Codes, quarters: int, alphabet: str) -> Codes:

@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -172,6 +173,21 @@ def run_single_threaded(call: str) -> list[float]:
     code = f"from locatk.formats.benchmarks.{module} import {name}; print(*{expression})"
     command = [sys.executable, "-c", code]
     return [float(word) for word in run_command(command, SINGLE_THREAD_ENVIRONMENT).split()]
+
+
+def peak_memory_mb() -> float:
+    """Return the largest memory [MB] of this process until now.
+
+    Raises
+    ------
+    OSError
+        The system does not report it.
+    """
+    # The value of getrusage includes the memory of the parent before the program was started.
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    raise OSError("no VmHWM in /proc/self/status")
 
 
 def time_command(command: Sequence[str], repeats: int = 1, folder: str | None = None) -> Duration:

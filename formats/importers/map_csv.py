@@ -8,7 +8,10 @@ The columns are those of Goetting's navigation controllers (manual of the HG G-7
 - ``X mm`` and ``Y mm`` are its position in the frame of the map, as built if that is known;
 - ``Attr1`` is its heading as built in 1/100 degree, 0 as designed (the controller reads a heading
   there for start transponders only);
-- ``Attr2``, ``Attr3`` and ``Attr4`` are 0: there is no start transponder.
+- ``Attr2``, ``Attr3`` and ``Attr4`` are 0: there is no start transponder;
+- ``Landmark``, which may follow, is the letters of the bars, as in ``NNSN``. ``Code`` is then any
+  number, for controllers that look up positions by it
+  (:func:`locatk.formats.exporters.map_csv.landmark_number`).
 
 The table does not contain the alphabet, the window, the walls and the bars. It is written by
 :mod:`locatk.formats.exporters.map_csv`.
@@ -22,12 +25,14 @@ import math
 import os
 
 from locatk.core.errors import FormatError, error_context
-from locatk.core.landmarks.landmark import CODE_COUNT
+from locatk.core.landmarks.landmark import CODE_COUNT, code_of
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
 from locatk.core.units import metres
 
 HEADER = ("No", "Code", "X mm", "Y mm", "Attr1", "Attr2", "Attr3", "Attr4")
+
+LETTERS_COLUMN = "Landmark"
 
 MAX_COORDINATE_MM = 1e7
 """10 km, larger than any floor: larger numbers are in another unit."""
@@ -76,7 +81,7 @@ def loads_csv(
                 columns = _header(cells, file, rows.line_num)
                 continue
             line = _Line(cells, columns, file, rows.line_num)
-            codes.append(line.integer("Code", 0, CODE_COUNT - 1))
+            codes.append(line.code())
             # The heading of a start transponder is that of the vehicles.
             is_start = line.number("Attr4", 0) == 1
             heading = 0.0 if is_start else line.number("Attr1", MAX_HEADING_CENTIDEGREES)
@@ -118,15 +123,22 @@ class _Line:
             raise self._error(f"{text!r} under {name!r}, expected a number up to {max_abs:g}")
         return value
 
-    def integer(self, name: str, low: int, high: int) -> int:
-        """Return a whole number from ``low`` to ``high``."""
+    def code(self) -> int:
+        """Return the code of the landmark, by its letters if they have a column."""
+        name = LETTERS_COLUMN if LETTERS_COLUMN in self._columns else "Code"
         index = self._columns[name]
         text = self._cells[index] if index < len(self._cells) else ""
+        if name == LETTERS_COLUMN:
+            try:
+                return code_of(text)
+            except ValueError:
+                expected = "the letters of the bars of a landmark, as in NNSN"
+                raise self._error(f"{text!r} under {name!r}, expected {expected}") from None
         is_whole = text.isascii() and text.isdigit() and len(text) < 10
-        if not (is_whole and low <= int(text) <= high):
+        if not (is_whole and int(text) < CODE_COUNT):
             raise self._error(
-                f"{text!r} under {name!r}, expected a whole number from {low} to {high}, the "
-                "code of a landmark"
+                f"{text!r} under {name!r}, expected a whole number from 0 to {CODE_COUNT - 1}, the "
+                f"code of a landmark, or a column {LETTERS_COLUMN!r}"
             )
         return int(text)
 
@@ -140,10 +152,12 @@ def _header(cells: list[str], file: str | os.PathLike[str], line: int) -> dict[s
     plain = {cell.removesuffix("mm").strip(): number for number, cell in enumerate(bare)}
     columns = {
         name: plain[key]
-        for name in HEADER
+        for name in (*HEADER, LETTERS_COLUMN)
         if (key := name.lower().removesuffix("mm").strip()) in plain
     }
     missing = [name for name in ("Code", "X mm", "Y mm") if name not in columns]
+    if LETTERS_COLUMN in columns and "Code" in missing:
+        missing.remove("Code")
     if missing:
         raise FormatError(
             f"no column {missing[0]!r}",

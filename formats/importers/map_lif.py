@@ -1,8 +1,8 @@
-"""Landmark maps from layouts in VDMA's Layout Interchange Format (LIF).
+"""Landmark maps from layouts in VDMA's Layout Interchange Format (LIF) 1.0.0 and 2.0.0.
 
-A node is a landmark, whose name is the letters of its bars. Neighbours without an edge in either
-direction are separated by a wall. The format and the conventions of its nodes and edges are
-described in :mod:`locatk.formats.exporters.map_lif`, which writes such layouts.
+A node is a landmark, whose name (in LIF 2, its descriptor) is the letters of its bars. Neighbours
+without an edge in either direction are separated by a wall. The format and the conventions of its
+nodes and edges are described in :mod:`locatk.formats.exporters.map_lif`, which writes such layouts.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
 
 MAX_COORDINATE_M = 1e4
 """10 km, larger than any floor: larger numbers are in another unit."""
+
+LETTERS_KEY = {"1": "nodeName", "2": "nodeDescriptor"}
+"""Key of the letters of a node by the major version of LIF."""
 
 
 def loads_lif(
@@ -50,7 +53,7 @@ def loads_lif(
         The positions are not on a grid; the error names a deviating node.
     """
     reader = _LayoutReader(file)
-    layout = reader.layout(text)
+    layout, major = reader.layout(text)
     codes, poses, names = [], [], []
     index: dict[str, int] = {}
     for number, node in enumerate(reader.objects(layout, "nodes")):
@@ -59,7 +62,7 @@ def loads_lif(
         if node_id in index:
             raise reader.error(f"node {node_id!r} occurs twice", where)
         index[node_id] = number
-        codes.append(reader.code(node, where, node_id))
+        codes.append(reader.code(node, LETTERS_KEY[major], where, node_id))
         poses.append((*reader.position(node, where), 0.0))
         names.append(f"node {node_id!r}")
     if not codes:
@@ -98,8 +101,8 @@ class _LayoutReader:
     def error(self, message: str, where: str, hint: str | None = None) -> FormatError:
         return FormatError(message, file=self._file, where=where, hint=hint)
 
-    def layout(self, text: str) -> dict[str, Any]:
-        """Return the only layout of the text."""
+    def layout(self, text: str) -> tuple[dict[str, Any], str]:
+        """Return the only layout of the text, and the major version of its format."""
         try:
             data = json.loads(text.removeprefix("\ufeff"))
         except json.JSONDecodeError as error:
@@ -108,16 +111,36 @@ class _LayoutReader:
             ) from None
         except (ValueError, RecursionError) as error:
             raise FormatError(f"not JSON ({error})", file=self._file) from None
-        if not isinstance(data, dict) or "layouts" not in data:
-            raise FormatError("not LIF: expected the key 'layouts'", file=self._file)
-        layouts = self.objects(data, "layouts")
+        if not isinstance(data, dict):
+            raise FormatError("not LIF: expected an object", file=self._file)
+        major = self._major_version(data)
+        root = "layouts" if major == "1" else "origins"
+        if root not in data:
+            raise FormatError(f"not LIF {major}: expected the key {root!r}", file=self._file)
+        parents = [data] if major == "1" else self.objects(data, "origins")
+        layouts = [layout for parent in parents for layout in self.objects(parent, "layouts")]
         if len(layouts) != 1:
             raise self.error(
                 f"{len(layouts)} layouts, expected one",
                 "layouts",
                 "A landmark map is one floor: keep one layout in the file",
             )
-        return layouts[0]
+        return layouts[0], major
+
+    def _major_version(self, data: dict[str, Any]) -> str:
+        """Return the stated major version; a file without one is recognized by its keys."""
+        head = data.get("metaInformation")
+        version = head.get("lifVersion") if isinstance(head, dict) else None
+        if version is None:
+            return "2" if "origins" in data else "1"
+        major = version.split(".")[0] if isinstance(version, str) else ""
+        if major not in LETTERS_KEY:
+            raise self.error(
+                f"version {version!r} of LIF is not supported",
+                "metaInformation.lifVersion",
+                "Export the layout as LIF 1.0.0 or 2.0.0",
+            )
+        return major
 
     def objects(self, data: dict[str, Any], key: str) -> list[dict[str, Any]]:
         """Return a list of objects."""
@@ -133,16 +156,16 @@ class _LayoutReader:
             raise self.error("expected a string", f"{where}.{key}")
         return value
 
-    def code(self, node: dict[str, Any], where: str, node_id: str) -> int:
-        """Return the code of the landmark that is the name of a node."""
-        letters = node.get("nodeName")
+    def code(self, node: dict[str, Any], key: str, where: str, node_id: str) -> int:
+        """Return the code of the landmark whose letters a node has under ``key``."""
+        letters = node.get(key)
         try:
             return code_of(letters if isinstance(letters, str) else "")
         except ValueError:
             raise self.error(
-                f"the name of node {node_id!r} is not a landmark",
-                f"{where}.nodeName",
-                "Give the letters of its bars as the name, as in NNSN: counter-clockwise from +x",
+                f"the {key} of node {node_id!r} is not a landmark",
+                f"{where}.{key}",
+                f"Give the letters of its bars as {key}, as in NNSN: counter-clockwise from +x",
             ) from None
 
     def position(self, node: dict[str, Any], where: str) -> tuple[float, float]:

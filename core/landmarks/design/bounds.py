@@ -89,26 +89,35 @@ def require_enough_words_for_windows(
     cells: Integers, heading: Integers, *, alphabet: str, window: str, detect: int
 ) -> None:
     """Apply :func:`require_enough_words` to windows (n, k, 2) at headings (n,)."""
-    count, bound = len(cells), max_distinct_readings(alphabet, window, detect)
-    words = len(ALPHABET_CODES[alphabet]) ** (len(WINDOW_PATHS[window]) - detect)
-    at_heading = ""
-    if alphabet == "compass":
-        # The headings share no words: the heading with the most windows decides.
-        count = int(np.bincount(heading, minlength=4).max())
-        bound, at_heading = words, "at one heading "
-    elif count <= words and bound < words:
-        # A window that is passable in one direction only may read a symmetric word.
-        count = _count_reversible_readings(cells, heading)
+    count, bound = count_competing_readings(
+        cells, heading, alphabet=alphabet, window=window, detect=detect
+    )
     if count <= bound:
         return
     side = max_square_side(alphabet, window, detect)
     raise InputError(
-        f"this floor has {count} readings {at_heading}of window {window}, but only {bound} of "
-        f"alphabet {alphabet} can be different"
+        f"this floor has {count} readings {'at one heading ' * (alphabet == 'compass')}of window "
+        f"{window}, but only {bound} of alphabet {alphabet} can be different"
         + (f" with {detect} misread landmarks detected" if detect else ""),
-        hint=f"make the floor smaller (a square has at most {side} x {side} landmarks, before any"
-        f" search), {'' if alphabet == '16' else 'use alphabet 16, '}or take a larger window",
+        hint=f"make the floor smaller: a square has at most {side} x {side} landmarks",
     )
+
+
+def count_competing_readings(
+    cells: Integers, heading: Integers, *, alphabet: str, window: str, detect: int
+) -> tuple[int, int]:
+    """Return the readings of windows (n, k, 2) at headings (n,), and how many can be different.
+
+    With ``compass`` the headings share no words: the heading with the most readings counts.
+    """
+    count, bound = len(cells), max_distinct_readings(alphabet, window, detect)
+    words = len(ALPHABET_CODES[alphabet]) ** (len(WINDOW_PATHS[window]) - detect)
+    if alphabet == "compass":
+        return int(np.bincount(heading, minlength=4).max()), words
+    if count <= words and bound < words:
+        # A window that is passable in one direction only may read a symmetric word.
+        count = _count_reversible_readings(cells, heading)
+    return count, bound
 
 
 def _count_reversible_readings(cells: Integers, heading: Integers) -> int:

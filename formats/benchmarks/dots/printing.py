@@ -6,7 +6,6 @@ import io
 import math
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +29,12 @@ from locatk.core.dots.identification.decoding import (
 from locatk.core.dots.sheet import Manifest
 from locatk.core.paper_sizes import paper_size
 from locatk.formats.benchmarks.figures import Duration, Figure
-from locatk.formats.benchmarks.timing import FIRST_SEED, measure_single_threaded, time_call
+from locatk.formats.benchmarks.timing import (
+    FIRST_SEED,
+    measure_single_threaded,
+    peak_memory_mb,
+    time_call,
+)
 from locatk.formats.printing import pattern
 
 SHEET_ORIGIN = (SECTION_LENGTH // 2, SECTION_LENGTH // 4)
@@ -230,17 +234,9 @@ def measure_reportlab(dots: int) -> tuple[float, float]:
 def measure_memory() -> tuple[float, float]:
     """Return the largest memory [MB] of this process before and after printing A0."""
     manifest = default_sheet("A0")
-    before_mb = _peak_memory_mb()
+    before_mb = peak_memory_mb()
     pattern.render(manifest)
-    return before_mb, _peak_memory_mb()
-
-
-def _peak_memory_mb() -> float:
-    # The value of getrusage includes the memory of the parent before the program was started.
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    raise OSError("no VmHWM in /proc/self/status")
+    return before_mb, peak_memory_mb()
 
 
 def raster_figures(paper: str, manifest: Manifest, pdf: bytes) -> list[Figure]:

@@ -149,10 +149,16 @@ def window_walks(floor: FloorMap) -> list[Walk]:
     ]
 
 
-def random_walk(floor: FloorMap, start: Cell, heading: int, rng: np.random.Generator) -> Walk:
-    """Walk from a start, straight ahead or to a side, if possible to cells not visited before."""
+def random_walk(
+    floor: FloorMap,
+    start: Cell,
+    heading: int,
+    rng: np.random.Generator,
+    count: int = WALK_LANDMARKS,
+) -> Walk:
+    """Walk over ``count`` landmarks, straight ahead or to a side, if possible to new cells."""
     cells, quarters = [start], [heading]
-    while len(cells) < WALK_LANDMARKS:
+    while len(cells) < count:
         passable = [
             h for h in ((heading + turn) % 4 for turn in (0, 1, 3))
             if floor.is_passable(cells[-1], h)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.published.study import study
 from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.landmarks.endurance import endurance_figures
 from locatk.formats.benchmarks.landmarks.global_localization import global_figures
 from locatk.formats.benchmarks.landmarks.sessions import closed_loop_figures, session_figures
 from locatk.formats.benchmarks.landmarks.speed import map_figures, speed_figures
@@ -74,6 +75,7 @@ def figures(data: Path) -> list[Figure]:
         *closed_loop_figures(folder),
         *map_figures(folder),
         *speed_figures(),
+        *endurance_figures(),
     ]
 
 

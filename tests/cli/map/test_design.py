@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from locatk.cli import console
 from locatk.core.landmarks.landmark import PATTERN_OF, Geometry, rotated
 from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap
 from locatk.formats.artifacts.maps import read_map, write_map
@@ -210,6 +211,12 @@ def test_impossible_designs_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_hint_names_changes_and_not_what_is_set(locatk, tmp_path: Path) -> None:
+    result = locatk("map", "design", "34x34", "--window", "L", "-o", tmp_path / "map.toml")
+    assert result.exit_code == 1
+    assert result.stderr.endswith("Hint: Use --window 2x2, or a floor of 25x25.\n")
+
+
 # ---- design --landmark
 
 
@@ -276,6 +283,18 @@ def test_check_proves_a_map(locatk, made: Path) -> None:
     for fault in ("flipped bar", "missing bar", "missing landmark"):
         assert fault in result.stdout
     assert all(len(line) <= 80 for line in result.stdout.splitlines()[1:])
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_terminal_shows_that_maps_are_checked(
+    locatk, made: Path, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    """One map has a label, which is erased, and several have a bar."""
+    monkeypatch.setattr(console, "_shows_progress", lambda: True)
+    result = locatk("map", "check", *[made] * count)
+    assert result.exit_code == 0
+    assert "Proving" in result.stderr
+    assert ("Proving ..." in result.stderr) == (count == 1)
 
 
 def test_check_shows_duplicates_with_both_positions(locatk, made: Path, tmp_path: Path) -> None:

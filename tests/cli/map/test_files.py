@@ -125,6 +125,26 @@ def test_export_and_import_give_the_same_map(
     assert found.walls == (FLOOR.walls if file.endswith("json") else frozenset())
 
 
+@pytest.mark.parametrize(
+    ("file", "option"), [("m.csv", ["--unique-codes"]), ("m.json", ["--lif-version", "2.0.0"])]
+)
+def test_variants_of_a_format_are_imported_without_options(
+    locatk, map_file: Path, tmp_path: Path, file: str, option: list[str]
+) -> None:
+    variant, plain, back = tmp_path / file, tmp_path / f"plain-{file}", tmp_path / "back.toml"
+    assert locatk("map", "export", map_file, "-o", plain).exit_code == 0
+    assert locatk("map", "export", map_file, "-o", variant, *option).exit_code == 0
+    assert variant.read_bytes() != plain.read_bytes()
+    result = locatk("map", "import", variant, "-o", back, "--pitch", 200)
+    assert result.exit_code == 0, result.stderr
+    np.testing.assert_array_equal(read_map(back).codes, FLOOR.codes)
+    # The option is not ignored by a format that has no such variant.
+    other = locatk("map", "export", map_file, "-o", tmp_path / "m.svg", *option)
+    assert other.exit_code == 2
+    assert option[0] in other.stderr
+    assert not (tmp_path / "m.svg").exists()
+
+
 def test_json_of_an_import(locatk, tmp_path: Path) -> None:
     table, out = tmp_path / "t.csv", tmp_path / "m.toml"
     table.write_text("0;7;0;0\n1;1;150;0\n2;7;0;150\n3;8;151;150\n")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import DegenerateError, InputError
-from locatk.core.landmarks.design import search
+from locatk.core.landmarks.design import generation, search
 from locatk.core.landmarks.design.generation import DesignOptions, design_map
 from locatk.core.landmarks.design.proof import prove_map
 from locatk.core.landmarks.landmark import Geometry
@@ -113,6 +113,20 @@ def test_an_exhausted_budget_reports_the_remainder() -> None:
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     assert all(left > 0 for _, left in observed)
+
+
+def test_large_tables_leave_time_for_one_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each stage builds a table of all possible words, which may take longer than its steps."""
+    reported: list[float] = []
+    monkeypatch.setattr(generation, "MAX_SETUP_WORDS", 20 * 4096)
+    with pytest.raises(DegenerateError):
+        design_map(
+            DesignOptions(32, 32, evaluations=100_000), lambda used, _: reported.append(used)
+        )
+    assert len(reported) == 20
+    assert reported[-1] == 1.0
+    monkeypatch.setattr(generation, "MAX_SETUP_WORDS", 1)
+    assert design_map(DesignOptions(9, 9)).shape == (9, 9)
 
 
 @pytest.mark.parametrize(

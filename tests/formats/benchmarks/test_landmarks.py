@@ -21,6 +21,7 @@ from locatk.core.landmarks.solver import solve
 from locatk.core.solution import Solution
 from locatk.formats.benchmarks import timing
 from locatk.formats.benchmarks.figures import Duration, Figure
+from locatk.formats.benchmarks.landmarks import endurance as landmarks_endurance
 from locatk.formats.benchmarks.landmarks import global_localization as landmarks_global
 from locatk.formats.benchmarks.landmarks import sessions as landmarks_sessions
 from locatk.formats.benchmarks.landmarks import speed as landmarks_speed
@@ -49,6 +50,9 @@ PROMISED = {
     "map 7x7, 6/L: search": 10.0,
     "map 100x100, 16/2x2: proof": 1.0,
     "time an estimate, one pass, p50": 0.05,
+    "an hour on 200x200: memory": 300.0,
+    "an hour on 200x200: time per visit": 0.05,
+    "an hour on 200x200: wrong silently": 0.0,
     "field of four bars, times as fast as magpylib": 20.0,
     "field of a bar, difference to magpylib": 1e-12,
 }
@@ -87,6 +91,9 @@ def quick(
         patch.setattr(landmarks_speed, "SEARCHED_MAPS", landmarks_speed.SEARCHED_MAPS[:1])
         patch.setattr(landmarks_speed, "time_call", time_once)
         patch.setattr(landmarks_speed, "run_single_threaded", run_in_process)
+        patch.setattr(landmarks_endurance, "DRIVE_LANDMARKS", 12)
+        patch.setattr(landmarks_endurance, "time_call", time_once)
+        patch.setattr(landmarks_endurance, "run_single_threaded", run_in_process)
         patch.setattr(timing, "run_single_threaded", run_in_process)
         yield
 
@@ -139,9 +146,47 @@ def test_failed_measurements_are_explained(monkeypatch: pytest.MonkeyPatch) -> N
         raise OSError("no such thing")
 
     monkeypatch.setattr(landmarks_speed, "run_single_threaded", fails)
-    for figure in [*landmarks_speed.field_figures()[:2], *landmarks_speed.estimate_figures()]:
+    monkeypatch.setattr(landmarks_endurance, "run_single_threaded", fails)
+    for figure in [
+        *landmarks_speed.field_figures()[:2],
+        *landmarks_speed.estimate_figures(),
+        *landmarks_endurance.endurance_figures(),
+    ]:
         assert figure.value is None
         assert "no such thing" in figure.how
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_visits() -> None:
+    """Beliefs of 40,000 cells and four headings are 1.3 MB a visit if they are dense."""
+    before_mb, after_mb, correct_percent, wrong, seconds, _ = timing.run_single_threaded(
+        "landmarks.endurance.measure_drive(300)"
+    )
+    assert after_mb - before_mb < 120
+    assert (correct_percent, wrong) == (100, 0)
+    assert 0 < seconds / 300 < 2
+
+
+@pytest.mark.slow
+def test_wrong_cells_of_a_drive_are_counted(
+    monkeypatch: pytest.MonkeyPatch, time_once: Callable[..., Duration]
+) -> None:
+    """Two of six visits of a changed result are wrong, one of them with certainty."""
+
+    def identify(*given: Any, **options: Any) -> Any:
+        result = landmarks_endurance_identify(*given, **options)
+        estimates = list(result.estimates)
+        for number, probability in ((2, 0.9995), (4, 0.9)):
+            other = (estimates[number].quarters + 1) % 4
+            estimates[number] = replace(estimates[number], quarters=other, probability=probability)
+        return replace(result, estimates=estimates)
+
+    landmarks_endurance_identify = landmarks_endurance.identify_cells
+    monkeypatch.setattr(landmarks_endurance, "identify_cells", identify)
+    monkeypatch.setattr(landmarks_endurance, "time_call", time_once)
+    _, _, correct_percent, wrong, _, _ = landmarks_endurance.measure_drive(6)
+    assert correct_percent == pytest.approx(100 * 4 / 6)
+    assert wrong == 1
 
 
 def test_published_maps_are_unique(data: Path, tmp_path: Path) -> None:

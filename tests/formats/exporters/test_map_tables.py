@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from locatk.core.errors import FormatError, InputError
 from locatk.core.landmarks.landmark import signs
 from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap, as_built_poses
-from locatk.formats.exporters.map_csv import dumps_csv
+from locatk.formats.exporters.map_csv import dumps_csv, landmark_number
 from locatk.formats.exporters.map_lif import dumps_lif
 from locatk.formats.importers.map_csv import HEADER, loads_csv
 from locatk.formats.importers.map_lif import loads_lif
@@ -53,20 +53,29 @@ def reread_csv(floor: FloorMap) -> FloorMap:
     return loads_csv(dumps_csv(floor), file="map.csv")
 
 
-def reread_lif(floor: FloorMap) -> FloorMap:
-    return loads_lif(dumps_lif(floor, STAMP), file="map.json")
+def reread_unique_codes(floor: FloorMap) -> FloorMap:
+    return loads_csv(dumps_csv(floor, unique_codes=True), file="map.csv")
+
+
+def reread_lif(floor: FloorMap, version: str = "1.0.0") -> FloorMap:
+    return loads_lif(dumps_lif(floor, STAMP, version), file="map.json")
+
+
+def reread_lif_2(floor: FloorMap) -> FloorMap:
+    return reread_lif(floor, "2.0.0")
 
 
 @pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(placed_floors())
 def test_a_map_as_designed_comes_back(floor: FloorMap) -> None:
-    for back in (reread_csv(floor), reread_lif(floor)):
+    for reread in (reread_csv, reread_unique_codes, reread_lif, reread_lif_2):
+        back = reread(floor)
         np.testing.assert_array_equal(back.codes, floor.codes)
         assert back.pitch_m == floor.pitch_m
         assert back.origin_m == floor.origin_m
         assert back.built == {}
-    assert reread_lif(floor).walls == floor.walls
+    assert reread_lif(floor).walls == reread_lif_2(floor).walls == floor.walls
 
 
 @pytest.mark.slow
@@ -114,6 +123,30 @@ def test_the_table_has_the_columns_of_controllers() -> None:
     )
 
 
+def test_unique_codes_are_numbers_of_the_cells() -> None:
+    floor = FloorMap(np.array([[7, HOLE_CODE, 7], [7, 15, 0]]))
+    table = (
+        "No;Code;X mm;Y mm;Attr1;Attr2;Attr3;Attr4;Landmark\n"
+        "0;1;0;0;0;0;0;0;NNNS\n"
+        "1;9;400;0;0;0;0;0;NNNS\n"
+        "2;2;0;200;0;0;0;0;NNNS\n"
+        "3;3;200;200;0;0;0;0;NNNN\n"
+        "4;8;400;200;0;0;0;0;SSSS\n"
+    )
+    assert dumps_csv(floor, unique_codes=True) == table
+    np.testing.assert_array_equal(loads_csv(table, file="x.csv").codes, floor.codes)
+    # The letters suffice; an unknown code of the controller is not read.
+    without = table.replace("No;Code;", "No;Tag;").replace("0;1;0", "0;x;0")
+    np.testing.assert_array_equal(loads_csv(without, file="x.csv").codes, floor.codes)
+
+
+def test_numbers_of_cells_stay_when_the_floor_grows() -> None:
+    """The cells of a square of n x n have the numbers 1 to n^2."""
+    for side in (1, 2, 17):
+        numbers = {landmark_number((r, c)) for r in range(side) for c in range(side)}
+        assert numbers == set(range(1, side**2 + 1))
+
+
 def test_tables_of_other_programs() -> None:
     """Other orders of columns, no header, a comma in decimals, attributes that are missing
     and a start transponder, whose attribute is the heading of vehicles."""
@@ -138,6 +171,8 @@ def test_tables_of_other_programs() -> None:
         ("x,y\n1,2\n", 1, "no column 'Code'"),
         ("0;16;0;0\n", 1, "'16' under 'Code', expected a whole number from 0 to 15"),
         ("0;1;0;0\n1;;200;0\n", 2, "'' under 'Code'"),
+        ("No;Code;X;Y;Landmark\n0;1;0;0;NNNS\n1;2;200;0\n", 3, "'' under 'Landmark'"),
+        ("No;Code;X;Y;Landmark\n0;1;0;0;NNNX\n", 2, "'NNNX' under 'Landmark', expected the let"),
         ("0;1.0;0;0\n", 1, "'1.0' under 'Code'"),
         ("0;1;0;0\n1;1;2 m;0\n", 2, "'2 m' under 'X mm', expected a number"),
         ("0;1;0\n", 1, "'' under 'Y mm'"),
@@ -217,6 +252,65 @@ def test_the_layout_has_what_lif_requires() -> None:
     assert reread_lif(FLOOR).name == "hall"
 
 
+def test_the_layout_has_what_lif_2_requires() -> None:
+    """Required keys of json_schemas/LIF.schema of the repository of LIF 2.0.0; no key of 1.0.0."""
+    data = json.loads(dumps_lif(FLOOR, STAMP, "2.0.0"))
+    assert set(data) == {"metaInformation", "origins"}
+    head = data["metaInformation"]
+    assert set(head) == {"lifId", "creator", "exportTimestamp", "lifVersion"}
+    assert head["lifVersion"] == "2.0.0"
+    assert head["exportTimestamp"] == "2026-03-01T12:30:05.120Z"
+    (origin,) = data["origins"]
+    fields(origin, {"originId": str, "layouts": list})
+    (layout,) = origin["layouts"]
+    assert set(layout) == {
+        "layoutId", "layoutName", "layoutVersion", "layoutDescriptor", "nodes", "edges"
+    }  # fmt: skip
+    robots = [{"manufacturer": "locatk", "seriesName": "landmarks"}]
+    for node in layout["nodes"]:
+        assert set(node) == {
+            "nodeId", "nodeDescriptor", "mapId", "nodePosition", "mobileRobotTypeNodeProperties"
+        }  # fmt: skip
+        assert node["mobileRobotTypeNodeProperties"] == [{"mobileRobotTypes": robots}]
+    for edge in layout["edges"]:
+        assert set(edge) == {"edgeId", "startNodeId", "endNodeId", "mobileRobotTypeEdgeProperties"}
+        (properties,) = edge["mobileRobotTypeEdgeProperties"]
+        assert properties["mobileRobotTypes"] == robots
+        assert properties["mobileRobotOrientations"] == [0.0]
+        assert properties["reachOrientationBeforeEntering"] is True
+        assert properties["orientationType"] == "TANGENTIAL"
+    # Nodes and passages are those of LIF 1.
+    first = json.loads(dumps_lif(FLOOR, STAMP))["layouts"][0]
+    for key, name in (("nodes", "nodeId"), ("edges", "edgeId")):
+        assert [item[name] for item in layout[key]] == [item[name] for item in first[key]]
+    letters = {node["nodeId"]: node["nodeDescriptor"] for node in layout["nodes"]}
+    assert letters == {node["nodeId"]: node["nodeName"] for node in first["nodes"]}
+
+
+def changed_2(change: Callable[[dict[str, Any]], object]) -> str:
+    data = json.loads(dumps_lif(FLOOR, STAMP, "2.0.0"))
+    change(data)
+    return json.dumps(data)
+
+
+def state_version(version: object) -> Callable[[dict[str, Any]], object]:
+    return lambda data: data["metaInformation"].update(lifVersion=version)
+
+
+def test_the_version_of_a_layout_is_detected() -> None:
+    for text in (
+        changed_2(lambda data: None),
+        changed_2(state_version("2.1.3")),
+        changed_2(lambda data: data.pop("metaInformation")),
+        changed_2(lambda data: data["origins"].append({"originId": "empty", "layouts": []})),
+        changed(state_version("1.0.1")),
+        changed(lambda data: data.pop("metaInformation")),
+    ):
+        found = loads_lif(text, file="map.json")
+        np.testing.assert_array_equal(found.codes, FLOOR.codes)
+        assert (found.walls, found.name) == (FLOOR.walls, "hall")
+
+
 def test_the_stamp_is_in_utc() -> None:
     later = datetime.fromisoformat("2026-03-01T14:30:05.12+02:00")
     assert dumps_lif(FLOOR, later) == dumps_lif(FLOOR, STAMP)
@@ -239,6 +333,18 @@ def test_an_edge_in_one_direction_is_not_a_wall() -> None:
         ("", 1, "not JSON"),
         ("{\n\n", 3, "not JSON"),
         ("[1]", None, "not LIF"),
+        (changed(state_version("3.0.0")), "metaInformation.lifVersion", "'3.0.0' of LIF is not"),
+        (changed(state_version("0.11.0")), "metaInformation.lifVersion", "is not supported"),
+        (changed(state_version(2)), "metaInformation.lifVersion", "is not supported"),
+        (changed(state_version("2.0.0")), None, "not LIF 2: expected the key 'origins'"),
+        (changed_2(state_version("1.0.0")), None, "not LIF 1: expected the key 'layouts'"),
+        (changed_2(lambda d: d["origins"].append(d["origins"][0])), "layouts", "2 layouts"),
+        (changed_2(lambda d: d.update(origins=1)), "origins", "list of objects"),
+        (
+            changed_2(lambda d: d["origins"][0]["layouts"][0]["nodes"][2].pop("nodeDescriptor")),
+            "nodes[2].nodeDescriptor",
+            "the nodeDescriptor of node 'r1c0' is not a landmark",
+        ),
         ("{}", None, "not LIF"),
         ('{"layouts": 1}', "layouts", "list of objects"),
         ('{"layouts": []}', "layouts", "0 layouts"),
@@ -249,7 +355,7 @@ def test_an_edge_in_one_direction_is_not_a_wall() -> None:
         (
             changed(lambda d: d["layouts"][0]["nodes"][2].pop("nodeName")),
             "nodes[2].nodeName",
-            "the name of node 'r1c0' is not a landmark",
+            "the nodeName of node 'r1c0' is not a landmark",
         ),
         (
             changed(lambda d: d["layouts"][0]["nodes"][2].update(nodeId="r0c0")),
