@@ -31,11 +31,14 @@ class DeviceSummary:
     poses : int
     median_sigma : tuple of 4 float
         Median standard deviations of x, y, z [m] and heading [rad]; nan if unknown.
+    min_probability : float
+        Probability of the least probable pose; nan if unknown.
     """
 
     device: str
     poses: int
     median_sigma: tuple[float, float, float, float]
+    min_probability: float
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def summarize(
         method=solution.method,
         solve_s=solve_s,
         devices=tuple(
-            DeviceSummary(track.device, len(track), _median_sigma(track))
+            DeviceSummary(track.device, len(track), _median_sigma(track), track.min_probability)
             for track in solution.trajectories
         ),
         rejected=solution.rejected,

@@ -30,6 +30,7 @@ from locatk.formats.plots.units import (
     format_number,
     select_unit,
 )
+from locatk.formats.report.detections import format_probability
 from locatk.formats.report.diagram_grid import DiagramGrid
 from locatk.formats.report.panels import Panel, Table, escape, join_names, join_sentences
 from locatk.formats.report.style import INK
@@ -78,7 +79,7 @@ def summarize(subject: Subject) -> str:
                 "axes together)."
             )
         reason = why_not_evaluated(subject)
-        return join_sentences(reason, covariance, _invalid_poses_note(solution))
+        return join_sentences(reason, covariance, *_trust_notes(solution))
     median, p95 = (
         format_length(value, unscaled=unscaled) for value in (evaluation.median, evaluation.p95)
     )
@@ -98,8 +99,19 @@ def summarize(subject: Subject) -> str:
         alignment,
         offset,
         consistency,
-        _invalid_poses_note(solution),
+        *_trust_notes(solution),
     )
+
+
+def _trust_notes(solution: Solution) -> list[str]:
+    """Return sentences on provisional poses and on poses that are not finite."""
+    notes = [
+        f"The poses of {t.device} are provisional: the least certain one is right with a "
+        f"probability of {format_probability(t.min_probability)} %."
+        for t in solution.trajectories
+        if t.is_provisional
+    ]
+    return [*notes, _invalid_poses_note(solution)]
 
 
 def _invalid_poses_note(solution: Solution) -> str:
