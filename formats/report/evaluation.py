@@ -93,7 +93,8 @@ def summarize(subject: Subject) -> str:
         origin = evaluation.time_offset.describe()
         offset = f"Time offset: {evaluation.offset_s:.4f} s ({origin})."
     if evaluation.consistency is not None:
-        consistency = f"{evaluation.consistency.describe().capitalize()}."
+        description = evaluation.consistency.describe()
+        consistency = f"{description[0].upper()}{description[1:]}."
     return join_sentences(
         f"Half of the poses are within {median} of the truth, 95 % within {p95}.",
         alignment,
@@ -310,9 +311,8 @@ def _nees_panels(evaluation: Evaluation, colors: dict[str, str], start_ns: int) 
     row = ValueRow("NEES / 95 % quantile", split_by_device(evaluation, ratio, is_known), {})
     explanation = (
         "Normalized estimation error squared (NEES), divided by its 95 % quantile. "
-        f"{100 * consistency.inside:.0f} % of {format_count(consistency.n, 'poses')} are below 1. "
-        f"The mean NEES is {format_number(consistency.mean)} times the expected one (1 if the "
-        "covariances are right)."
+        f"{100 * consistency.inside:.0f} % of {format_count(consistency.n, 'poses')} are below 1 "
+        f"(95 % if the covariances are right)."
     )
     title = "Consistency of the covariance"
     return [value_panel(title, explanation, [row], colors, start_ns, as_marks=True, reference=1.0)]
