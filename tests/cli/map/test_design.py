@@ -155,6 +155,13 @@ def test_stdout_is_one_json_object(locatk, tmp_path: Path) -> None:
     assert len(told["warnings"]) == 2  # the pitch is too small for territories and fields
     checked = json.loads(locatk("map", "check", path, "--json").stdout)["maps"][0]
     assert checked["proof"] == proof
+    final = told["landmarks_until_final"]
+    assert checked["landmarks_until_final"] == final
+    assert set(final) == {"starts", "mean", "p99", "worst", "worst_start", "never"}
+    assert final["starts"] == 4 * told["map"]["landmarks"]
+    assert proof["landmarks_to_localise"]["mean"] < final["mean"] <= final["worst"]
+    lines = locatk("map", "check", path).stdout
+    assert f"Final      after {final['mean']:.2g} landmarks on average, " in lines
     assert checked["map"] == told["map"]
 
 
