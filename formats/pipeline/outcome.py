@@ -231,7 +231,7 @@ def _unlocalized_robots(solution: Solution) -> list[SolverWarning]:
 def _provisional_poses(device: str, facts: RobotFacts) -> SolverWarning:
     """Return the loss of a robot that may be on another floor or in another cell."""
     text = f"the poses of {device} are provisional: they are right with a probability of "
-    text += f"{facts.probability:.4g}" if facts.probability is not None else "unknown"
+    text += f"{facts.probability:.5g}" if facts.probability is not None else "unknown"
     return SolverWarning("provisional", f"{text}; visit more landmarks")
 
 

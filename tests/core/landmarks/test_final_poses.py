@@ -116,3 +116,14 @@ def test_fewer_misread_landmarks_need_fewer_landmarks() -> None:
     floor = FloorMap(np.random.default_rng(5).choice(CODES["compass"], (8, 8)), alphabet="compass")
     often, seldom = (count_landmarks_until_final(floor, misread=rate) for rate in (0.2, 0.001))
     assert often.mean > seldom.mean + 1
+
+
+def test_two_rooms_of_which_one_is_the_other_rotated_are_never_distinguished() -> None:
+    room = np.random.default_rng(6).integers(0, 16, (6, 6))
+    # Rows ascend with y, so that np.rot90 turns clockwise as seen from above.
+    other = rotated(np.rot90(room), -1)
+    wall = np.full((6, 1), HOLE_CODE)
+    assert count_landmarks_until_final(FloorMap(np.hstack([room, wall, other]))).never == 4 * 72
+    # Without the rotation of the codes each landmark differs.
+    unlike = FloorMap(np.hstack([room, wall, np.rot90(room)]))
+    assert count_landmarks_until_final(unlike).never == 0
