@@ -93,7 +93,9 @@ def proof_lines(proof: MapProof) -> list[tuple[str, str]]:
 def final_lines(final: FinalPoses, floor: FloorMap) -> list[tuple[str, str]]:
     """Return label and text of the lines about the landmarks until poses are final."""
     if final.mean is None or final.p99 is None:
-        return [("Final", "never: poses remain provisional, because the map is too small")]
+        return [
+            ("Final", "never: poses remain provisional, because other floors or starts fit as well")
+        ]
     is_sampled = final.starts < 4 * len(floor.cells())
     tested = f" of {_count(final.starts, 'tested start')}" if is_sampled else ""
     never = f", never from {_count(final.never, 'start')}" if final.never else ""

@@ -43,7 +43,7 @@ tabulated because importing scipy takes longer than the whole computation; a tes
 
 MAX_UNRESERVED_SIGMA_RATIO = 2.0
 """Ratio of actual to reported sigmas, or its inverse, that the errors must exclude for a verdict
-without reservation: a tenth of the errors of a long drive does."""
+without reservation. Eight independent numbers exclude it, by the quantiles of chi-squared."""
 
 MIN_RATIO_IN_WORDS = 1.1
 """Ratio of sigmas from which on it is a factor in texts, and not a difference in percent."""
@@ -91,9 +91,9 @@ class Consistency:
 
     @property
     def verdict(self) -> str:
-        """``"fit"`` if the mean NEES is in its interval; sigmas are else too small or too large.
+        """``"fit"`` if the mean NEES is in its interval, else ``"too_small"`` or ``"too_large"``.
 
-        The other values are ``"too_small"`` and ``"too_large"``.
+        The latter refer to the sigmas.
         """
         if self.low <= self.mean <= self.high:
             return "fit"
@@ -152,7 +152,7 @@ def _excess(ratio: float) -> str:
     """Return how much larger or smaller the one sigma is, as a factor or in percent."""
     factor = max(ratio, 1 / ratio) if ratio > 0 else np.inf
     if factor < MIN_RATIO_IN_WORDS:
-        return f"{100 * (factor - 1):.1g} %"
+        return f"{max(round(100 * (factor - 1)), 1)} %"
     if factor > 100:
         return "more than 100 times"
     return f"{factor:.0f} times" if factor >= 10 else f"{factor:.2g} times"

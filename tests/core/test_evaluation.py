@@ -526,6 +526,7 @@ def test_verdicts_in_words() -> None:
     for mean, words in (
         (1.1, "sigmas are 5 % too small"),
         (0.9, "sigmas are 5 % too large"),
+        (1.2, "sigmas are 10 % too small"),
         (0.0, "sigmas are more than 100 times too large"),
         (225.0, "sigmas are 15 times too small"),
     ):

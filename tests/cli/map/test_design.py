@@ -58,6 +58,16 @@ def bad(made: Path, path: Path) -> Path:
 
 
 @pytest.mark.slow
+def test_a_map_on_which_poses_stay_provisional_says_so(locatk, tmp_path: Path) -> None:
+    path = tmp_path / "row.toml"
+    assert locatk("map", "design", "1x3", "--window", "I2", "-o", path).exit_code in (0, 3)
+    assert "Final      never: poses remain provisional" in locatk("map", "check", path).stdout
+    (told,) = json.loads(locatk("map", "check", path, "--json").stdout)["maps"]
+    final = told["landmarks_until_final"]
+    assert (final["mean"], final["worst_start"]) == (None, None)
+    assert final["never"] == final["starts"] == 12
+
+
 def test_design_writes_and_prints_a_map(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     result = locatk("map", "design", "6x7", "-o", path, "--name", "hall", "--seed", 5)
