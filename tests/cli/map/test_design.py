@@ -57,7 +57,6 @@ def bad(made: Path, path: Path) -> Path:
 # ---- design
 
 
-@pytest.mark.slow
 def test_a_map_on_which_poses_stay_provisional_says_so(locatk, tmp_path: Path) -> None:
     path = tmp_path / "row.toml"
     assert locatk("map", "design", "1x3", "--window", "I2", "-o", path).exit_code in (0, 3)
@@ -68,6 +67,7 @@ def test_a_map_on_which_poses_stay_provisional_says_so(locatk, tmp_path: Path) -
     assert final["never"] == final["starts"] == 12
 
 
+@pytest.mark.slow
 def test_design_writes_and_prints_a_map(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
     result = locatk("map", "design", "6x7", "-o", path, "--name", "hall", "--seed", 5)
