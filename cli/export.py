@@ -69,7 +69,8 @@ def command(
     tum      time and pose, one file per device, for evo and others
     kitti    3 x 4 matrices, one file per device; times in a second file
     csv      time_s, device, x_m, y_m, z_m, qx, qy, qz, qw, sigma_x_m,
-             sigma_y_m, sigma_z_m, sigma_heading_rad; unknown sigmas are empty
+             sigma_y_m, sigma_z_m, sigma_heading_rad, probability; unknown
+             values are empty
     parquet  as csv, with exact times, frames and full covariances; needs
              locatk[parquet]
     ros2     PoseStamped and TFMessage in MCAP, for ros2 bag, RViz and evo

@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+PROVISIONAL_PROBABILITY = 0.999
+"""Probability of a pose below which it is provisional: of a thousand poses, one may be wrong."""
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -27,6 +30,10 @@ class Trajectory:
     covariance : (n, 6, 6) ndarray
         Of (x, y, z, rotation about x, y, z) in m and rad; ``nan`` in the rows and columns of
         unobserved components (a single photodiode has no heading).
+    probability : (n,) ndarray or None
+        Posterior probability that the pose is right within its covariance, and not one of
+        another position that the readings fit as well; ``nan`` if unknown. None if the system
+        does not estimate it.
     """
 
     device: str
@@ -35,6 +42,7 @@ class Trajectory:
     position: NDArray[np.float64]
     quaternion: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    probability: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.time_ns)
@@ -46,6 +54,8 @@ class Trajectory:
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, not {shape}")
+        if self.probability is not None and self.probability.shape != (n,):
+            raise ValueError(f"probability has shape {self.probability.shape}, not {(n,)}")
 
     def __len__(self) -> int:
         return len(self.time_ns)
@@ -77,6 +87,18 @@ class Trajectory:
         """Standard deviations (n, 6) in m and rad; ``nan`` for unobserved components."""
         return np.sqrt(np.einsum("nii->ni", self.covariance))
 
+    @property
+    def min_probability(self) -> float:
+        """Probability of the least probable pose; ``nan`` if none is known."""
+        if self.probability is None or np.isnan(self.probability).all():
+            return float("nan")
+        return float(np.nanmin(self.probability))
+
+    @property
+    def is_provisional(self) -> bool:
+        """True if a pose is less probable than :data:`PROVISIONAL_PROBABILITY`."""
+        return self.min_probability < PROVISIONAL_PROBABILITY
+
     def select(self, mask: NDArray[np.bool_]) -> Trajectory:
         """Return only the poses whose ``mask`` (n,) is true."""
         time_ns, covariance = self.time_ns[mask], self.covariance
@@ -91,6 +113,7 @@ class Trajectory:
             position=self.position[mask],
             quaternion=self.quaternion[mask],
             covariance=covariance,
+            probability=None if self.probability is None else self.probability[mask],
         )
 
     def shifted(self, shift_ns: int) -> Trajectory:

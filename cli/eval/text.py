@@ -183,7 +183,6 @@ def _consistency(evaluation: Evaluation) -> str:
     if consistency is None:
         return "consistency: - (the estimate has no covariances)"
     return (
-        f"consistency: {consistency.describe()}; NEES {consistency.mean:.3g} per degree of freedom "
-        f"({consistency.low:.2f} to {consistency.high:.2f} expected of independent poses), "
-        f"{100 * consistency.inside:.0f} % of the poses in their 95 % region"
+        f"consistency: {consistency.describe()}; {100 * consistency.inside:.0f} % of the poses are "
+        "in their 95 % region"
     )

@@ -18,7 +18,9 @@ MAX_ROWS = 20
 MAX_MAP_CELLS = 5_000
 """Number of cells of the largest map that is drawn."""
 
-KNOWN_METADATA = {("locatk", key) for key in ("format_version", "tool_version", "kind", "system")}
+KNOWN_METADATA = {
+    ("locatk", key) for key in ("format_version", "tool_version", "kind", "system", "provisional")
+}
 """Entries that the first lines show."""
 
 SIMULATION_PREFIX = "simulated_"
@@ -40,6 +42,7 @@ def text(facts: dict[str, Any]) -> str:
         ("sweeps", facts.get("sweeps")),
         ("markers", facts.get("markers")),
         ("scale", facts.get("scale")),
+        ("provisional", _provisional(facts.get("metadata") or {})),
         ("frames", facts.get("frames")),
         ("print", _print(facts)),
         ("camera", _camera(facts.get("camera"))),
@@ -203,6 +206,12 @@ def _metadata(records: dict[str, dict[str, Any]]) -> list[str]:
     if simulation_options:
         lines.append(f"... and {simulation_options} options of the simulation: see -v")
     return lines
+
+
+def _provisional(records: dict[str, dict[str, Any]]) -> str | None:
+    """Format the devices whose poses are provisional."""
+    devices = records.get("locatk", {}).get("provisional")
+    return devices and f"{devices} (poses may be wrong by more than their covariance)"
 
 
 def _unread(unread: int | None) -> str | None:

@@ -15,6 +15,7 @@ from locatk.cli.map import proof_text
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
+    from locatk.core.landmarks.design.final_poses import FinalPoses
     from locatk.core.landmarks.design.proof import MapProof
     from locatk.core.landmarks.map.floor import FloorMap
 
@@ -32,8 +33,9 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
 
     The readings of all windows under all headings are compared. The output lists duplicates with
     both positions, the minimum number of landmarks in which two readings differ, the number of
-    landmarks that a robot visits until it is localised, and the effect of one fault. For a map as
-    built (`locatk calibrate map`), the bars are compared as they were installed.
+    landmarks that a robot visits until it is localised, and until its poses are no longer
+    provisional, and the effect of one fault. For a map as built (`locatk calibrate map`), the bars
+    are compared as they were installed.
 
     The exit status is 0 if every map is unique and detects as many misread landmarks as its file
     specifies (`detect`), otherwise 1.
@@ -44,21 +46,24 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
       locatk map check floors/*.toml -q && echo unique
       locatk map check map.toml --json | jq '.maps[0].proof.duplicates'
     """
+    from locatk.core.landmarks.design.final_poses import count_landmarks_until_final
     from locatk.core.landmarks.design.proof import prove_map
     from locatk.core.landmarks.map.floor import as_built_codes
     from locatk.formats.artifacts.maps import read_map
 
-    proved: list[tuple[Path, FloorMap, MapProof]] = []
+    proved: list[tuple[Path, FloorMap, MapProof, FinalPoses]] = []
     floors = [(path, read_map(path)) for path in maps]
     # A bar of one step shows nothing.
     shown = console.working("Proving") if len(floors) == 1 else contextlib.nullcontext()
     with shown, console.progress(floors, "Proving") as bar:
         for path, floor in bar:
-            proved.append((path, floor, prove_map(replace(floor, codes=as_built_codes(floor)))))
-    for number, (path, floor, proof) in enumerate(proved):
+            built = replace(floor, codes=as_built_codes(floor))
+            final = count_landmarks_until_final(built)
+            proved.append((path, floor, prove_map(built), final))
+    for number, (path, floor, proof, final) in enumerate(proved):
         if number:
             console.result("")
-        _print_proof(path, floor, proof)
+        _print_proof(path, floor, proof, final)
     if as_json:
         console.emit_json(
             {
@@ -69,12 +74,13 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
                         "verdict": proof_text.verdict(proof),
                         "map": proof_text.map_entry(floor),
                         "proof": proof_text.proof_entry(proof, floor),
+                        "landmarks_until_final": proof_text.final_entry(final),
                     }
-                    for path, floor, proof in proved
+                    for path, floor, proof, final in proved
                 ],
             }
         )
-    failed = [(path, proof) for path, _, proof in proved if not proof.holds]
+    failed = [(path, proof) for path, _, proof, _ in proved if not proof.holds]
     if len(failed) == 1:
         path, proof = failed[0]
         raise InputError(proof_text.verdict(proof), file=path, hint=_hint(proof))
@@ -85,11 +91,17 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
         )
 
 
-def _print_proof(path: Path, floor: FloorMap, proof: MapProof) -> None:
+def _print_proof(path: Path, floor: FloorMap, proof: MapProof, final: FinalPoses) -> None:
     """Print the proof of one map, and warn of landmarks that differ from the design."""
     console.result(f"{path}: {proof_text.verdict(proof)}\n")
     console.result(
-        console.labelled([*proof_text.floor_lines(floor), *proof_text.proof_lines(proof)])
+        console.labelled(
+            [
+                *proof_text.floor_lines(floor),
+                *proof_text.proof_lines(proof),
+                *proof_text.final_lines(final, floor),
+            ]
+        )
     )
     if proof.duplicates:
         console.result("\n" + proof_text.duplicates(proof, floor))

@@ -181,8 +181,10 @@ def _print_map(
     output: Path, floor: FloorMap, proof: MapProof, analysis: LandmarkAnalysis, as_json: bool
 ) -> None:
     from locatk.core.landmarks.design.analysis import landmark_warnings, pitch_warnings
+    from locatk.core.landmarks.design.final_poses import count_landmarks_until_final
     from locatk.core.landmarks.design.materials import count_patterns
 
+    final = count_landmarks_until_final(floor)
     patterns = count_patterns(floor)
     counts = ", ".join(f"{item.landmarks} {item.letters}" for item in patterns)
     bars = 4 * len(floor.cells())
@@ -192,6 +194,7 @@ def _print_map(
             [
                 *proof_text.floor_lines(floor),
                 *proof_text.proof_lines(proof),
+                *proof_text.final_lines(final, floor),
                 ("Bars", f"{bars} of {landmark_text.bar(floor.geometry)}"),
                 ("Patterns", counts),
                 ("SHA-256", proof.fingerprint),
@@ -207,6 +210,7 @@ def _print_map(
                 "map": proof_text.map_entry(floor),
                 "patterns": {item.letters: item.landmarks for item in patterns},
                 "proof": proof_text.proof_entry(proof, floor),
+                "landmarks_until_final": proof_text.final_entry(final),
                 "landmark": landmark_text.entry(analysis, floor.pitch_m),
                 "warnings": warnings,
             }

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from locatk.cli import console
 
 if TYPE_CHECKING:
+    from locatk.core.landmarks.design.final_poses import FinalPoses
     from locatk.core.landmarks.design.localization_steps import Start
     from locatk.core.landmarks.design.proof import FaultEffects, MapProof
     from locatk.core.landmarks.map.floor import Cell, FloorMap
@@ -87,6 +88,24 @@ def proof_lines(proof: MapProof) -> list[tuple[str, str]]:
         elif proof.is_unique:
             lines.append(("Detection", "one misread landmark may give a wrong position"))
     return [*lines, *_localization_lines(proof)]
+
+
+def final_lines(final: FinalPoses, floor: FloorMap) -> list[tuple[str, str]]:
+    """Return label and text of the lines about the landmarks until poses are final."""
+    if final.mean is None or final.p99 is None:
+        return [
+            ("Final", "never: poses remain provisional, because other floors or starts fit as well")
+        ]
+    is_sampled = final.starts < 4 * len(floor.cells())
+    tested = f" of {_count(final.starts, 'tested start')}" if is_sampled else ""
+    never = f", never from {_count(final.never, 'start')}" if final.never else ""
+    return [
+        (
+            "Final",
+            f"after {final.mean:.2g} landmarks on average, {final.p99:.0f} for 99 % of starts, "
+            f"{final.worst} at most{tested}{never}; until then, poses are provisional",
+        )
+    ]
 
 
 def duplicates(proof: MapProof, floor: FloorMap) -> str:
@@ -179,6 +198,18 @@ def proof_entry(proof: MapProof, floor: FloorMap) -> dict[str, Any]:
             "never_starts": [_start_entry(start) for start in steps.never_starts],
         },
         "sha256": proof.fingerprint,
+    }
+
+
+def final_entry(final: FinalPoses) -> dict[str, Any]:
+    """Return the landmarks until poses are final for ``--json``."""
+    return {
+        "starts": final.starts,
+        "mean": final.mean,
+        "p99": final.p99,
+        "worst": final.worst,
+        "worst_start": None if final.worst_start is None else _start_entry(final.worst_start),
+        "never": final.never,
     }
 
 

@@ -57,19 +57,25 @@ def notes(report: SolveReport) -> list[str]:
 
 
 def _device_table(report: SolveReport) -> str:
-    """Format number of poses and median standard deviations of each device, `-` if unknown."""
+    """Format number of poses and median standard deviations of each device, `-` if unknown.
+
+    The probability of the least probable pose follows if the system estimates it.
+    """
     from locatk.core.natural_order import natural_key
+    from locatk.formats.report.detections import format_probability
 
     if not report.devices:
         return ""
     # The positions of a scene without scale are not in metres.
     unit = "mm" if report.is_metric else "1e-3"
     factors = (1e3, 1e3, 1e3, 180 / math.pi)
+    has_probability = any(not math.isnan(device.min_probability) for device in report.devices)
     header = (
         "device",
         "poses",
         *(f"sigma {axis} [{unit}]" for axis in "xyz"),
         "sigma heading [deg]",
+        *(["probability [%]"] if has_probability else []),
     )
     rows = [
         (
@@ -80,6 +86,7 @@ def _device_table(report: SolveReport) -> str:
                 "-" if math.isnan(sigma) else f"{factor * sigma:#.3g}"
                 for sigma, factor in zip(device.median_sigma, factors, strict=True)
             ),
+            *([format_probability(device.min_probability)] if has_probability else []),
         )
         for device in sorted(report.devices, key=lambda device: natural_key(device.device))
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -201,7 +201,7 @@ class Evaluation:
                 "translation_percent": self.drift_percent,
                 "rotation_deg_per_m": None if rotation_drift is None else rotation_drift.mean,
             },
-            "nees": None if self.consistency is None else asdict(self.consistency),
+            "nees": None if self.consistency is None else self.consistency.as_dict(),
             "devices": per_device,
         }
 

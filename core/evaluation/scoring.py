@@ -23,7 +23,7 @@ from locatk.core.evaluation.association import (
     Pairs,
     associate,
 )
-from locatk.core.evaluation.consistency import compute_nees, summarize_nees
+from locatk.core.evaluation.consistency import nees_of, normalize_errors, summarize_consistency
 from locatk.core.evaluation.coverage import Coverage, compute_coverage
 from locatk.core.evaluation.pose_errors import (
     Delta,
@@ -177,7 +177,8 @@ def evaluate(pairs: Pairs, options: EvaluationOptions | None = None) -> Evaluati
     relative = RelativeErrors.concatenate(relative_parts)
 
     known_rotation_errors = np.where(is_oriented[:, None], rotation_errors, np.nan)
-    nees, nees_dof = _compute_nees(pairs, matches, residuals, known_rotation_errors, alignment)
+    normalized = _normalize_errors(pairs, matches, residuals, known_rotation_errors, alignment)
+    nees, nees_dof = nees_of(np.concatenate(normalized))
     names = tuple(dict.fromkeys(estimate.device for estimate, _ in pairs))
     return Evaluation(
         ape_translation=Statistics.from_errors(errors),
@@ -206,7 +207,7 @@ def evaluate(pairs: Pairs, options: EvaluationOptions | None = None) -> Evaluati
         path_m=sum((path_length(match.truth) for match in matches), 0.0),
         path_estimate_m=sum((path_length(match.estimate) for match in matches), 0.0),
         drift=Drift.concatenate(drift_parts),
-        consistency=summarize_nees(nees, nees_dof),
+        consistency=summarize_consistency(normalized),
         nees=nees,
         nees_dof=nees_dof,
     )
@@ -287,18 +288,18 @@ def _total_coverage(pairs: Pairs, offset_s: float, max_gap_s: float) -> Coverage
     return sum(parts, Coverage(0.0, 0.0))
 
 
-def _compute_nees(
+def _normalize_errors(
     pairs: Pairs,
     matches: Sequence[Association],
     residuals: Array,
     rotation_errors: Array,
     alignment: Similarity,
-) -> tuple[Array, NDArray[np.int64]]:
-    """Compute the normalized errors squared of all matched poses and their degrees of freedom."""
-    nees_parts, dof_parts = [], []
+) -> list[Array]:
+    """Return the errors of each pair (n, 6), normalized by their covariances."""
+    normalized = []
     for (estimate, truth), match, rows in zip(pairs, matches, _row_slices(matches), strict=True):
         if _has_variance(estimate):
-            nees, dof = compute_nees(
+            errors = normalize_errors(
                 residuals[rows],
                 rotation_errors[rows],
                 estimate.covariance[match.index],
@@ -306,10 +307,9 @@ def _compute_nees(
                 match.interpolate_truth(truth.covariance) if _has_variance(truth) else None,
             )
         else:
-            nees, dof = np.full(len(match), np.nan), np.zeros(len(match), np.int64)
-        nees_parts.append(nees)
-        dof_parts.append(dof)
-    return np.concatenate(nees_parts), np.concatenate(dof_parts)
+            errors = np.full((len(match), 6), np.nan)
+        normalized.append(errors)
+    return normalized
 
 
 def _has_variance(trajectory: Trajectory) -> bool:

@@ -18,7 +18,6 @@ from locatk.core.landmarks.localization.cell_filter import (
 )
 from locatk.core.landmarks.localization.consistency import (
     NO_MAP_WARNING,
-    PROVISIONAL_PROBABILITY,
     describe_visit,
     find_displaced_landmarks,
     is_map_contradicted,
@@ -33,7 +32,7 @@ from locatk.core.landmarks.localization.smoothing import (
     measure_visits,
     smooth,
 )
-from locatk.core.landmarks.localization.trajectory import estimate_trajectory
+from locatk.core.landmarks.localization.trajectory import estimate_trajectory, pose_probability
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.preprocessing import (
     DEFAULT_PITCH_M,
@@ -44,7 +43,7 @@ from locatk.core.landmarks.preprocessing import (
 from locatk.core.landmarks.published.solver import solve as solve_published
 from locatk.core.landmarks.results import LandmarkFacts, RobotFacts
 from locatk.core.solution import Solution, SolverWarning
-from locatk.core.trajectory import Trajectory
+from locatk.core.trajectory import PROVISIONAL_PROBABILITY, Trajectory
 
 METHODS = ("field", "paper")
 
@@ -258,7 +257,13 @@ def localize_robot(
         identified.odometry,
         identified.priors,
     )
-    return replace(robot, trajectories=(trajectory,))
+    probability = pose_probability(
+        trajectory.time_ns,
+        [visit.segment for visit in on_map],
+        [visit.estimate.probability for visit in on_map if visit.estimate is not None],
+        identified.map_probability,
+    )
+    return replace(robot, trajectories=(replace(trajectory, probability=probability),))
 
 
 def smooth_robot(

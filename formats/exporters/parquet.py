@@ -1,8 +1,8 @@
 """Export of poses as Parquet for pandas, Polars, DuckDB, Spark and R.
 
-The columns are those of the CSV form, followed by exact times, frames and full covariances.
-Unknown values are null. The columns are documented in docs/formats.md; later versions only add
-columns.
+The columns are those of the CSV form up to the sigmas, followed by exact times, frames, full
+covariances and probabilities. Unknown values are null. The columns are documented in
+docs/formats.md; later versions only add columns at the end.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from locatk.core.errors import LocatkError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers.trajectory_csv import COLUMNS, SIGMA_AXES
+from locatk.formats.importers.trajectory_csv import COLUMNS, PROBABILITY_COLUMN, SIGMA_AXES
 from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.messages import triangle
 
@@ -101,6 +101,9 @@ def _table(arrow: Any, trajectory: Trajectory) -> Any:
         ]
 
     pose = np.hstack([trajectory.position, trajectory.quaternion])
+    probability = trajectory.probability
+    if probability is None:
+        probability = np.full(n, np.nan)
     # Whole seconds and the rest are added, because a float64 product rounds the last digits.
     seconds, rest = np.divmod(trajectory.time_ns, 1_000_000_000)
     columns = [
@@ -111,8 +114,11 @@ def _table(arrow: Any, trajectory: Trajectory) -> Any:
         arrow.array(trajectory.time_ns),
         texts(trajectory.frame),
         *numbers(triangle(trajectory.covariance)),
+        *numbers(probability[:, None]),
     ]
-    return arrow.table(columns, names=[*COLUMNS, "time_ns", "frame", *COVARIANCE])
+    names = [name for name in COLUMNS if name != PROBABILITY_COLUMN]
+    names += ["time_ns", "frame", *COVARIANCE, PROBABILITY_COLUMN]
+    return arrow.table(columns, names=names)
 
 
 def _empty_trajectory() -> Trajectory:

@@ -20,7 +20,8 @@ from locatk.formats.tables.timestamps import format_epoch_seconds
 def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool = False) -> None:
     """Write poses as CSV (:data:`COLUMNS`), one row a pose, device after device.
 
-    Unknown sigmas are empty cells. Numbers have the fewest digits that read back equal.
+    Unknown sigmas and probabilities are empty cells. Numbers have the fewest digits that read
+    back equal.
 
     Raises
     ------
@@ -46,9 +47,12 @@ def _csv_lines(trajectory: Trajectory) -> Iterator[str]:
     if any(character in device for character in ',"\r\n'):
         device = '"' + device.replace('"', '""') + '"'
     poses = np.hstack([trajectory.position, trajectory.quaternion]).tolist()
-    sigmas = trajectory.sigma[:, SIGMA_AXES].tolist()
-    for time_ns, pose, sigma in zip(trajectory.time_ns.tolist(), poses, sigmas, strict=True):
-        cells = ("" if value != value else repr(value) for value in sigma)
+    probability = trajectory.probability
+    if probability is None:
+        probability = np.full(len(trajectory), np.nan)
+    trust = np.column_stack([trajectory.sigma[:, SIGMA_AXES], probability]).tolist()
+    for time_ns, pose, values in zip(trajectory.time_ns.tolist(), poses, trust, strict=True):
+        cells = ("" if value != value else repr(value) for value in values)
         yield ",".join([format_epoch_seconds(time_ns), device, *map(repr, pose), *cells]) + "\n"
 
 

@@ -27,6 +27,7 @@ COLUMNS = (
     "sigma_y_m",
     "sigma_z_m",
     "sigma_heading_rad",
+    "probability",
 )
 """Header of the file. It is part of the contract (docs/formats.md): new columns go to the end."""
 
@@ -34,6 +35,8 @@ SIGMA_AXES = (0, 1, 2, 5)
 """Rows of a pose's covariance that belong to the four sigmas."""
 
 POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9], COLUMNS[9:13]
+
+PROBABILITY_COLUMN = COLUMNS[13]
 
 MAX_NORM_ERROR = 1e-2
 """Largest deviation of a quaternion from unit length that passes for rounding by its writer."""
@@ -48,8 +51,9 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     Parameters
     ----------
     path : path
-        Columns ``qx`` to ``qw`` and the sigmas may be missing (all four of a kind); further
-        columns are ignored. A sigma that is empty or ``nan`` is unknown.
+        Columns ``qx`` to ``qw`` and the sigmas may be missing (all four of a kind), and so may
+        the probability; further columns are ignored. A sigma or probability that is empty or
+        ``nan`` is unknown.
     frame : str
         Name of the frame, which is not part of the file.
 
@@ -64,8 +68,8 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     MissingDataError, FormatError
         The file is missing, or is not CSV with these columns.
     InputError
-        A cell is not a number, a sigma is negative, a quaternion is far from unit length, or
-        the time stamps of a device do not ascend.
+        A cell is not a number, a sigma is negative, a probability is not between 0 and 1, a
+        quaternion is far from unit length, or the time stamps of a device do not ascend.
     """
     table = read_table(path)
     table.require(*COLUMNS[:5])
@@ -80,6 +84,9 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
         table.require(*SIGMA_COLUMNS)
         columns = [table.floats(name, low=0.0, allow_missing=True) for name in SIGMA_COLUMNS]
         sigma = np.stack(columns, axis=1)
+    probability = np.full(n, np.nan)
+    if PROBABILITY_COLUMN in table.columns:
+        probability = table.floats(PROBABILITY_COLUMN, low=0.0, high=1.0, allow_missing=True)
     time_ns = table.epoch_times_ns("time_s")
 
     trajectories = []
@@ -88,8 +95,17 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
         rows = np.flatnonzero(devices == device)
         check_ascending(table, time_ns, rows)
         covariance = _diagonal_covariance(sigma[rows])
+        is_known = np.isfinite(probability[rows]).any()
         trajectories.append(
-            Trajectory(device, frame, time_ns[rows], position[rows], quaternion[rows], covariance)
+            Trajectory(
+                device,
+                frame,
+                time_ns[rows],
+                position[rows],
+                quaternion[rows],
+                covariance,
+                probability[rows] if is_known else None,
+            )
         )
     return trajectories
 

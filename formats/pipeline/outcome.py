@@ -31,11 +31,14 @@ class DeviceSummary:
     poses : int
     median_sigma : tuple of 4 float
         Median standard deviations of x, y, z [m] and heading [rad]; nan if unknown.
+    min_probability : float
+        Probability of the least probable pose; nan if unknown.
     """
 
     device: str
     poses: int
     median_sigma: tuple[float, float, float, float]
+    min_probability: float
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def summarize(
         method=solution.method,
         solve_s=solve_s,
         devices=tuple(
-            DeviceSummary(track.device, len(track), _median_sigma(track))
+            DeviceSummary(track.device, len(track), _median_sigma(track), track.min_probability)
             for track in solution.trajectories
         ),
         rejected=solution.rejected,
@@ -228,7 +231,7 @@ def _unlocalized_robots(solution: Solution) -> list[SolverWarning]:
 def _provisional_poses(device: str, facts: RobotFacts) -> SolverWarning:
     """Return the loss of a robot that may be on another floor or in another cell."""
     text = f"the poses of {device} are provisional: they are right with a probability of "
-    text += f"{facts.probability:.4g}" if facts.probability is not None else "unknown"
+    text += f"{facts.probability:.5g}" if facts.probability is not None else "unknown"
     return SolverWarning("provisional", f"{text}; visit more landmarks")
 
 

@@ -30,6 +30,7 @@ from locatk.formats.plots.units import (
     format_number,
     select_unit,
 )
+from locatk.formats.report.detections import format_probability
 from locatk.formats.report.diagram_grid import DiagramGrid
 from locatk.formats.report.panels import Panel, Table, escape, join_names, join_sentences
 from locatk.formats.report.style import INK
@@ -78,7 +79,7 @@ def summarize(subject: Subject) -> str:
                 "axes together)."
             )
         reason = why_not_evaluated(subject)
-        return join_sentences(reason, covariance, _invalid_poses_note(solution))
+        return join_sentences(reason, covariance, *_trust_notes(solution))
     median, p95 = (
         format_length(value, unscaled=unscaled) for value in (evaluation.median, evaluation.p95)
     )
@@ -92,14 +93,26 @@ def summarize(subject: Subject) -> str:
         origin = evaluation.time_offset.describe()
         offset = f"Time offset: {evaluation.offset_s:.4f} s ({origin})."
     if evaluation.consistency is not None:
-        consistency = f"{evaluation.consistency.describe().capitalize()}."
+        description = evaluation.consistency.describe()
+        consistency = f"{description[0].upper()}{description[1:]}."
     return join_sentences(
         f"Half of the poses are within {median} of the truth, 95 % within {p95}.",
         alignment,
         offset,
         consistency,
-        _invalid_poses_note(solution),
+        *_trust_notes(solution),
     )
+
+
+def _trust_notes(solution: Solution) -> list[str]:
+    """Return sentences on provisional poses and on poses that are not finite."""
+    notes = [
+        f"The poses of {t.device} are provisional: the least certain one is right with a "
+        f"probability of {format_probability(t.min_probability)} %."
+        for t in solution.trajectories
+        if t.is_provisional
+    ]
+    return [*notes, _invalid_poses_note(solution)]
 
 
 def _invalid_poses_note(solution: Solution) -> str:
@@ -298,9 +311,8 @@ def _nees_panels(evaluation: Evaluation, colors: dict[str, str], start_ns: int) 
     row = ValueRow("NEES / 95 % quantile", split_by_device(evaluation, ratio, is_known), {})
     explanation = (
         "Normalized estimation error squared (NEES), divided by its 95 % quantile. "
-        f"{100 * consistency.inside:.0f} % of {format_count(consistency.n, 'poses')} are below 1. "
-        f"The mean NEES is {format_number(consistency.mean)} times the expected one (1 if the "
-        "covariances are right)."
+        f"{100 * consistency.inside:.0f} % of {format_count(consistency.n, 'poses')} are below 1 "
+        f"(95 % if the covariances are right)."
     )
     title = "Consistency of the covariance"
     return [value_panel(title, explanation, [row], colors, start_ns, as_marks=True, reference=1.0)]

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x12locatk/poses.proto\x12\x06locatk\x1a\x1fgoogle/protobuf/timestamp.proto\"\xb4\x01\n\tPoseTrack\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x10\n\x08\x66rame_id\x18\x03 \x01(\t\x12\x0f\n\x07time_ns\x18\x04 \x03(\x06\x12\x12\n\nposition_m\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x12\x18\n\x10\x63ovariance_m_rad\x18\x07 \x03(\x01\"\xb1\x01\n\x08Odometry\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x10\n\x08\x66rame_id\x18\x03 \x01(\t\x12\x0f\n\x07time_ns\x18\x04 \x03(\x06\x12\x0b\n\x03x_m\x18\x05 \x03(\x01\x12\x0b\n\x03y_m\x18\x06 \x03(\x01\x12\x13\n\x0bheading_rad\x18\x07 \x03(\x01\x12\x14\n\x0c\x64\x65vice_ticks\x18\x08 \x03(\x06\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x12locatk/poses.proto\x12\x06locatk\x1a\x1fgoogle/protobuf/timestamp.proto\"\xc9\x01\n\tPoseTrack\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x10\n\x08\x66rame_id\x18\x03 \x01(\t\x12\x0f\n\x07time_ns\x18\x04 \x03(\x06\x12\x12\n\nposition_m\x18\x05 \x03(\x01\x12\x17\n\x0fquaternion_xyzw\x18\x06 \x03(\x01\x12\x18\n\x10\x63ovariance_m_rad\x18\x07 \x03(\x01\x12\x13\n\x0bprobability\x18\x08 \x03(\x01\"\xb1\x01\n\x08Odometry\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06\x64\x65vice\x18\x02 \x01(\t\x12\x10\n\x08\x66rame_id\x18\x03 \x01(\t\x12\x0f\n\x07time_ns\x18\x04 \x03(\x06\x12\x0b\n\x03x_m\x18\x05 \x03(\x01\x12\x0b\n\x03y_m\x18\x06 \x03(\x01\x12\x13\n\x0bheading_rad\x18\x07 \x03(\x01\x12\x14\n\x0c\x64\x65vice_ticks\x18\x08 \x03(\x06\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,7 +33,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'locatk.poses_pb2', _globals
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_POSETRACK']._serialized_start=64
-  _globals['_POSETRACK']._serialized_end=244
-  _globals['_ODOMETRY']._serialized_start=247
-  _globals['_ODOMETRY']._serialized_end=424
+  _globals['_POSETRACK']._serialized_end=265
+  _globals['_ODOMETRY']._serialized_start=268
+  _globals['_ODOMETRY']._serialized_end=445
 # @@protoc_insertion_point(module_scope)

@@ -8,7 +8,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class PoseTrack(_message.Message):
-    __slots__ = ("timestamp", "device", "frame_id", "time_ns", "position_m", "quaternion_xyzw", "covariance_m_rad")
+    __slots__ = ("timestamp", "device", "frame_id", "time_ns", "position_m", "quaternion_xyzw", "covariance_m_rad", "probability")
     TIMESTAMP_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
@@ -16,6 +16,7 @@ class PoseTrack(_message.Message):
     POSITION_M_FIELD_NUMBER: _ClassVar[int]
     QUATERNION_XYZW_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_M_RAD_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     timestamp: _timestamp_pb2.Timestamp
     device: str
     frame_id: str
@@ -23,7 +24,8 @@ class PoseTrack(_message.Message):
     position_m: _containers.RepeatedScalarFieldContainer[float]
     quaternion_xyzw: _containers.RepeatedScalarFieldContainer[float]
     covariance_m_rad: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, timestamp: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., device: _Optional[str] = ..., frame_id: _Optional[str] = ..., time_ns: _Optional[_Iterable[int]] = ..., position_m: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., covariance_m_rad: _Optional[_Iterable[float]] = ...) -> None: ...
+    probability: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, timestamp: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., device: _Optional[str] = ..., frame_id: _Optional[str] = ..., time_ns: _Optional[_Iterable[int]] = ..., position_m: _Optional[_Iterable[float]] = ..., quaternion_xyzw: _Optional[_Iterable[float]] = ..., covariance_m_rad: _Optional[_Iterable[float]] = ..., probability: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Odometry(_message.Message):
     __slots__ = ("timestamp", "device", "frame_id", "time_ns", "x_m", "y_m", "heading_rad", "device_ticks")

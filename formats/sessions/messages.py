@@ -250,6 +250,7 @@ POSES = Layout(
         Column("position_m", "<f8", 3),
         Column("quaternion_xyzw", "<f8", 4),
         Column("covariance_m_rad", "<f8", 21, optional=True),
+        Column("probability", "<f8", optional=True),
     ),
 )
 

@@ -103,6 +103,9 @@ def write_solution(
     start_ns = min(starts, default=0)
     name = Path(source).name
     record = {**(facts or {}), "method": solution.method, "source": name}
+    provisional = [t.device for t in solution.trajectories if t.is_provisional]
+    if provisional:
+        record["provisional"] = ", ".join(provisional)
     with SessionWriter(
         path, kind="solution", system=solution.system, facts=record, overwrite=overwrite
     ) as writer:

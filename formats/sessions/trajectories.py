@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,8 @@ def track_messages(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]
     }
     if not np.isnan(trajectory.covariance).all():
         columns["covariance_m_rad"] = triangle(trajectory.covariance)
+    if trajectory.probability is not None:
+        columns["probability"] = trajectory.probability
     return _batched(POSES, topic, trajectory, columns)
 
 
@@ -150,7 +153,11 @@ def read_tracks(session: Session, prefix: str) -> list[Trajectory]:
         columns = batches.columns
         position, quaternion = columns["position_m"], columns["quaternion_xyzw"]
         covariance = symmetric(columns["covariance_m_rad"])
-        trajectories.append(_trajectory(batches, topic, position, quaternion, covariance))
+        track = _trajectory(batches, topic, position, quaternion, covariance)
+        probability = columns["probability"]
+        if not np.isnan(probability).all():
+            track = replace(track, probability=probability)
+        trajectories.append(track)
     return trajectories
 
 

@@ -123,13 +123,13 @@ def test_text_summarizes_the_errors(locatk, run: Path, found: Path, tmp_path: Pa
         "coverage: 100.0 % (29.9 of 29.9 s)",
         "path: 5.9",
         "drift: 0.",
-        "consistency: covariances fit: errors are ",
+        "consistency: covariances fit: NEES ",
     ):
         assert line in text, line
     assert "APE [mm]" in text
     bold = solution(tmp_path / "bold.mcap", solved(factor=3.0))
     said = locatk("eval", bold, "--truth", run, "--full").stdout
-    assert re.search(r"covariances are too small: errors are (2\.9|3|3\.1) times as large", said)
+    assert re.search(r"sigmas are (2\.9|3|3\.1) times too small: NEES", said)
 
 
 def test_the_default_text_is_short(locatk, run: Path, found: Path) -> None:
@@ -153,7 +153,7 @@ def test_points_have_no_rotation(locatk, tmp_path: Path) -> None:
     run, found = session(tmp_path / "a.mcap", point), solution(tmp_path / "b.mcap", point)
     assert answer(locatk, found, "--truth", run)["ape"]["rotation_deg"] is None
     full = locatk("eval", found, "--truth", run, "--full").stdout
-    assert "covariances are too large: errors are less than 0.01 times as large" in full
+    assert "sigmas are more than 100 times too large: NEES 0" in full
     assert "[deg]" not in full + locatk("eval", found, "--truth", run).stdout
 
 

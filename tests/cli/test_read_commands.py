@@ -142,7 +142,8 @@ def test_export_csv_is_the_contract(locatk, solved: Path, tmp_path: Path) -> Non
     with out.open(newline="") as stream:
         rows = list(csv.reader(stream))
     assert ",".join(rows[0]) == (
-        "time_s,device,x_m,y_m,z_m,qx,qy,qz,qw,sigma_x_m,sigma_y_m,sigma_z_m,sigma_heading_rad"
+        "time_s,device,x_m,y_m,z_m,qx,qy,qz,qw,"
+        "sigma_x_m,sigma_y_m,sigma_z_m,sigma_heading_rad,probability"
     )
     assert len(rows) == POSES + 1
     assert rows[1][:2] == ["1700000000.000000000", "red"]

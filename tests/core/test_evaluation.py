@@ -4,6 +4,9 @@ with, and against draws whose answer is known."""
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import signal, stats
 from scipy.spatial.transform import Rotation, Slerp
 
 from locatk.core.errors import DegenerateError, InputError
@@ -321,8 +324,12 @@ def test_nees_of_draws_is_chi_squared(factor: float) -> None:
     assert said.mean == pytest.approx(1 / factor, rel=0.03)
     assert said.median == pytest.approx(1 / factor, rel=0.05)
     assert (said.low <= said.mean <= said.high) == (factor == 1.0)
-    assert said.ratio == pytest.approx(factor**-0.5, rel=0.02)
-    words = {1.0: "covariances fit", 0.25: "are too small", 9.0: "are too large"}
+    assert said.sigma_ratio == pytest.approx(factor**-0.5, rel=0.02)
+    words = {
+        1.0: "covariances fit: NEES",
+        0.25: "sigmas are 2 times too small: NEES",
+        9.0: "sigmas are 3 times too large: NEES",
+    }
     assert words[factor] in said.describe()
     if factor == 1.0:
         assert said.inside == pytest.approx(0.95, abs=0.015)
@@ -364,7 +371,9 @@ def test_nees_of_what_is_known_against_a_plain_inverse(seed: int, known: set[int
     reported[:, unknown, :], reported[:, :, unknown] = np.nan, np.nan
     error = rng.normal(0, 1, (5, 6))
     turned = quaternion_from_matrix(rotation_exp(error[:, 3:]))
-    values, dof = consistency.compute_nees(error[:, :3], turned, reported, Similarity.identity())
+    values, dof = consistency.nees_of(
+        consistency.normalize_errors(error[:, :3], turned, reported, Similarity.identity())
+    )
     part = np.ix_(sorted(known), sorted(known))
     error[:, 3:] = Rotation.from_quat(turned).as_rotvec()
     expected = [
@@ -381,10 +390,11 @@ def test_nees_omits_fixed_and_dependent_axes() -> None:
     covariance[1, :2, :2] = [[1e-4, 2e-4], [2e-4, 4e-4]]  # y is twice x
     covariance[2] = np.nan
     offsets = np.array([[0.01, 0.02, 0.5], [0.01, 0.02, 0.5], [1.0, 1.0, 1.0]])
-    values, dof = consistency.compute_nees(offsets, None, covariance, Similarity.identity())
+    normalized = consistency.normalize_errors(offsets, None, covariance, Similarity.identity())
+    values, dof = consistency.nees_of(normalized)
     np.testing.assert_allclose(values, [2.0, 1.0, np.nan])
     assert dof.tolist() == [2, 1, 0]
-    assert consistency.summarize_nees(values[2:], dof[2:]) is None
+    assert consistency.summarize_consistency([normalized[2:]]) is None
 
 
 def test_quantiles_that_are_written_down() -> None:
@@ -406,6 +416,131 @@ def test_a_few_outlying_poses_are_distinguished() -> None:
     spoiled = Trajectory("r", "f", estimate.time_ns, position, estimate.quaternion,
                          estimate.covariance)  # fmt: skip
     assert "because of a few poses" in evaluate_pair(spoiled, truth).consistency.describe()
+
+
+# Generators of normalized errors (n, k) of variance 1. Only the passes are as the estimate of the
+# number of independent errors assumes. Nothing was tuned on them or on the seeds of these tests.
+
+
+def independent_errors(rng: np.random.Generator, k: int) -> Array:
+    return rng.normal(size=(600, k))
+
+
+def decaying_errors(rng: np.random.Generator, k: int, poses: float = 40.0) -> Array:
+    """An Ornstein-Uhlenbeck process, as of odometry that is corrected now and then."""
+    decay = np.exp(-1 / poses)
+    steps = np.sqrt(1 - decay**2) * rng.normal(size=(1200, k))
+    steps[0] = rng.normal(size=k)
+    return np.asarray(signal.lfilter([1.0], [1.0, -decay], steps, axis=0))
+
+
+def errors_of_passes(rng: np.random.Generator, k: int) -> Array:
+    """Poses over tags: all of one pass share an error, and passes differ in length."""
+    lengths = rng.integers(20, 120, 16)
+    return np.repeat(rng.normal(size=(16, k)), lengths, axis=0)
+
+
+def smooth_errors(rng: np.random.Generator, k: int) -> Array:
+    """Sums of waves of random length, as of a path over a distorted floor."""
+    time, frequency = np.arange(500) / 500, rng.normal(0, 50, (30, k))
+    amplitude, phase = rng.rayleigh(1.0, (30, k)), rng.uniform(0, 2 * np.pi, (30, k))
+    waves = np.cos(time[:, None, None] * frequency + phase)
+    return np.einsum("nwk,wk->nk", waves, amplitude) / np.sqrt(30)
+
+
+def constant_errors(rng: np.random.Generator, k: int) -> Array:
+    return np.tile(rng.normal(size=k), (300, 1))
+
+
+def mixed_errors(rng: np.random.Generator, k: int) -> Array:
+    """Errors of which one component decays slowly, and the others are independent."""
+    errors = rng.normal(size=(1200, k))
+    errors[:, 0] = decaying_errors(rng, 1, 100.0)[:, 0]
+    return errors
+
+
+GENERATORS = (
+    independent_errors, decaying_errors, errors_of_passes, smooth_errors, constant_errors,
+    mixed_errors,
+)  # fmt: skip
+
+
+def summary_of(errors: Array, factor: float = 1.0) -> consistency.Consistency:
+    normalized = np.full((len(errors), 6), np.nan)
+    normalized[:, : errors.shape[1]] = factor * errors
+    summary = consistency.summarize_consistency([normalized])
+    assert summary is not None
+    return summary
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [1, 3, 6])
+@pytest.mark.parametrize("generator", GENERATORS)
+def test_right_covariances_fit_however_errors_are_shared(
+    generator: Callable[[np.random.Generator, int], Array], k: int
+) -> None:
+    """At most 5 % of the drives are accused, of 300 in expectation; 9 % is three sigmas off."""
+    rng = np.random.default_rng([2026, k])
+    summaries = [summary_of(generator(rng, k)) for _ in range(300)]
+    verdicts = Counter(each.verdict for each in summaries)
+    assert verdicts["too_small"] + verdicts["too_large"] <= 0.09 * 300
+    # The spread of the mean NEES over all drives gives the number that each has to estimate.
+    spread = 2 / (k * np.var([each.mean for each in summaries]))
+    assert 0.35 < np.median([each.independent for each in summaries]) / spread < 1.3
+
+
+@pytest.mark.parametrize("generator", GENERATORS)
+def test_wrong_covariances_are_named(
+    generator: Callable[[np.random.Generator, int], Array],
+) -> None:
+    """Sigmas of a third or three times the right ones never fit without reservation."""
+    rng = np.random.default_rng(11)
+    for factor, verdict in ((3.0, "too_small"), (1 / 3, "too_large")):
+        summary = summary_of(generator(rng, 3), factor)
+        if generator is not constant_errors:
+            assert summary.verdict == verdict
+            assert f"times {verdict.replace('_', ' ')}: NEES" in summary.describe()
+            low, high = summary.sigma_ratio_interval
+            assert low < factor < high
+        assert not summary.describe().startswith("covariances fit:")
+
+
+def test_a_single_error_is_no_proof_of_fit() -> None:
+    summary = summary_of(np.tile([0.9, -1.1, 1.0], (300, 1)))
+    assert summary.verdict == "fit"
+    assert "covariances fit as far as 1 independent error can show" in summary.describe()
+
+
+def test_nees_of_1_93_does_not_fit() -> None:
+    """It was once reported as fitting."""
+    errors = np.random.default_rng(5).normal(size=(400, 3))
+    summary = summary_of(errors, np.sqrt(1.93 / np.mean(errors**2)))
+    assert summary.describe().startswith("sigmas are 1.4 times too small: NEES 1.93")
+    table = summary.as_dict()
+    assert (table["verdict"], table["sigma_ratio"]) == ("too_small", pytest.approx(1.93**0.5))
+    assert 1.3 < table["sigma_ratio_low"] < 1.93**0.5 < table["sigma_ratio_high"] < 1.5
+
+
+def test_verdicts_in_words() -> None:
+    base = summary_of(np.random.default_rng(5).normal(size=(400, 3)))
+    for mean, words in (
+        (1.1, "sigmas are 5 % too small"),
+        (0.9, "sigmas are 5 % too large"),
+        (1.2, "sigmas are 10 % too small"),
+        (0.0, "sigmas are more than 100 times too large"),
+        (225.0, "sigmas are 15 times too small"),
+    ):
+        assert replace(base, mean=mean, low=0.95, high=1.05).describe().startswith(words)
+    one = replace(base, mean=1.9, low=0.0, high=5.0, independent=1.0)
+    assert "0.62 to any number of times the reported ones" in one.describe()
+    assert one.as_dict()["sigma_ratio_high"] is None
+
+
+def test_errors_of_devices_are_independent() -> None:
+    errors = np.ones((50, 6))
+    summary = consistency.summarize_consistency([errors, -errors, np.full((5, 6), np.nan)])
+    assert summary is not None
+    assert summary.independent == pytest.approx(2.0, rel=1e-2)
 
 
 # ---- association, and what cannot be evaluated

@@ -26,7 +26,7 @@ from locatk.core.evaluation import (
 )
 from locatk.core.evaluation.association import require_ascending
 from locatk.core.evaluation.coarse_offset import clocks_agree
-from locatk.core.evaluation.consistency import compute_nees, summarize_nees
+from locatk.core.evaluation.consistency import nees_of, normalize_errors, summarize_consistency
 from locatk.core.evaluation.coverage import compute_coverage
 from locatk.core.evaluation.pose_errors import MatchedPoses, select_pairs
 from locatk.core.geometry import Similarity, quaternion_from_heading
@@ -253,10 +253,13 @@ def test_statistics_leave_out_what_is_not_finite() -> None:
 
 
 def test_consistency_of_one_known_pose() -> None:
-    consistency = summarize_nees(np.array([np.nan, 3.0, 5.0]), np.array([3, 3, 0]))
+    errors = np.full((3, 6), np.nan)
+    errors[1, :3] = 1.0
+    consistency = summarize_consistency([errors])
     assert consistency is not None
     assert (consistency.n, consistency.mean, consistency.dof) == (1, 1.0, 3.0)
-    assert summarize_nees(np.array([np.nan, 1.0]), np.array([1, 0])) is None
+    assert consistency.independent == 1.0
+    assert summarize_consistency([errors[:1]]) is None
 
 
 @pytest.mark.parametrize(("excess", "dof"), [(1e-13, 1), (1e-10, 2)])
@@ -265,7 +268,7 @@ def test_a_component_that_the_others_determine_does_not_count(excess: float, dof
     covariance = np.full((1, 6, 6), np.nan)
     covariance[0, :2, :2] = 1e-4 * np.array([[1.0, 2.0], [2.0, 4.0 * (1 + excess)]])
     residuals = np.array([[0.01, 0.02 + 1e-6, 0.0]])
-    nees, nees_dof = compute_nees(residuals, None, covariance, Similarity.identity())
+    nees, nees_dof = nees_of(normalize_errors(residuals, None, covariance, Similarity.identity()))
     assert nees_dof.tolist() == [dof]
     assert (nees[0] == pytest.approx(1.0)) == (dof == 1)
 

@@ -22,9 +22,7 @@ from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_
 from locatk.core.landmarks.preprocessing import HallRecording
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import SolverWarning
-
-PROVISIONAL_PROBABILITY = 0.999
-"""Probability below which poses are provisional."""
+from locatk.core.trajectory import PROVISIONAL_PROBABILITY
 
 MIN_MISREAD_PROBABILITY = 0.99
 """Probability from which on a landmark is reported to differ from the map."""

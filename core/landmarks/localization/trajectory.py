@@ -7,6 +7,7 @@ Before the first and after the last visit the trajectory is dead reckoning.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -72,6 +73,35 @@ def estimate_trajectory(
     position = np.column_stack([pose[:, :2], np.zeros(len(pose))])
     quaternion = quaternion_from_heading(pose[:, 2])
     return Trajectory(device, "map", time_ns, position, quaternion, covariance)
+
+
+def pose_probability(
+    time_ns: NDArray[np.int64],
+    segments: Sequence[VisitSegment],
+    probabilities: Sequence[float],
+    map_probability: float,
+) -> Array:
+    """Return the probability (n,) that each pose is not of another position or floor.
+
+    Between two visits it is that of the less probable one, because dead reckoning connects both.
+
+    Parameters
+    ----------
+    time_ns : (n,) int64 ndarray
+        Times of the poses.
+    segments : sequence of VisitSegment
+        The visits of :func:`estimate_trajectory`.
+    probabilities : sequence of float
+        Posterior probability of the cell of each visit.
+    map_probability : float
+        Posterior probability that the robot is on this floor.
+    """
+    of_visit = np.array(probabilities)
+    starts = np.array([segment.time_ns[0] for segment in segments])
+    ends = np.array([segment.time_ns[-1] for segment in segments])
+    begun = np.maximum(np.searchsorted(starts, time_ns, side="right") - 1, 0)
+    unfinished = np.minimum(np.searchsorted(ends, time_ns), len(segments) - 1)
+    return map_probability * np.minimum(of_visit[begun], of_visit[unfinished])
 
 
 def _during(segment: VisitSegment, estimate: VisitPose, odometry: Trajectory) -> TimedPoses:

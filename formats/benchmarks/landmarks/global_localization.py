@@ -28,12 +28,12 @@ from locatk.core.landmarks.localization.cell_filter import (
     OtherFloor,
     map_probability,
 )
-from locatk.core.landmarks.localization.consistency import PROVISIONAL_PROBABILITY
 from locatk.core.landmarks.map.floor import STEPS, Cell, FloorMap, neighbour
 from locatk.core.landmarks.map.windows import window_path, window_readings
 from locatk.core.landmarks.simulation.options import Errors
 from locatk.core.landmarks.simulation.sensors import odometry
 from locatk.core.landmarks.solver import SolveOptions
+from locatk.core.trajectory import PROVISIONAL_PROBABILITY
 from locatk.formats.artifacts.map_library import library_maps
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.timing import FIRST_SEED

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import heading_from_quaternion
-from locatk.core.landmarks.localization.consistency import PROVISIONAL_PROBABILITY
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.published.driver import published_driver
 from locatk.core.landmarks.simulation.closed_loop import Approach
@@ -29,6 +28,7 @@ from locatk.core.landmarks.simulation.options import Faults, SimulationOptions
 from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
 from locatk.core.landmarks.solver import SolveOptions, solve
 from locatk.core.solution import Solution
+from locatk.core.trajectory import PROVISIONAL_PROBABILITY
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.landmarks.global_localization import (
     MISREAD_FRACTION,

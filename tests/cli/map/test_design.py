@@ -58,6 +58,16 @@ def bad(made: Path, path: Path) -> Path:
 # ---- design
 
 
+def test_a_map_on_which_poses_stay_provisional_says_so(locatk, tmp_path: Path) -> None:
+    path = tmp_path / "row.toml"
+    assert locatk("map", "design", "1x3", "--window", "I2", "-o", path).exit_code in (0, 3)
+    assert "Final      never: poses remain provisional" in locatk("map", "check", path).stdout
+    (told,) = json.loads(locatk("map", "check", path, "--json").stdout)["maps"]
+    final = told["landmarks_until_final"]
+    assert (final["mean"], final["worst_start"]) == (None, None)
+    assert final["never"] == final["starts"] == 12
+
+
 @pytest.mark.slow
 def test_design_writes_and_prints_a_map(locatk, tmp_path: Path) -> None:
     path = tmp_path / "map.toml"
@@ -156,6 +166,13 @@ def test_stdout_is_one_json_object(locatk, tmp_path: Path) -> None:
     assert len(told["warnings"]) == 2  # the pitch is too small for territories and fields
     checked = json.loads(locatk("map", "check", path, "--json").stdout)["maps"][0]
     assert checked["proof"] == proof
+    final = told["landmarks_until_final"]
+    assert checked["landmarks_until_final"] == final
+    assert set(final) == {"starts", "mean", "p99", "worst", "worst_start", "never"}
+    assert final["starts"] == 4 * told["map"]["landmarks"]
+    assert proof["landmarks_to_localise"]["mean"] < final["mean"] <= final["worst"]
+    lines = locatk("map", "check", path).stdout
+    assert f"Final      after {final['mean']:.2g} landmarks on average, " in lines
     assert checked["map"] == told["map"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from locatk.core.landmarks.localization.smoothing import (
     measure_visits,
     smooth,
 )
-from locatk.core.landmarks.localization.trajectory import estimate_trajectory
+from locatk.core.landmarks.localization.trajectory import estimate_trajectory, pose_probability
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation.session import (
     NONE,
@@ -56,6 +57,21 @@ def session(seed: int, clean: bool = False) -> tuple[SimulatedSession, Trajector
 def identified(seed: int, clean: bool = False) -> solver.IdentifiedRecording:
     one = session(seed, clean)[0]
     return solver.identify_recording(one.samples[0], one.odometry[0], FLOOR, SolveOptions())
+
+
+def test_a_pose_is_as_probable_as_the_less_probable_neighbouring_visit() -> None:
+    segments = [SimpleNamespace(time_ns=np.array(each)) for each in ([10, 12, 14], [20, 24], [30])]
+    time_ns = np.array([3, 10, 12, 14, 17, 20, 23, 24, 27, 30, 40])
+    found = pose_probability(time_ns, segments, [0.9, 1.0, 0.8], 0.5)
+    expected = [0.9, 0.9, 0.9, 0.9, 0.9, 1.0, 1.0, 1.0, 0.8, 0.8, 0.8]
+    np.testing.assert_allclose(found, 0.5 * np.array(expected))
+
+
+def test_probabilities_of_poses_agree_with_the_facts() -> None:
+    one, trajectory = session(1)
+    facts = solver.solve(one.samples, FLOOR, odometry=one.odometry).facts.robots["robot"]
+    assert trajectory.min_probability == pytest.approx(facts.probability)
+    assert facts.provisional == trajectory.is_provisional
 
 
 def errors_of(one: SimulatedSession, trajectory: Trajectory) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +65,10 @@ def test_columns_are_those_of_csv_and_more(parquet, tmp_path: Path) -> None:
     tracks = [track("red"), track("blue", seed=2)]
     write_parquet(tmp_path / "poses.parquet", tracks)
     table = parquet.read_table(tmp_path / "poses.parquet")
-    assert tuple(table.column_names[: len(COLUMNS)]) == COLUMNS
-    assert table.column_names[len(COLUMNS) : len(COLUMNS) + 3] == ["time_ns", "frame", "cov_x_x_m2"]
+    # The columns of earlier versions keep their order: the probability is the last one.
+    assert tuple(table.column_names[:13]) == COLUMNS[:13]
+    assert table.column_names[13:16] == ["time_ns", "frame", "cov_x_x_m2"]
+    assert table.column_names[-1] == COLUMNS[-1] == "probability"
     assert COVARIANCE[5] == "cov_x_rz_m_rad"
     assert COVARIANCE[-1] == "cov_rz_rz_rad2"
     assert len(COVARIANCE) == len(set(COVARIANCE)) == 21
@@ -84,7 +87,18 @@ def test_unknown_values_are_null(parquet, tmp_path: Path) -> None:
     assert table["sigma_x_m"].null_count == 0
     assert table["sigma_heading_rad"].null_count == 15
     assert table["cov_x_rz_m_rad"].null_count == 15
+    assert table["probability"].null_count == 30
     assert not np.isnan([x for x in table["cov_x_rz_m_rad"].to_pylist() if x is not None]).any()
+
+
+def test_probabilities_are_the_last_column(parquet, tmp_path: Path) -> None:
+    probability = np.linspace(0.9, 1.0, 30)
+    probability[3] = np.nan
+    path = tmp_path / "poses.parquet"
+    write_parquet(path, [replace(track("red"), probability=probability), track("blue")])
+    column = parquet.read_table(path)["probability"]
+    assert column.null_count == 31
+    np.testing.assert_array_equal(column.to_numpy()[:30], probability)
 
 
 def test_the_schema_contains_the_origin(parquet, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -154,10 +155,26 @@ def sample(device: str = "robot") -> Trajectory:
 def test_csv_is_what_the_contract_says(tmp_path: Path) -> None:
     write_csv(tmp_path / "a.csv", [sample()])
     assert (tmp_path / "a.csv").read_bytes().decode() == (
-        "time_s,device,x_m,y_m,z_m,qx,qy,qz,qw,sigma_x_m,sigma_y_m,sigma_z_m,sigma_heading_rad\n"
-        "1690218696.074800000,robot,0.5,-0.25,0.0,0.0,0.0,0.0,1.0,0.001,0.002,0.003,\n"
-        "1690218696.174800001,robot,0.75,1.0,0.125,0.0,0.0,0.0,1.0,0.001,0.002,0.003,\n"
+        "time_s,device,x_m,y_m,z_m,qx,qy,qz,qw,"
+        "sigma_x_m,sigma_y_m,sigma_z_m,sigma_heading_rad,probability\n"
+        "1690218696.074800000,robot,0.5,-0.25,0.0,0.0,0.0,0.0,1.0,0.001,0.002,0.003,,\n"
+        "1690218696.174800001,robot,0.75,1.0,0.125,0.0,0.0,0.0,1.0,0.001,0.002,0.003,,\n"
     )
+
+
+def test_probabilities_of_poses_survive_csv(tmp_path: Path) -> None:
+    """They are in the last column; a file of an earlier version has none."""
+    certain = replace(sample(), probability=np.array([0.97, np.nan]))
+    path = tmp_path / "a.csv"
+    write_csv(path, [certain, replace(sample(), device="other")])
+    cells = [line.rpartition(",")[2] for line in path.read_text().splitlines()]
+    assert cells == ["probability", "0.97", "", "", ""]
+    back, other = read_csv(path)
+    np.testing.assert_array_equal(back.probability, certain.probability)
+    assert other.probability is None
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(line.rpartition(",")[0] for line in lines[:3]))
+    assert [each.probability for each in read_csv(path)] == [None]
 
 
 def test_tum_is_what_evo_demands(tmp_path: Path) -> None:
@@ -227,6 +244,7 @@ ROW = "1.0,a,0,0,0,0,0,0,1,,,,\n"
         (HEADER + ROW + "2.0,a,0,0,0,0,0,0,1,-1,,,\n", 3, "0 or more"),
         (HEADER + ROW + "\n2.0,a,0,0,0,0,0,0,1,,x,,\n", 4, "'x'"),
         (HEADER + ROW + "2.0,a,0,0,0,0,0,0,0.5,,,,\n", 3, "quaternion"),
+        (HEADER[:-1] + ",probability\n" + ROW[:-1] + ",1.5\n", 2, "1 or less"),
         (HEADER + ROW + ROW, 3, "ascend"),
         (HEADER + ROW + "yesterday,a,0,0,0,0,0,0,1,,,,\n", 3, "'yesterday'"),
         (HEADER + ROW + "2.0,a,0\n", 3, "3 cells"),

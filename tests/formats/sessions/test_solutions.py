@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
@@ -20,6 +22,7 @@ from locatk.core.polaris.results import (
     TagDetection,
 )
 from locatk.core.solution import GenericRecord, Solution, SolverWarning
+from locatk.core.trajectory import Trajectory
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import SOLUTION_FILE, read_solution, write_solution
 from locatk.formats.sessions.writer import SessionWriter
@@ -80,6 +83,28 @@ def test_typed_results_are_restored(tmp_path: Path, solution: Solution) -> None:
     path = tmp_path / "solved.mcap"
     write_solution(path, solution, source="run.mcap")
     assert read_solution(path) == solution
+
+
+def test_probabilities_of_poses_are_restored(tmp_path: Path) -> None:
+    """Devices of unknown probability have none, as have files of earlier versions."""
+    time_ns = 1_700_000_000_000_000_000 + 10**7 * np.arange(3000)
+    unknown = Trajectory.from_positions("b", "map", time_ns, np.zeros((3000, 3)))
+    probability = np.linspace(0.95, 1.0, 3000)
+    probability[1500] = np.nan
+    known = replace(unknown, device="a", probability=probability)
+    certain = replace(unknown, device="c", probability=np.full(3000, 0.9995))
+    path = tmp_path / "solved.mcap"
+    solution = Solution("landmarks", "field", (known, unknown, certain))
+    write_solution(path, solution, source="run.mcap")
+    back = read_solution(path).trajectories
+    np.testing.assert_array_equal(back[0].probability, probability)
+    assert back[1].probability is None
+    assert [each.is_provisional for each in back] == [True, False, False]
+    assert back[0].min_probability == 0.95
+    assert np.isnan(back[1].min_probability)
+    assert Session.open(path).facts["provisional"] == "a"
+    write_solution(path, replace(solution, trajectories=back[1:]), source="x", overwrite=True)
+    assert "provisional" not in Session.open(path).facts
 
 
 def test_keys_are_those_of_the_docs(tmp_path: Path) -> None:
