@@ -13,9 +13,9 @@ import numpy as np
 
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.localization.cell_filter import CellIdentification, identify_cells
-from locatk.core.landmarks.localization.consistency import PROVISIONAL_PROBABILITY
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.solver import SolveOptions
+from locatk.core.trajectory import PROVISIONAL_PROBABILITY
 from locatk.formats.artifacts.map_library import library_maps
 from locatk.formats.benchmarks.figures import Duration, Figure
 from locatk.formats.benchmarks.landmarks.global_localization import (
