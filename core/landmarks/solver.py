@@ -20,18 +20,16 @@ from locatk.core.landmarks.localization.consistency import (
     NO_MAP_WARNING,
     PROVISIONAL_PROBABILITY,
     describe_visit,
-    find_displaced_landmarks,
     is_map_contradicted,
+    warn_of_cause,
     warn_of_missing_pose,
     warn_of_opposite_polarity,
 )
+from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing, smooth_robustly
 from locatk.core.landmarks.localization.smoothing import (
-    DISPLACED_LANDMARK_SIGMA,
     SMOOTHED_MODEL_ERROR_T,
-    SmoothingResult,
     landmark_priors,
     measure_visits,
-    smooth,
 )
 from locatk.core.landmarks.localization.trajectory import estimate_trajectory
 from locatk.core.landmarks.map.floor import FloorMap
@@ -247,42 +245,34 @@ def localize_robot(
         not_localised = replace(facts, localised=False, provisional=False)
         return _with_warnings(replace(unlocalized, facts=not_localised), obstacle, *polarity)
     smoothed, warnings = smooth_robot(identified, on_map, floor)
-    facts = replace(facts, misfit_sigma=smoothed.residual_sigma)
+    residual_sigma = smoothed.result.residual_sigma
+    facts = replace(facts, misfit_sigma=residual_sigma)
     robot = _with_warnings(replace(unlocalized, facts=facts), *warnings)
-    if smoothed.residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
+    if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
         return replace(robot, facts=replace(facts, localised=False))
     trajectory = estimate_trajectory(
         identified.device,
-        [visit.segment for visit in on_map],
-        smoothed.visits[0],
+        smoothed.measurements,
+        smoothed.result.visits[0],
         identified.odometry,
-        identified.priors,
+        smoothed.slipped_links,
     )
     return replace(robot, trajectories=(trajectory,))
 
 
 def smooth_robot(
     identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit], floor: FloorMap
-) -> tuple[SmoothingResult, list[SolverWarning]]:
-    """Smooth the visits of one robot; displaced landmarks are detected and given less weight."""
+) -> tuple[RobustSmoothing, list[SolverWarning]]:
+    """Smooth the visits of one robot, with warnings of inconsistencies."""
     priors = replace(identified.priors, model_error_t=SMOOTHED_MODEL_ERROR_T)
     measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
     landmarks = landmark_priors(on_map, floor, identified.priors)
-    smoothed = smooth([measurements], landmarks, floor.geometry, priors)
-    warnings = []
-    displaced = find_displaced_landmarks(landmarks, smoothed)
-    for cell, distance_m in displaced.items():
-        landmarks[cell] = replace(landmarks[cell], sigma=DISPLACED_LANDMARK_SIGMA)
+    smoothed = smooth_robustly(measurements, landmarks, floor.geometry, priors)
+    warnings = [warn_of_cause(*cause) for cause in smoothed.causes]
+    residual_sigma = smoothed.result.residual_sigma
+    if residual_sigma > MAX_RESIDUAL_SIGMAS:
         message = (
-            f"the landmark at {cell[0]},{cell[1]} is displaced by {1e3 * distance_m:.2g} mm or "
-            "more; `locatk calibrate map` estimates by how much"
-        )
-        warnings.append(SolverWarning("landmark_displaced", message))
-    if displaced:
-        smoothed = smooth([measurements], landmarks, floor.geometry, priors)
-    if smoothed.residual_sigma > MAX_RESIDUAL_SIGMAS:
-        message = (
-            f"fields deviate from the model by {smoothed.residual_sigma:.2g} standard deviations; "
+            f"fields deviate from the model by {residual_sigma:.2g} standard deviations; "
             "check clocks and scale of the odometry, the sensors and the landmarks' geometry"
         )
         warnings.append(SolverWarning("field_misfit", message))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +17,8 @@ from locatk.core.landmarks.localization.cell_filter import (
     IdentifiedVisit,
     identify_cells,
 )
-from locatk.core.landmarks.localization.smoothing import LandmarkPrior, SmoothingResult
-from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_code
+from locatk.core.landmarks.localization.robust_smoothing import Cause, WheelSlip
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap, as_built_code
 from locatk.core.landmarks.preprocessing import HallRecording
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import SolverWarning
@@ -31,13 +31,6 @@ MIN_MISREAD_PROBABILITY = 0.99
 
 MIN_OUTLIER_PROBABILITY = 0.5
 """Probability from which on a visit counts as an outlier."""
-
-MIN_LANDMARKS_FOR_DISPLACEMENT = 3
-"""Number of landmarks from which on the displacement of one of them can be recognized."""
-
-MIN_DISPLACEMENT_SIGMAS = 2.5
-"""Deviation of a landmark from its pose on the map, in standard deviations of installation, from
-which on it counts as displaced."""
 
 MIN_CONTRADICTIONS = 2
 MAX_CONTRADICTED_FRACTION = 1 / 3
@@ -124,18 +117,23 @@ def describe_visit(
     )
 
 
-def find_displaced_landmarks(
-    landmarks: Mapping[Cell, LandmarkPrior], smoothed: SmoothingResult
-) -> dict[Cell, float]:
-    """Return the landmarks that are far from their pose on the map, with the distance in metres."""
-    if len(landmarks) < MIN_LANDMARKS_FOR_DISPLACEMENT:
-        return {}
-    displaced = {}
-    for cell, prior in landmarks.items():
-        shift = smoothed.landmarks[cell].pose - prior.pose
-        if np.abs(shift / prior.sigma).max() > MIN_DISPLACEMENT_SIGMAS:
-            displaced[cell] = float(np.hypot(*shift[:2]))
-    return displaced
+def warn_of_cause(cause: Cause, *alternatives: Cause) -> SolverWarning:
+    """Return the warning of a wheel slip or of a displaced landmark, or of either."""
+    code = "wheel_slip" if isinstance(cause, WheelSlip) else "landmark_displaced"
+    message = ", or ".join(_describe_cause(each) for each in (cause, *alternatives))
+    if alternatives:
+        message += "; the recording does not show which"
+    return SolverWarning(code, message)
+
+
+def _describe_cause(cause: Cause) -> str:
+    size = f"{1e3 * cause.distance_m:.2g} mm and {math.degrees(abs(cause.rotation_rad)):.2g} deg"
+    if isinstance(cause, WheelSlip):
+        return (
+            f"a wheel slipped between {1e-9 * cause.first_ns:.3f} and "
+            f"{1e-9 * cause.last_ns:.3f} s, by {size}"
+        )
+    return f"the landmark at {cause.cell[0]},{cause.cell[1]} is displaced by {size}"
 
 
 def is_map_contradicted(
