@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from locatk.core.errors import InputError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import detect_landmarks
+from locatk.core.landmarks.detection.trace import OdometryDrift, known_drift
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization.cell_filter import (
@@ -22,11 +24,15 @@ from locatk.core.landmarks.localization.consistency import (
     describe_visit,
     is_map_contradicted,
     warn_of_cause,
+    warn_of_lag,
     warn_of_missing_pose,
     warn_of_opposite_polarity,
 )
+from locatk.core.landmarks.localization.odometry_path import without_lag
 from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing, smooth_robustly
 from locatk.core.landmarks.localization.smoothing import (
+    LAG_COLUMN,
+    POSE_SIZE,
     SMOOTHED_MODEL_ERROR_T,
     landmark_priors,
     measure_visits,
@@ -45,6 +51,18 @@ from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
 METHODS = ("field", "paper")
+
+MAX_LAG_ROUNDS = 3
+"""Rounds of a solution, each without the lag of the odometry that the previous one found."""
+
+MIN_LAG_S = 2e-3
+"""Lag of the odometry that is removed: the linearization takes smaller ones ..."""
+
+MIN_REPORTED_LAG_S = 0.01
+"""... and from which on a warning is given."""
+
+MIN_LAG_SIGMAS = 4.0
+"""Significance of a lag."""
 
 MAX_RESIDUAL_SIGMAS = 2.0
 """Rms residual of all fields after smoothing from which on a warning is given ..."""
@@ -65,11 +83,18 @@ class SolveOptions:
         Probability that a landmark differs from the map or is misread.
     priors : ModelPriors
         Uncertainties of sensors, bars and odometry; the noise is taken from the recording.
+    odometry_noise : float, optional
+        Random walk of the heading by odometry [rad/sqrt(m)]; that of the position grows with it.
+        It is estimated from the recording if it is not given.
+    odometry_lag_s : float, optional
+        Time by which the odometry is later than the fields; it is estimated if it is not given.
     """
 
     method: str = "field"
     misread: float = 0.02
     priors: ModelPriors = field(default_factory=ModelPriors)
+    odometry_noise: float | None = None
+    odometry_lag_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -117,10 +142,7 @@ def solve(
         return solve_published(samples, floor, odometry=odometry)
     odometry_of = {trajectory.device: trajectory for trajectory in reversed(odometry)}
     robots = [
-        localize_robot(
-            identify_recording(each, odometry_of.get(each.device), floor, options), floor, options
-        )
-        for each in samples
+        solve_recording(each, odometry_of.get(each.device), floor, options) for each in samples
     ]
     detections = [
         describe_visit(visit.hypotheses, visit.estimate, floor)
@@ -186,7 +208,8 @@ def identify_recording(
     pitch_m = floor.pitch_m if floor is not None else DEFAULT_PITCH_M
     recording = preprocess(samples, odometry)
     check_odometry(recording, geometry)
-    priors = replace(options.priors, noise_t=recording.noise_t)
+    drift = known_drift(options.priors.drift, options.odometry_noise, options.odometry_lag_s)
+    priors = replace(options.priors, noise_t=recording.noise_t, drift=drift)
     recording, detected = detect_landmarks(recording, geometry, priors, pitch_m)
     visits, map_probability = identify_visits(
         detected, floor, misread=options.misread, drift=priors.drift
@@ -206,12 +229,41 @@ class LocalizedRobot:
     warnings : tuple of SolverWarning
     trajectories : tuple of Trajectory
         One on the map, or none if the robot is not localized.
+    lag_s : float
+        Time lag of the odometry; 0 if it is not significant.
     """
 
     identified: IdentifiedRecording
     facts: RobotFacts
     warnings: tuple[SolverWarning, ...]
     trajectories: tuple[Trajectory, ...] = ()
+    lag_s: float = 0.0
+
+
+def solve_recording(
+    samples: HallSamples,
+    odometry: Trajectory | None,
+    floor: FloorMap | None,
+    options: SolveOptions,
+) -> LocalizedRobot:
+    """Localize one robot; remove the time lag of its odometry if there is any.
+
+    Raises
+    ------
+    InputError
+        See :func:`solve`.
+    """
+    lag_s = options.odometry_lag_s or 0.0
+    for _ in range(MAX_LAG_ROUNDS):
+        shifted = odometry if odometry is None or not lag_s else without_lag(odometry, lag_s)
+        identified = identify_recording(samples, shifted, floor, options)
+        robot = localize_robot(identified, floor, options)
+        if options.odometry_lag_s is not None or not robot.lag_s:
+            break
+        lag_s += robot.lag_s
+    if options.odometry_lag_s is None and abs(lag_s) > MIN_REPORTED_LAG_S:
+        robot = _with_warnings(robot, warn_of_lag(lag_s).about(identified.device))
+    return robot
 
 
 def localize_robot(
@@ -244,10 +296,13 @@ def localize_robot(
         )
         not_localised = replace(facts, localised=False, provisional=False)
         return _with_warnings(replace(unlocalized, facts=not_localised), obstacle, *polarity)
-    smoothed, warnings = smooth_robot(identified, on_map, floor)
+    smoothed, warnings = smooth_robot(
+        identified, on_map, floor, estimate_walk=options.odometry_noise is None
+    )
     residual_sigma = smoothed.result.residual_sigma
     facts = replace(facts, misfit_sigma=residual_sigma)
-    robot = _with_warnings(replace(unlocalized, facts=facts), *warnings)
+    lag_s = significant_lag(smoothed, identified.priors.drift)
+    robot = _with_warnings(replace(unlocalized, facts=facts, lag_s=lag_s), *warnings)
     if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
         return replace(robot, facts=replace(facts, localised=False))
     trajectory = estimate_trajectory(
@@ -261,13 +316,19 @@ def localize_robot(
 
 
 def smooth_robot(
-    identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit], floor: FloorMap
+    identified: IdentifiedRecording,
+    on_map: Sequence[IdentifiedVisit],
+    floor: FloorMap,
+    *,
+    estimate_walk: bool = True,
 ) -> tuple[RobustSmoothing, list[SolverWarning]]:
     """Smooth the visits of one robot, with warnings of inconsistencies."""
     priors = replace(identified.priors, model_error_t=SMOOTHED_MODEL_ERROR_T)
     measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
     landmarks = landmark_priors(on_map, floor, identified.priors)
-    smoothed = smooth_robustly(measurements, landmarks, floor.geometry, priors)
+    smoothed = smooth_robustly(
+        measurements, landmarks, floor.geometry, priors, estimate_walk=estimate_walk
+    )
     warnings = [warn_of_cause(*cause) for cause in smoothed.causes]
     residual_sigma = smoothed.result.residual_sigma
     if residual_sigma > MAX_RESIDUAL_SIGMAS:
@@ -277,6 +338,15 @@ def smooth_robot(
         )
         warnings.append(SolverWarning("field_misfit", message))
     return smoothed, [warning.about(identified.device) for warning in warnings]
+
+
+def significant_lag(smoothed: RobustSmoothing, drift: OdometryDrift) -> float:
+    """Return the lag of the odometry in seconds, or 0 if it is not significant."""
+    visit = smoothed.result.visits[0][0]
+    sigma = math.sqrt(visit.covariance[POSE_SIZE + LAG_COLUMN, POSE_SIZE + LAG_COLUMN])
+    lag = float(visit.corrections[LAG_COLUMN])
+    is_significant = abs(lag) > max(MIN_LAG_SIGMAS * sigma, MIN_LAG_S / max(drift.lag_s, 1e-9))
+    return lag * drift.lag_s if is_significant else 0.0
 
 
 def _cell_facts(identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit]) -> RobotFacts:

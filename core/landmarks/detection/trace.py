@@ -54,6 +54,26 @@ class OdometryDrift:
     lag_s: float = 0.03
 
 
+def known_drift(
+    drift: OdometryDrift, heading_noise: float | None, lag_s: float | None
+) -> OdometryDrift:
+    """Return the drift of odometry whose random walk or lag is known.
+
+    Parameters
+    ----------
+    drift : OdometryDrift
+    heading_noise : float or None
+        Random walk of the heading [rad/sqrt(m)]; that of the position is in the same proportion.
+    lag_s : float or None
+        Not None if the lag is known, and removed.
+    """
+    if heading_noise is not None:
+        walk_rad = heading_noise * math.sqrt(WALK_DISTANCE_M)
+        walk_m = drift.walk_m * walk_rad / drift.walk_rad
+        drift = replace(drift, walk_rad=walk_rad, walk_m=walk_m)
+    return drift if lag_s is None else replace(drift, lag_s=0.0)
+
+
 @dataclass(frozen=True)
 class Trace:
     """Fields along the paths of the sensors during one visit, in a frame of the odometry.

@@ -136,6 +136,16 @@ def _describe_cause(cause: Cause) -> str:
     return f"the landmark at {cause.cell[0]},{cause.cell[1]} is displaced by {size}"
 
 
+def warn_of_lag(lag_s: float) -> SolverWarning:
+    """Return the warning of odometry that is later or earlier than the fields."""
+    direction = "later" if lag_s > 0 else "earlier"
+    message = (
+        f"the odometry is {1e3 * abs(lag_s):.2g} ms {direction} than the fields; its times were "
+        "corrected by that"
+    )
+    return SolverWarning("odometry_lag", message)
+
+
 def is_map_contradicted(
     visits: Sequence[IdentifiedVisit], on_map: Sequence[IdentifiedVisit], map_probability: float
 ) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.geometry import quaternion_from_heading
 from locatk.core.landmarks.preprocessing import planar_poses
 from locatk.core.trajectory import Trajectory
 
@@ -51,3 +52,15 @@ class OdometryPath:
             self.pose_at(time_ns + span) for span in (VELOCITY_SPAN_NS, -VELOCITY_SPAN_NS)
         )
         return (ahead - behind) / (2e-9 * VELOCITY_SPAN_NS)
+
+
+def without_lag(odometry: Trajectory, lag_s: float) -> Trajectory:
+    """Return the odometry as it would be without a lag, at the times for which it is known."""
+    path = OdometryPath.of(odometry)
+    time_ns = path.time_ns + round(1e9 * lag_s)
+    is_known = (time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])
+    pose = path.pose_at(time_ns[is_known])
+    position = np.column_stack([pose[:, :2], np.zeros(len(pose))])
+    quaternion = quaternion_from_heading(pose[:, 2])
+    known = odometry.select(is_known)
+    return replace(known, position=position, quaternion=quaternion)
