@@ -22,7 +22,9 @@ from locatk.core.landmarks.localization.consistency import (
     NO_MAP_WARNING,
     PROVISIONAL_PROBABILITY,
     describe_visit,
+    find_displaced_landmarks,
     is_map_contradicted,
+    warn_of_carrying,
     warn_of_cause,
     warn_of_lag,
     warn_of_missing_pose,
@@ -312,7 +314,12 @@ def localize_robot(
         identified.odometry,
         smoothed.slipped_links,
     )
-    return replace(robot, trajectories=(trajectory,))
+    unused = [visit for visit in visits if not any(visit is used for used in on_map)]
+    displaced = find_displaced_landmarks(unused, trajectory, floor)
+    return _with_warnings(
+        replace(robot, trajectories=(trajectory,)),
+        *(warn_of_cause(each).about(identified.device) for each in displaced),
+    )
 
 
 def smooth_robot(
@@ -322,14 +329,24 @@ def smooth_robot(
     *,
     estimate_walk: bool = True,
 ) -> tuple[RobustSmoothing, list[SolverWarning]]:
-    """Smooth the visits of one robot, with warnings of inconsistencies."""
+    """Smooth the visits of one robot, with warnings of inconsistencies.
+
+    A visit during which a wheel slipped is not used, unless it is the first or the last one: its
+    path is not known.
+    """
     priors = replace(identified.priors, model_error_t=SMOOTHED_MODEL_ERROR_T)
-    measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
     landmarks = landmark_priors(on_map, floor, identified.priors)
-    smoothed = smooth_robustly(
-        measurements, landmarks, floor.geometry, priors, estimate_walk=estimate_walk
-    )
+    while True:
+        measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
+        smoothed = smooth_robustly(
+            measurements, landmarks, floor.geometry, priors, estimate_walk=estimate_walk
+        )
+        unusable = smoothed.slipped_visits & set(range(1, len(on_map) - 1))
+        if not unusable:
+            break
+        on_map = [visit for n, visit in enumerate(on_map) if n not in unusable]
     warnings = [warn_of_cause(*cause) for cause in smoothed.causes]
+    warnings += warn_of_carrying(smoothed.measurements)
     residual_sigma = smoothed.result.residual_sigma
     if residual_sigma > MAX_RESIDUAL_SIGMAS:
         message = (

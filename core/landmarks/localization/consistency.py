@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
-from locatk.core.landmarks.detection.trace import OdometryDrift
+from locatk.core.landmarks.detection.trace import OdometryDrift, compose, relative
 from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, pattern, rotated
 from locatk.core.landmarks.localization.cell_filter import (
     MIN_CELL_PROBABILITY,
@@ -17,11 +18,24 @@ from locatk.core.landmarks.localization.cell_filter import (
     IdentifiedVisit,
     identify_cells,
 )
-from locatk.core.landmarks.localization.robust_smoothing import Cause, WheelSlip
-from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap, as_built_code
+from locatk.core.landmarks.localization.odometry_path import OdometryPath
+from locatk.core.landmarks.localization.robust_smoothing import (
+    Cause,
+    DisplacedLandmark,
+    WheelSlip,
+)
+from locatk.core.landmarks.localization.smoothing import RobotMeasurements
+from locatk.core.landmarks.map.floor import (
+    HOLE_CODE,
+    Cell,
+    FloorMap,
+    as_built_code,
+    as_built_landmark,
+)
 from locatk.core.landmarks.preprocessing import HallRecording
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import SolverWarning
+from locatk.core.trajectory import Trajectory
 
 PROVISIONAL_PROBABILITY = 0.999
 """Probability below which poses are provisional."""
@@ -31,6 +45,15 @@ MIN_MISREAD_PROBABILITY = 0.99
 
 MIN_OUTLIER_PROBABILITY = 0.5
 """Probability from which on a visit counts as an outlier."""
+
+MIN_DISPLACED_CODE_PROBABILITY = 0.9
+"""Probability of a code from which on a visit that was not used is evidence of a landmark."""
+
+MAX_DISPLACEMENT_PITCHES = 0.5
+"""Displacement of a landmark, in pitches, beyond which it would be in another cell."""
+
+MAX_POSE_GAP_NS = 100_000_000
+"""Time to the nearest pose up to which the trajectory is known."""
 
 MIN_CONTRADICTIONS = 2
 MAX_CONTRADICTED_FRACTION = 1 / 3
@@ -124,6 +147,65 @@ def warn_of_cause(cause: Cause, *alternatives: Cause) -> SolverWarning:
     if alternatives:
         message += "; the recording does not show which"
     return SolverWarning(code, message)
+
+
+def warn_of_carrying(robot: RobotMeasurements) -> list[SolverWarning]:
+    """Return a warning for each time that a robot was carried."""
+    warnings = []
+    for (first, second), link in zip(pairwise(robot.visits), robot.links, strict=True):
+        if link is None:
+            message = (
+                f"the robot was carried between {1e-9 * first.segment.time_ns[-1]:.3f} and "
+                f"{1e-9 * second.segment.time_ns[0]:.3f} s; there are no poses in between"
+            )
+            warnings.append(SolverWarning("robot_carried", message))
+    return warnings
+
+
+def find_displaced_landmarks(
+    visits: Sequence[IdentifiedVisit], trajectory: Trajectory, floor: FloorMap
+) -> list[DisplacedLandmark]:
+    """Find landmarks for whose displacement a visit was not used.
+
+    Such a visit read the code of the landmark that is nearest to it by the trajectory, at another
+    pose than that on the map.
+
+    Parameters
+    ----------
+    visits : sequence of IdentifiedVisit
+        Those that are not used.
+    trajectory : Trajectory
+        From the others.
+    floor : FloorMap
+    """
+    path = OdometryPath.of(trajectory)
+    displaced: dict[Cell, DisplacedLandmark] = {}
+    for visit in visits:
+        if visit.hypotheses.refused or not visit.hypotheses.hypotheses:
+            continue
+        best = visit.hypotheses.best
+        time_ns = np.array([visit.hypotheses.time_ns])
+        gap_ns = np.abs(trajectory.time_ns - time_ns).min()
+        if best.probability < MIN_DISPLACED_CODE_PROBABILITY or gap_ns > MAX_POSE_GAP_NS:
+            continue
+        robot = path.pose_at(time_ns)[0]
+        landmark = compose(robot, relative(np.zeros((1, 3)), best.pose)[0])
+        quarters = round(landmark[2] / HALF_PI_RAD)
+        cell = min(
+            floor.cells(),
+            key=lambda one: math.dist(floor.position(one), landmark[:2]),
+            default=None,
+        )
+        if cell is None or as_built_code(floor, cell) != rotated(best.code, quarters % 4):
+            continue
+        built, _ = as_built_landmark(floor, cell)
+        shift = landmark - built
+        rotation = math.remainder(float(shift[2]), HALF_PI_RAD)
+        distance = float(np.hypot(*shift[:2]))
+        if distance > MAX_DISPLACEMENT_PITCHES * floor.pitch_m:
+            continue
+        displaced[cell] = DisplacedLandmark(cell, distance, rotation)
+    return list(displaced.values())
 
 
 def _describe_cause(cause: Cause) -> str:

@@ -128,8 +128,8 @@ class RobustSmoothing:
     result : SmoothingResult
     causes : list of tuple of Cause
         Priors that do not hold; alternatives of one inconsistency are in one tuple.
-    slipped_links : frozenset of int
-        Links between visits with a slip.
+    slipped_links, slipped_visits : frozenset of int
+        Links between visits, and visits, with a slip.
     drift : OdometryDrift
         With the estimated random walk.
     """
@@ -138,6 +138,7 @@ class RobustSmoothing:
     result: SmoothingResult
     causes: list[tuple[Cause, ...]]
     slipped_links: frozenset[int]
+    slipped_visits: frozenset[int]
     drift: OdometryDrift
 
 
@@ -423,10 +424,15 @@ class _Snooping:
         for one in self.candidates:
             if one.is_released and id(one) not in reported:
                 causes.append((self._cause(one),))
-        slipped = frozenset(
-            one.visit for one in self.candidates if one.is_released and one.unit < 0 <= one.visit
+        slips = [one for one in self.candidates if one.is_released and one.cell is None]
+        return RobustSmoothing(
+            self.robot,
+            result,
+            causes,
+            slipped_links=frozenset(one.visit for one in slips if one.unit < 0),
+            slipped_visits=frozenset(one.visit for one in slips if one.unit >= 0),
+            drift=self.drift,
         )
-        return RobustSmoothing(self.robot, result, causes, slipped, self.drift)
 
     def _cause(self, one: _Candidate) -> Cause:
         state = self.state[one.columns]

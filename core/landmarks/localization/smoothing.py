@@ -248,7 +248,10 @@ def measure_visits(
         measurement = VisitMeasurement(segment, visit.cell, pose, priors.drift, velocity)
         measurements.append(measurement.with_drift(priors.drift))
     links = [
-        link_visits(first, second, path, priors.drift) for first, second in pairwise(measurements)
+        None
+        if is_carried(first, second, path, floor.pitch_m)
+        else link_visits(first, second, path, priors.drift)
+        for first, second in pairwise(measurements)
     ]
     return RobotMeasurements(measurements, links)
 
@@ -326,6 +329,24 @@ def link_visits(
     velocity = path.velocity(np.concatenate([end_times[0], time_ns, end_times[1]]))
     velocity = velocity @ planar_rotation(start[2])
     return odometry_link(time_ns, relative(pose, start), drift, velocity)
+
+
+def is_carried(
+    first: VisitMeasurement, second: VisitMeasurement, path: OdometryPath, pitch_m: float
+) -> bool:
+    """Return whether a robot was carried between two visits.
+
+    A slip is at most as long as the path of the wheels, or as that of the robot, which is a pitch
+    at least. Differences beyond both are no slips.
+    """
+    start, end = first.segment.origin, second.segment.origin
+    expected = compose(first.pose, relative(end[None], start)[0])
+    difference_m = float(np.hypot(*(second.pose - expected)[:2]))
+    between = path.between(
+        first.segment.time_ns[first.trace.reference], second.segment.time_ns[second.trace.reference]
+    )
+    step = np.diff(np.vstack([start, path.pose[between], end]), axis=0)
+    return difference_m > max(pitch_m, float(np.hypot(step[:, 0], step[:, 1]).sum()))
 
 
 def odometry_link(
