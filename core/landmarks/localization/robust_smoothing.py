@@ -213,7 +213,7 @@ class _Candidate:
 
     def update(self, covariance: Array, mean: Array, weight: Array) -> None:
         """Compute the information of all other measurements from the posterior."""
-        inverse = np.linalg.inv(covariance)
+        inverse: Array = np.linalg.inv(covariance)
         self.information = inverse - np.diag(weight)
         self.mean_information = inverse @ mean
 
@@ -452,9 +452,9 @@ class _Snooping:
             correction = trace.correction[-1] - trace.correction[0]
             changes = np.flatnonzero(np.diff(trace.correction[:, 0, units[1, 0]]))
             first_ns, last_ns = times[changes[0]], times[changes[-1] + 1]
-        shift = correction[0, units[1]] @ x, correction[1, units[2]] @ y
+        distance = math.hypot(correction[0, units[1]] @ x, correction[1, units[2]] @ y)
         rotation = float(correction[2, units[0]] @ heading)
-        return WheelSlip(int(first_ns), int(last_ns), float(np.hypot(*shift)), rotation)
+        return WheelSlip(int(first_ns), int(last_ns), distance, rotation)
 
 
 def _slip_candidate(columns: Indices, span: Array, units: int, visit: int, unit: int) -> _Candidate:
