@@ -213,7 +213,7 @@ class _Candidate:
 
     def update(self, covariance: Array, mean: Array, weight: Array) -> None:
         """Compute the information of all other measurements from the posterior."""
-        inverse: Array = np.linalg.inv(covariance)
+        inverse = np.asarray(np.linalg.inv(covariance), float)
         self.information = inverse - np.diag(weight)
         self.mean_information = inverse @ mean
 
