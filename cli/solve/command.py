@@ -62,6 +62,23 @@ templates_option = click.option(
 )
 
 
+odometry_noise_option = click.option(
+    "--odometry-noise",
+    type=click.FloatRange(min=0, min_open=True, max=90),
+    metavar="DEG",
+    help="Landmarks: random walk of the heading by odometry, in deg per square root of a metre.  "
+    "[default: estimated]",
+)
+
+odometry_lag_option = click.option(
+    "--odometry-lag",
+    type=click.FloatRange(min=-1000, max=1000),
+    metavar="MS",
+    help="Landmarks: time by which odometry is later than the hall sensors, in milliseconds.  "
+    "[default: estimated]",
+)
+
+
 def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     """Convert a number of processes; 0 stands for one per core."""
     if value != "auto" and not value.isdecimal():
@@ -90,6 +107,8 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     scene_option,
     speed_option,
     templates_option,
+    odometry_noise_option,
+    odometry_lag_option,
 )
 @section(
     "Output",
@@ -133,6 +152,8 @@ def command(
     camera: Path | None,
     speed: float | None,
     templates: str | None,
+    odometry_noise: float | None,
+    odometry_lag: float | None,
     save_scene: Path | None,
     jobs: int,
     scheduler: str | None,
@@ -177,7 +198,9 @@ def command(
     if save_scene is not None:
         _check_scene(names)
     input_files = [path for path in (artifact, camera) if path is not None]
-    request = pipeline.SolveRequest(method, scene, artifact, camera, speed, templates)
+    request = pipeline.SolveRequest(
+        method, scene, artifact, camera, speed, templates, odometry_noise, odometry_lag
+    )
     try:
         outputs = pipeline.plan_outputs(names, output, is_folder=found.has_folder)
         if len(names) > 1:

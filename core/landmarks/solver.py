@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from locatk.core.errors import InputError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import detect_landmarks
+from locatk.core.landmarks.detection.trace import OdometryDrift, known_drift
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization.cell_filter import (
@@ -21,16 +23,20 @@ from locatk.core.landmarks.localization.consistency import (
     describe_visit,
     find_displaced_landmarks,
     is_map_contradicted,
+    warn_of_carrying,
+    warn_of_cause,
+    warn_of_lag,
     warn_of_missing_pose,
     warn_of_opposite_polarity,
 )
+from locatk.core.landmarks.localization.odometry_path import without_lag
+from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing, smooth_robustly
 from locatk.core.landmarks.localization.smoothing import (
-    DISPLACED_LANDMARK_SIGMA,
+    LAG_COLUMN,
+    POSE_SIZE,
     SMOOTHED_MODEL_ERROR_T,
-    SmoothingResult,
     landmark_priors,
     measure_visits,
-    smooth,
 )
 from locatk.core.landmarks.localization.trajectory import estimate_trajectory, pose_probability
 from locatk.core.landmarks.map.floor import FloorMap
@@ -46,6 +52,18 @@ from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import PROVISIONAL_PROBABILITY, Trajectory
 
 METHODS = ("field", "paper")
+
+MAX_LAG_ROUNDS = 3
+"""Rounds of a solution, each without the lag of the odometry that the previous one found."""
+
+MIN_LAG_S = 2e-3
+"""Lag of the odometry that is removed: the linearization takes smaller ones ..."""
+
+MIN_REPORTED_LAG_S = 0.01
+"""... and from which on a warning is given."""
+
+MIN_LAG_SIGMAS = 4.0
+"""Significance of a lag."""
 
 MAX_RESIDUAL_SIGMAS = 2.0
 """Rms residual of all fields after smoothing from which on a warning is given ..."""
@@ -66,11 +84,18 @@ class SolveOptions:
         Probability that a landmark differs from the map or is misread.
     priors : ModelPriors
         Uncertainties of sensors, bars and odometry; the noise is taken from the recording.
+    odometry_noise : float, optional
+        Random walk of the heading by odometry [rad/sqrt(m)]; that of the position grows with it.
+        It is estimated from the recording if it is not given.
+    odometry_lag_s : float, optional
+        Time by which the odometry is later than the fields; it is estimated if it is not given.
     """
 
     method: str = "field"
     misread: float = 0.02
     priors: ModelPriors = field(default_factory=ModelPriors)
+    odometry_noise: float | None = None
+    odometry_lag_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -118,10 +143,7 @@ def solve(
         return solve_published(samples, floor, odometry=odometry)
     odometry_of = {trajectory.device: trajectory for trajectory in reversed(odometry)}
     robots = [
-        localize_robot(
-            identify_recording(each, odometry_of.get(each.device), floor, options), floor, options
-        )
-        for each in samples
+        solve_recording(each, odometry_of.get(each.device), floor, options) for each in samples
     ]
     detections = [
         describe_visit(visit.hypotheses, visit.estimate, floor)
@@ -187,7 +209,8 @@ def identify_recording(
     pitch_m = floor.pitch_m if floor is not None else DEFAULT_PITCH_M
     recording = preprocess(samples, odometry)
     check_odometry(recording, geometry)
-    priors = replace(options.priors, noise_t=recording.noise_t)
+    drift = known_drift(options.priors.drift, options.odometry_noise, options.odometry_lag_s)
+    priors = replace(options.priors, noise_t=recording.noise_t, drift=drift)
     recording, detected = detect_landmarks(recording, geometry, priors, pitch_m)
     visits, map_probability = identify_visits(
         detected, floor, misread=options.misread, drift=priors.drift
@@ -207,12 +230,41 @@ class LocalizedRobot:
     warnings : tuple of SolverWarning
     trajectories : tuple of Trajectory
         One on the map, or none if the robot is not localized.
+    lag_s : float
+        Time lag of the odometry; 0 if it is not significant.
     """
 
     identified: IdentifiedRecording
     facts: RobotFacts
     warnings: tuple[SolverWarning, ...]
     trajectories: tuple[Trajectory, ...] = ()
+    lag_s: float = 0.0
+
+
+def solve_recording(
+    samples: HallSamples,
+    odometry: Trajectory | None,
+    floor: FloorMap | None,
+    options: SolveOptions,
+) -> LocalizedRobot:
+    """Localize one robot; remove the time lag of its odometry if there is any.
+
+    Raises
+    ------
+    InputError
+        See :func:`solve`.
+    """
+    lag_s = options.odometry_lag_s or 0.0
+    for _ in range(MAX_LAG_ROUNDS):
+        shifted = odometry if odometry is None or not lag_s else without_lag(odometry, lag_s)
+        identified = identify_recording(samples, shifted, floor, options)
+        robot = localize_robot(identified, floor, options)
+        if options.odometry_lag_s is not None or not robot.lag_s:
+            break
+        lag_s += robot.lag_s
+    if options.odometry_lag_s is None and abs(lag_s) > MIN_REPORTED_LAG_S:
+        robot = _with_warnings(robot, warn_of_lag(lag_s).about(identified.device))
+    return robot
 
 
 def localize_robot(
@@ -245,53 +297,78 @@ def localize_robot(
         )
         not_localised = replace(facts, localised=False, provisional=False)
         return _with_warnings(replace(unlocalized, facts=not_localised), obstacle, *polarity)
-    smoothed, warnings = smooth_robot(identified, on_map, floor)
-    facts = replace(facts, misfit_sigma=smoothed.residual_sigma)
-    robot = _with_warnings(replace(unlocalized, facts=facts), *warnings)
-    if smoothed.residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
+    smoothed, warnings = smooth_robot(
+        identified, on_map, floor, estimate_walk=options.odometry_noise is None
+    )
+    residual_sigma = smoothed.result.residual_sigma
+    facts = replace(facts, misfit_sigma=residual_sigma)
+    lag_s = significant_lag(smoothed, identified.priors.drift)
+    robot = _with_warnings(replace(unlocalized, facts=facts, lag_s=lag_s), *warnings)
+    if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
         return replace(robot, facts=replace(facts, localised=False))
     trajectory = estimate_trajectory(
         identified.device,
-        [visit.segment for visit in on_map],
-        smoothed.visits[0],
+        smoothed.measurements,
+        smoothed.result.visits[0],
         identified.odometry,
-        identified.priors,
+        smoothed.slipped_links,
     )
+    unused = [visit for visit in visits if not any(visit is used for used in on_map)]
+    displaced = find_displaced_landmarks(unused, trajectory, floor)
     probability = pose_probability(
         trajectory.time_ns,
         [visit.segment for visit in on_map],
         [visit.estimate.probability for visit in on_map if visit.estimate is not None],
         identified.map_probability,
     )
-    return replace(robot, trajectories=(replace(trajectory, probability=probability),))
+    return _with_warnings(
+        replace(robot, trajectories=(replace(trajectory, probability=probability),)),
+        *(warn_of_cause(each).about(identified.device) for each in displaced),
+    )
 
 
 def smooth_robot(
-    identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit], floor: FloorMap
-) -> tuple[SmoothingResult, list[SolverWarning]]:
-    """Smooth the visits of one robot; displaced landmarks are detected and given less weight."""
+    identified: IdentifiedRecording,
+    on_map: Sequence[IdentifiedVisit],
+    floor: FloorMap,
+    *,
+    estimate_walk: bool = True,
+) -> tuple[RobustSmoothing, list[SolverWarning]]:
+    """Smooth the visits of one robot, with warnings of inconsistencies.
+
+    A visit during which a wheel slipped is not used, unless it is the first or the last one: its
+    path is not known.
+    """
     priors = replace(identified.priors, model_error_t=SMOOTHED_MODEL_ERROR_T)
-    measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
     landmarks = landmark_priors(on_map, floor, identified.priors)
-    smoothed = smooth([measurements], landmarks, floor.geometry, priors)
-    warnings = []
-    displaced = find_displaced_landmarks(landmarks, smoothed)
-    for cell, distance_m in displaced.items():
-        landmarks[cell] = replace(landmarks[cell], sigma=DISPLACED_LANDMARK_SIGMA)
-        message = (
-            f"the landmark at {cell[0]},{cell[1]} is displaced by {1e3 * distance_m:.2g} mm or "
-            "more; `locatk calibrate map` estimates by how much"
+    while True:
+        measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
+        smoothed = smooth_robustly(
+            measurements, landmarks, floor.geometry, priors, estimate_walk=estimate_walk
         )
-        warnings.append(SolverWarning("landmark_displaced", message))
-    if displaced:
-        smoothed = smooth([measurements], landmarks, floor.geometry, priors)
-    if smoothed.residual_sigma > MAX_RESIDUAL_SIGMAS:
+        unusable = smoothed.slipped_visits & set(range(1, len(on_map) - 1))
+        if not unusable:
+            break
+        on_map = [visit for n, visit in enumerate(on_map) if n not in unusable]
+    warnings = [warn_of_cause(*cause) for cause in smoothed.causes]
+    warnings += warn_of_carrying(smoothed.measurements)
+    residual_sigma = smoothed.result.residual_sigma
+    if residual_sigma > MAX_RESIDUAL_SIGMAS:
         message = (
-            f"fields deviate from the model by {smoothed.residual_sigma:.2g} standard deviations; "
+            f"fields deviate from the model by {residual_sigma:.2g} standard deviations; "
             "check clocks and scale of the odometry, the sensors and the landmarks' geometry"
         )
         warnings.append(SolverWarning("field_misfit", message))
     return smoothed, [warning.about(identified.device) for warning in warnings]
+
+
+def significant_lag(smoothed: RobustSmoothing, drift: OdometryDrift) -> float:
+    """Return the lag of the odometry in seconds, or 0 if it is not significant."""
+    visit = smoothed.result.visits[0][0]
+    sigma = math.sqrt(visit.covariance[POSE_SIZE + LAG_COLUMN, POSE_SIZE + LAG_COLUMN])
+    lag = float(visit.corrections[LAG_COLUMN])
+    is_significant = abs(lag) > max(MIN_LAG_SIGMAS * sigma, MIN_LAG_S / max(drift.lag_s, 1e-9))
+    return lag * drift.lag_s if is_significant else 0.0
 
 
 def _cell_facts(identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit]) -> RobotFacts:

@@ -6,6 +6,7 @@ function like an entry of :data:`SYSTEMS`: ``(session, request) -> SolvedSession
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -47,6 +48,10 @@ class SolveRequest:
         Polaris: speed of the array over the tags [m/s].
     templates : str, optional
         Polaris, method ``paper``: resolution of the templates, as in ``"36,5,80"``.
+    odometry_noise : float, optional
+        Landmarks: random walk of the heading by odometry [deg/sqrt(m)].
+    odometry_lag : float, optional
+        Landmarks: time by which odometry is later than the hall sensors [ms].
     """
 
     method: str | None = None
@@ -55,6 +60,8 @@ class SolveRequest:
     camera: Path | None = None
     speed: float | None = None
     templates: str | None = None
+    odometry_noise: float | None = None
+    odometry_lag: float | None = None
 
 
 @dataclass(frozen=True)
@@ -218,7 +225,13 @@ def _prepare_landmarks(session: Session, request: SolveRequest) -> Callable[[], 
                 hint="Hall sensors alone do not determine the path: also record x, y and heading "
                 f"of the wheels, on /odometry/{each.device}",
             )
-    options = _solver_options(landmarks.SolveOptions, method=request.method)
+    noise_deg, lag_ms = request.odometry_noise, request.odometry_lag
+    options = _solver_options(
+        landmarks.SolveOptions,
+        method=request.method,
+        odometry_noise=None if noise_deg is None else math.radians(noise_deg),
+        odometry_lag_s=None if lag_ms is None else 1e-3 * lag_ms,
+    )
     return lambda: landmarks.solve(samples, floor, options, odometry=odometry)
 
 
@@ -239,7 +252,9 @@ SYSTEMS: dict[str, Solver] = {
         ),
         System("dots", ("lattice", "paper"), ("camera",), _prepare_dots),
         System("polaris", ("joint", "paper"), ("speed", "templates"), _prepare_polaris),
-        System("landmarks", ("field", "paper"), (), _prepare_landmarks),
+        System(
+            "landmarks", ("field", "paper"), ("odometry_noise", "odometry_lag"), _prepare_landmarks
+        ),
     )
 }
 """Solvers by the name of the system in the metadata of a session."""

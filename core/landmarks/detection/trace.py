@@ -20,9 +20,9 @@ WALK_DISTANCE_M = 0.15
 WALK_ROTATION_RAD = math.pi / 2
 """Rotation that counts as one unit of effort of the random walk."""
 
-CONSTANT_ERROR_COUNT = 3
-"""Number of leading corrections that are the same during a whole recording: scale, rotation scale
-and curvature."""
+CONSTANT_ERROR_COUNT = 4
+"""Number of leading corrections that are the same during a whole recording: scale, rotation scale,
+curvature and time lag."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,9 @@ class OdometryDrift:
     walk_m, walk_rad : float
         Random walk of position and heading over one unit of effort: a distance of
         :data:`WALK_DISTANCE_M` or a rotation of :data:`WALK_ROTATION_RAD`.
+    lag_s : float
+        Time by which odometry is later than the fields, constant. The default is the delay of a
+        fieldbus or a serial line with buffers: tens of milliseconds.
     """
 
     scale: float = 0.01
@@ -48,6 +51,27 @@ class OdometryDrift:
     curvature_rad_per_m: float = math.radians(1) / 0.23
     walk_m: float = 0.2e-3
     walk_rad: float = math.radians(0.1)
+    lag_s: float = 0.03
+
+
+def known_drift(
+    drift: OdometryDrift, heading_noise: float | None, lag_s: float | None
+) -> OdometryDrift:
+    """Return the drift of odometry whose random walk or lag is known.
+
+    Parameters
+    ----------
+    drift : OdometryDrift
+    heading_noise : float or None
+        Random walk of the heading [rad/sqrt(m)]; that of the position is in the same proportion.
+    lag_s : float or None
+        Not None if the lag is known, and removed.
+    """
+    if heading_noise is not None:
+        walk_rad = heading_noise * math.sqrt(WALK_DISTANCE_M)
+        walk_m = drift.walk_m * walk_rad / drift.walk_rad
+        drift = replace(drift, walk_rad=walk_rad, walk_m=walk_m)
+    return drift if lag_s is None else replace(drift, lag_s=0.0)
 
 
 @dataclass(frozen=True)
@@ -147,7 +171,9 @@ def relative(pose: Array, origin: Array) -> Array:
 # ---- errors of odometry
 
 
-def odometry_corrections(pose: Array, reference: int, drift: OdometryDrift) -> Array:
+def odometry_corrections(
+    pose: Array, reference: int, drift: OdometryDrift, velocity: Array | None = None
+) -> Array:
     """Linearize the errors of odometry.
 
     Parameters
@@ -157,13 +183,15 @@ def odometry_corrections(pose: Array, reference: int, drift: OdometryDrift) -> A
     reference : int
         Sample at which all corrections are zero.
     drift : OdometryDrift
+    velocity : (n, 3) ndarray, optional
+        Derivative of the path by time. Without it, a lag is not considered.
 
     Returns
     -------
     (n, 3, m) ndarray
         Change of x, y, heading by one standard deviation of each error. First the constant ones
         (:data:`CONSTANT_ERROR_COUNT`), then the random walk of heading, x and y, each a linear
-        ramp over one unit of effort.
+        ramp over one unit of effort, see :func:`walk_units`.
     """
     step = np.diff(pose, axis=0, prepend=pose[:1])
     length = np.hypot(step[:, 0], step[:, 1])
@@ -185,10 +213,14 @@ def odometry_corrections(pose: Array, reference: int, drift: OdometryDrift) -> A
     by_heading = np.moveaxis(_effect_of_heading_errors(heading, step, reference), 2, 1)
     stretch = np.column_stack([pose[:, :2] - pose[reference, :2], np.zeros(len(pose))])
     shift = drift.walk_m * ramps
+    lag = np.zeros_like(pose) if velocity is None else _effect_of_lag(pose, velocity, reference)
+    constant_by_heading, walk_of_heading = np.split(by_heading, [2], axis=2)
     return np.concatenate(
         [
             drift.scale * stretch[:, :, None],
-            by_heading,
+            constant_by_heading,
+            drift.lag_s * lag[:, :, None],
+            walk_of_heading,
             np.stack([shift, zero, zero], 1),
             np.stack([zero, shift, zero], 1),
         ],
@@ -196,10 +228,19 @@ def odometry_corrections(pose: Array, reference: int, drift: OdometryDrift) -> A
     )
 
 
-def correct_constant_errors(pose: Array, errors: Array, drift: OdometryDrift) -> Array:
-    """Remove the constant errors from a path (n, 3), from its first pose on.
+def walk_units(correction_count: int) -> NDArray[np.intp]:
+    """Return the columns (parts, 3) of corrections that belong to each unit of the random walk.
 
-    ``errors`` (3,) are scale, rotation scale and curvature in standard deviations of ``drift``.
+    The three of a unit are those of heading, x and y.
+    """
+    return np.arange(CONSTANT_ERROR_COUNT, correction_count).reshape(3, -1).T
+
+
+def correct_constant_errors(pose: Array, errors: Array, drift: OdometryDrift) -> Array:
+    """Remove the constant errors except the lag from a path (n, 3), from its first pose on.
+
+    The first of ``errors`` are scale, rotation scale and curvature in standard deviations of
+    ``drift``.
     The first columns of :func:`odometry_corrections` are the linearization of this function.
     """
     step = np.diff(pose, axis=0, prepend=pose[:1])
@@ -216,6 +257,18 @@ def correct_constant_errors(pose: Array, errors: Array, drift: OdometryDrift) ->
     x = np.cumsum(stretch * (cos * step[:, 0] - sin * step[:, 1]))
     y = np.cumsum(stretch * (sin * step[:, 0] + cos * step[:, 1]))
     return np.column_stack([pose[0, 0] + x, pose[0, 1] + y, pose[:, 2] + change])
+
+
+def _effect_of_lag(pose: Array, velocity: Array, reference: int) -> Array:
+    """Return the derivative (n, 3) of the path by a lag, in the frame of the reference.
+
+    Both the pose and the frame are those of a later odometry.
+    """
+    arm = pose - pose[reference]
+    effect = velocity - velocity[reference]
+    effect[:, 0] += velocity[reference, 2] * arm[:, 1]
+    effect[:, 1] -= velocity[reference, 2] * arm[:, 0]
+    return effect
 
 
 def _effect_of_heading_errors(heading: Array, step: Array, reference: int) -> Array:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from locatk.core.landmarks.detection.hypotheses import VisitHypotheses
-from locatk.core.landmarks.detection.trace import OdometryDrift
+from locatk.core.landmarks.detection.trace import OdometryDrift, compose, relative
 from locatk.core.landmarks.landmark import CODE_COUNT, HALF_PI_RAD, pattern, rotated
 from locatk.core.landmarks.localization.cell_filter import (
     MIN_CELL_PROBABILITY,
@@ -17,12 +18,24 @@ from locatk.core.landmarks.localization.cell_filter import (
     IdentifiedVisit,
     identify_cells,
 )
-from locatk.core.landmarks.localization.smoothing import LandmarkPrior, SmoothingResult
-from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap, as_built_code
+from locatk.core.landmarks.localization.odometry_path import OdometryPath
+from locatk.core.landmarks.localization.robust_smoothing import (
+    Cause,
+    DisplacedLandmark,
+    WheelSlip,
+)
+from locatk.core.landmarks.localization.smoothing import RobotMeasurements
+from locatk.core.landmarks.map.floor import (
+    HOLE_CODE,
+    Cell,
+    FloorMap,
+    as_built_code,
+    as_built_landmark,
+)
 from locatk.core.landmarks.preprocessing import HallRecording
 from locatk.core.landmarks.results import LandmarkDetection
 from locatk.core.solution import SolverWarning
-from locatk.core.trajectory import PROVISIONAL_PROBABILITY
+from locatk.core.trajectory import PROVISIONAL_PROBABILITY, Trajectory
 
 MIN_MISREAD_PROBABILITY = 0.99
 """Probability from which on a landmark is reported to differ from the map."""
@@ -30,12 +43,14 @@ MIN_MISREAD_PROBABILITY = 0.99
 MIN_OUTLIER_PROBABILITY = 0.5
 """Probability from which on a visit counts as an outlier."""
 
-MIN_LANDMARKS_FOR_DISPLACEMENT = 3
-"""Number of landmarks from which on the displacement of one of them can be recognized."""
+MIN_DISPLACED_CODE_PROBABILITY = 0.9
+"""Probability of a code from which on a visit that was not used is evidence of a landmark."""
 
-MIN_DISPLACEMENT_SIGMAS = 2.5
-"""Deviation of a landmark from its pose on the map, in standard deviations of installation, from
-which on it counts as displaced."""
+MAX_DISPLACEMENT_PITCHES = 0.5
+"""Displacement of a landmark, in pitches, beyond which it would be in another cell."""
+
+MAX_POSE_GAP_NS = 100_000_000
+"""Time to the nearest pose up to which the trajectory is known."""
 
 MIN_CONTRADICTIONS = 2
 MAX_CONTRADICTED_FRACTION = 1 / 3
@@ -122,18 +137,92 @@ def describe_visit(
     )
 
 
+def warn_of_cause(cause: Cause, *alternatives: Cause) -> SolverWarning:
+    """Return the warning of a wheel slip or of a displaced landmark, or of either."""
+    code = "wheel_slip" if isinstance(cause, WheelSlip) else "landmark_displaced"
+    message = ", or ".join(_describe_cause(each) for each in (cause, *alternatives))
+    if alternatives:
+        message += "; the recording does not show which"
+    return SolverWarning(code, message)
+
+
+def warn_of_carrying(robot: RobotMeasurements) -> list[SolverWarning]:
+    """Return a warning for each time that a robot was carried."""
+    warnings = []
+    for (first, second), link in zip(pairwise(robot.visits), robot.links, strict=True):
+        if link is None:
+            message = (
+                f"the robot was carried between {1e-9 * first.segment.time_ns[-1]:.3f} and "
+                f"{1e-9 * second.segment.time_ns[0]:.3f} s; there are no poses in between"
+            )
+            warnings.append(SolverWarning("robot_carried", message))
+    return warnings
+
+
 def find_displaced_landmarks(
-    landmarks: Mapping[Cell, LandmarkPrior], smoothed: SmoothingResult
-) -> dict[Cell, float]:
-    """Return the landmarks that are far from their pose on the map, with the distance in metres."""
-    if len(landmarks) < MIN_LANDMARKS_FOR_DISPLACEMENT:
-        return {}
-    displaced = {}
-    for cell, prior in landmarks.items():
-        shift = smoothed.landmarks[cell].pose - prior.pose
-        if np.abs(shift / prior.sigma).max() > MIN_DISPLACEMENT_SIGMAS:
-            displaced[cell] = float(np.hypot(*shift[:2]))
-    return displaced
+    visits: Sequence[IdentifiedVisit], trajectory: Trajectory, floor: FloorMap
+) -> list[DisplacedLandmark]:
+    """Find landmarks for whose displacement a visit was not used.
+
+    Such a visit read the code of the landmark that is nearest to it by the trajectory, at another
+    pose than that on the map.
+
+    Parameters
+    ----------
+    visits : sequence of IdentifiedVisit
+        Those that are not used.
+    trajectory : Trajectory
+        From the others.
+    floor : FloorMap
+    """
+    path = OdometryPath.of(trajectory)
+    displaced: dict[Cell, DisplacedLandmark] = {}
+    for visit in visits:
+        if visit.hypotheses.refused or not visit.hypotheses.hypotheses:
+            continue
+        best = visit.hypotheses.best
+        time_ns = np.array([visit.hypotheses.time_ns])
+        gap_ns = np.abs(trajectory.time_ns - time_ns).min()
+        if best.probability < MIN_DISPLACED_CODE_PROBABILITY or gap_ns > MAX_POSE_GAP_NS:
+            continue
+        robot = path.pose_at(time_ns)[0]
+        landmark = compose(robot, relative(np.zeros((1, 3)), best.pose)[0])
+        quarters = round(landmark[2] / HALF_PI_RAD)
+        cell = min(
+            floor.cells(),
+            key=lambda one: math.dist(floor.position(one), landmark[:2]),
+            default=None,
+        )
+        if cell is None or as_built_code(floor, cell) != rotated(best.code, quarters % 4):
+            continue
+        built, _ = as_built_landmark(floor, cell)
+        shift = landmark - built
+        rotation = math.remainder(float(shift[2]), HALF_PI_RAD)
+        distance = float(np.hypot(*shift[:2]))
+        if distance > MAX_DISPLACEMENT_PITCHES * floor.pitch_m:
+            continue
+        displaced[cell] = DisplacedLandmark(cell, distance, rotation)
+    return list(displaced.values())
+
+
+def _describe_cause(cause: Cause) -> str:
+    size = f"{1e3 * cause.distance_m:.2g} mm and {math.degrees(abs(cause.rotation_rad)):.2g} deg"
+    if isinstance(cause, WheelSlip):
+        return (
+            f"a wheel slipped between {1e-9 * cause.first_ns:.3f} and "
+            f"{1e-9 * cause.last_ns:.3f} s, by {size}"
+        )
+    return f"the landmark at {cause.cell[0]},{cause.cell[1]} is displaced by {size}"
+
+
+def warn_of_lag(lag_s: float) -> SolverWarning:
+    """Return the warning of odometry that is later or earlier than the fields."""
+    direction = "later" if lag_s > 0 else "earlier"
+    message = (
+        f"the odometry is {1e3 * abs(lag_s):.2g} ms {direction} than the fields; its times were "
+        "corrected by that"
+    )
+    return SolverWarning("odometry_lag", message)
 
 
 def is_map_contradicted(

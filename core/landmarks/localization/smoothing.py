@@ -5,11 +5,12 @@ Unknowns, with Gaussian priors unless stated otherwise:
 - of each robot: gains and offsets of its sensors, their height, and the constant errors of its
   odometry;
 - of each landmark: pose, strengths of its bars, and their positions;
-- of each visit: pose of the robot (no prior), and the random walk of its odometry.
+- of each visit: pose of the robot (no prior), and the random walk of its odometry;
+- of each link between two visits: the random walk of its odometry.
 
 Rows: the fields of every visit (the model of :mod:`locatk.core.landmarks.detection.fit`), and the
 odometry between successive visits. The normal matrix is sparse, because a visit involves one robot
-and one landmark, and a link two visits.
+and one landmark, and a link two visits. Whether priors hold is tested in :mod:`.robust_smoothing`.
 
 Notes
 -----
@@ -56,6 +57,7 @@ from locatk.core.landmarks.landmark import (
     signs,
 )
 from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit
+from locatk.core.landmarks.localization.odometry_path import OdometryPath
 from locatk.core.landmarks.map.floor import (
     HOLE_CODE,
     MISSING_BAR_STRENGTH,
@@ -63,7 +65,7 @@ from locatk.core.landmarks.map.floor import (
     FloorMap,
     as_built_landmark,
 )
-from locatk.core.landmarks.preprocessing import VisitSegment, planar_poses
+from locatk.core.landmarks.preprocessing import VisitSegment
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -76,14 +78,14 @@ MIN_STEP_M = 1e-6
 """Largest change of a position in one step below which the iteration has converged."""
 
 MIN_ODOMETRY_SIGMA = np.array([1e-5, 1e-5, 1e-5])
-"""Smallest standard deviations (m, m, rad) of the odometry between two visits."""
+"""Standard deviations (m, m, rad) of the odometry between two visits, besides its errors."""
+
+MIN_VISIT_BINS = 4
+"""Bins of a visit that are always used."""
 
 LANDMARK_SIGMA = np.array([1.5e-3, 1.5e-3, 0.012])
 """Standard deviations (m, m, rad) of landmarks about their poses on the map: installed by hand on
 a marked floor."""
-
-DISPLACED_LANDMARK_SIGMA = np.array([0.02, 0.02, 0.1])
-"""The same of a landmark that was observed far from its pose on the map."""
 
 MIN_POSE_SIGMA = 1e-5
 MIN_STRENGTH_SIGMA = 1e-3
@@ -95,6 +97,8 @@ SMOOTHED_MODEL_ERROR_T = 3e-5
 NEIGHBOUR_RANGE_M = 0.3
 """Distance from which on a landmark's field is neglected: it is at most 2.3 uT there (default
 geometry), and the noise of a sample is about 150 uT."""
+
+LAG_COLUMN = CONSTANT_ERROR_COUNT - 1
 
 POSE_SIZE = 3
 BAR_SIZE = 12
@@ -110,15 +114,34 @@ class VisitMeasurement:
 
     Attributes
     ----------
-    trace : Trace
+    segment : VisitSegment
+        The part of the visit within the territory of the landmark.
     cell : (row, column)
     pose : (3,) ndarray
         Initial guess of the robot at the trace's reference, in the frame of the map.
+    drift : OdometryDrift
+        Standard deviations that are the unit of the trace's corrections.
+    velocity : (n, 3) ndarray, optional
+        Derivative of the path of the trace by time.
     """
 
-    trace: Trace
+    segment: VisitSegment
     cell: Cell
     pose: Array
+    drift: OdometryDrift
+    velocity: Array | None = None
+
+    @property
+    def trace(self) -> Trace:
+        """Fields and odometry."""
+        return self.segment.trace
+
+    def with_drift(self, drift: OdometryDrift) -> VisitMeasurement:
+        """Return the measurement with corrections in other standard deviations."""
+        trace = self.trace
+        correction = odometry_corrections(trace.pose, trace.reference, drift, self.velocity)
+        trace = replace(trace, correction=correction)
+        return replace(self, segment=replace(self.segment, trace=trace), drift=drift)
 
 
 @dataclass(frozen=True)
@@ -127,25 +150,57 @@ class OdometryLink:
 
     Attributes
     ----------
+    time_ns : (n - 2,) int64 ndarray
+        Times of the odometry, which has two more poses, those of both bins.
     pose : (n, 3) ndarray
         Path in the frame of its first pose.
     correction : (n, 3, m) ndarray
         See :class:`.trace.Trace`.
     drift : OdometryDrift
         Standard deviations that are the unit of the corrections.
+    velocity : (n, 3) ndarray, optional
+        Derivative of the path by time.
     """
 
+    time_ns: NDArray[np.int64]
     pose: Array
     correction: Array
     drift: OdometryDrift
+    velocity: Array | None = None
+
+    def with_drift(self, drift: OdometryDrift) -> OdometryLink:
+        """Return the link with corrections in other standard deviations."""
+        return odometry_link(self.time_ns, self.pose, drift, self.velocity)
+
+    def without_constant_errors(self, errors: Array) -> Array:
+        """Return the path (n, 3) after removing the constant errors.
+
+        They bend a long path too much for the linearization.
+        """
+        path = correct_constant_errors(self.pose, errors, self.drift)
+        return path + self.correction[:, :, LAG_COLUMN] * errors[LAG_COLUMN]
 
 
 @dataclass(frozen=True)
 class RobotMeasurements:
-    """Visits of one robot in order of time, and the odometry between them."""
+    """Visits of one robot in order of time, and the odometry between them.
+
+    Attributes
+    ----------
+    visits : sequence of VisitMeasurement
+    links : sequence of OdometryLink or None
+        One less than visits; None if the robot was carried.
+    """
 
     visits: Sequence[VisitMeasurement]
-    links: Sequence[OdometryLink]
+    links: Sequence[OdometryLink | None]
+
+    def with_drift(self, drift: OdometryDrift) -> RobotMeasurements:
+        """Return the measurements with corrections in other standard deviations."""
+        return RobotMeasurements(
+            [visit.with_drift(drift) for visit in self.visits],
+            [None if link is None else link.with_drift(drift) for link in self.links],
+        )
 
 
 @dataclass(frozen=True)
@@ -174,8 +229,10 @@ def measure_visits(
     """Return the measurements of one robot for :func:`smooth`.
 
     The initial poses are those of the hypotheses in the cells of the map. The fields of all other
-    landmarks of the map are subtracted.
+    landmarks of the map are subtracted. Visits are limited to the territories of the landmarks:
+    the path between them, on which a wheel may slip, then belongs to the links.
     """
+    path = OdometryPath.of(odometry)
     measurements = []
     for visit in visits:
         landmark = np.array([*floor.position(visit.cell), visit.quarters * HALF_PI_RAD])
@@ -184,12 +241,44 @@ def measure_visits(
             raise ValueError("smoothing needs hypotheses with a fit of the field model")
         corrections = visit.hypothesis.fit.corrections(trace)
         trace = subtract_neighbours(trace, pose, corrections, visit.cell, floor)
-        measurements.append(VisitMeasurement(trace, visit.cell, pose))
+        segment = limit_to_territory(
+            replace(visit.segment, trace=trace), floor.geometry.threshold_t
+        )
+        velocity = path.velocity(segment.time_ns) @ planar_rotation(segment.origin[2])
+        measurement = VisitMeasurement(segment, visit.cell, pose, priors.drift, velocity)
+        measurements.append(measurement.with_drift(priors.drift))
     links = [
-        odometry_link(odometry_between(odometry, first.segment, second.segment)[1], priors)
-        for first, second in pairwise(visits)
+        None
+        if is_carried(first, second, path, floor.pitch_m)
+        else link_visits(first, second, path, priors.drift)
+        for first, second in pairwise(measurements)
     ]
     return RobotMeasurements(measurements, links)
+
+
+def limit_to_territory(segment: VisitSegment, threshold_t: float) -> VisitSegment:
+    """Return the part of a visit in which any field is above the threshold, and its reference.
+
+    If no field is, half of the largest one is the threshold.
+    """
+    trace = segment.trace
+    strongest = np.nan_to_num(np.abs(trace.field_t)).max(axis=1)
+    is_inside = strongest >= min(threshold_t, strongest.max() / 2)
+    is_inside[trace.reference] = True
+    inside = np.flatnonzero(is_inside)
+    first, stop = int(inside[0]), int(inside[-1]) + 1
+    if stop - first < MIN_VISIT_BINS:
+        return segment
+    kept = slice(first, stop)
+    trace = replace(
+        trace,
+        pose=trace.pose[kept],
+        correction=trace.correction[kept],
+        field_t=trace.field_t[kept],
+        weight=trace.weight[kept],
+        reference=trace.reference - first,
+    )
+    return replace(segment, time_ns=segment.time_ns[kept], trace=trace)
 
 
 def subtract_neighbours(
@@ -227,28 +316,45 @@ def subtract_neighbours(
     return replace(trace, field_t=field)
 
 
-def odometry_between(
-    odometry: Trajectory, first: VisitSegment, second: VisitSegment
-) -> tuple[NDArray[np.int64], Array]:
-    """Return the odometry between two visits.
+def link_visits(
+    first: VisitMeasurement, second: VisitMeasurement, path: OdometryPath, drift: OdometryDrift
+) -> OdometryLink:
+    """Return the odometry between two visits."""
+    ends = first.segment, second.segment
+    between = path.between(ends[0].time_ns[-1], ends[1].time_ns[0])
+    start, end = ends[0].odometry_pose(-1), ends[1].odometry_pose(0)
+    pose = np.vstack([start, path.pose[between], end])
+    time_ns = path.time_ns[between]
+    end_times = ends[0].time_ns[-1:], ends[1].time_ns[:1]
+    velocity = path.velocity(np.concatenate([end_times[0], time_ns, end_times[1]]))
+    velocity = velocity @ planar_rotation(start[2])
+    return odometry_link(time_ns, relative(pose, start), drift, velocity)
 
-    Returns
-    -------
-    time_ns : (n,) ndarray
-    pose : (n + 2, 3) ndarray
-        Poses at these times; before and after them those of the last bin of the first visit and of
-        the first bin of the second visit.
+
+def is_carried(
+    first: VisitMeasurement, second: VisitMeasurement, path: OdometryPath, pitch_m: float
+) -> bool:
+    """Return whether a robot was carried between two visits.
+
+    A slip is at most as long as the path of the wheels, or as that of the robot, which is a pitch
+    at least. Differences beyond both are no slips.
     """
-    is_between = (odometry.time_ns > first.time_ns[-1]) & (odometry.time_ns < second.time_ns[0])
-    pose = planar_poses(odometry)[is_between]
-    ends = first.odometry_pose(-1), second.odometry_pose(0)
-    return odometry.time_ns[is_between], np.vstack([ends[0], pose, ends[1]])
+    start, end = first.segment.origin, second.segment.origin
+    expected = compose(first.pose, relative(end[None], start)[0])
+    difference_m = float(np.hypot(*(second.pose - expected)[:2]))
+    between = path.between(
+        first.segment.time_ns[first.trace.reference], second.segment.time_ns[second.trace.reference]
+    )
+    step = np.diff(np.vstack([start, path.pose[between], end]), axis=0)
+    return difference_m > max(pitch_m, float(np.hypot(step[:, 0], step[:, 1]).sum()))
 
 
-def odometry_link(pose: Array, priors: ModelPriors) -> OdometryLink:
-    """Return the link along poses (n, 3) by odometry, both ends included."""
-    local = relative(pose, pose[0])
-    return OdometryLink(local, odometry_corrections(local, 0, priors.drift), priors.drift)
+def odometry_link(
+    time_ns: NDArray[np.int64], pose: Array, drift: OdometryDrift, velocity: Array | None = None
+) -> OdometryLink:
+    """Return the link along poses (n, 3) in the frame of the first one."""
+    correction = odometry_corrections(pose, 0, drift, velocity)
+    return OdometryLink(time_ns, pose, correction, drift, velocity)
 
 
 def landmark_priors(
@@ -363,15 +469,8 @@ def smooth(
     priors : ModelPriors
     """
     system = SmoothingSystem(robots, landmarks, geometry, priors)
-    state = system.initial_state()
-    for _ in range(MAX_ITERATIONS):
-        matrix, gradient, _ = system.normal_equations(state)
-        step = _factorized(matrix).solve(gradient)
-        state = state - step
-        if np.abs(step[system.position_columns]).max() < MIN_STEP_M:
-            break
-    matrix, _, residual_sigma = system.normal_equations(state)
-    return system.result(state, _factorized(matrix).solve, residual_sigma)
+    state, solve, residual_sigma = system.minimize(system.initial_state())
+    return system.result(state, solve, residual_sigma)
 
 
 def _factorized(matrix: Any) -> Any:
@@ -389,6 +488,11 @@ class SmoothingSystem:
 
     Poses of visits are in metres and radians in the frame of the map, all other unknowns in
     standard deviations of their priors.
+
+    Attributes
+    ----------
+    prior_weight : (size,) ndarray
+        Weights of the priors, 1 unless a prior is released.
     """
 
     def __init__(
@@ -417,6 +521,11 @@ class SmoothingSystem:
                     for visit in robot.visits
                 ]
             )
+        # Random walk of odometry.
+        self.link_columns = [
+            [self._allocate(0 if link is None else _walk_size(link)) for link in robot.links]
+            for robot in robots
+        ]
         # Pose, bars.
         self.landmark_columns = {
             cell: self._allocate(POSE_SIZE + BAR_SIZE) for cell in self.landmarks
@@ -429,6 +538,26 @@ class SmoothingSystem:
     def _allocate(self, count: int) -> Indices:
         self.size += count
         return np.arange(self.size - count, self.size)
+
+    def minimize(self, state: Array) -> tuple[Array, Solve, float]:
+        """Minimize the cost from a state.
+
+        Returns
+        -------
+        state : (size,) ndarray
+        solve : callable
+            Applies the inverse normal matrix at the minimum.
+        residual_sigma : float
+            Rms residual of the fields.
+        """
+        for _ in range(MAX_ITERATIONS):
+            matrix, gradient, _ = self.normal_equations(state)
+            step = _factorized(matrix).solve(gradient)
+            state = state - step
+            if np.abs(step[self.position_columns]).max() < MIN_STEP_M:
+                break
+        matrix, _, residual_sigma = self.normal_equations(state)
+        return state, _factorized(matrix).solve, residual_sigma
 
     def initial_state(self) -> Array:
         """Return the state at the initial poses of the visits."""
@@ -456,8 +585,9 @@ class SmoothingSystem:
                 add(unknowns, jacobian, residual)
                 squares += float(residual @ residual)
                 count += int((~np.isnan(visit.trace.field_t)).sum())
-            for k in range(len(robot.links)):
-                add(*self.link_rows(state, number, k))
+            for k, link in enumerate(robot.links):
+                if link is not None:
+                    add(*self.link_rows(state, number, k))
         diagonal = np.arange(self.size)
         matrix = coo_array(
             (
@@ -513,8 +643,10 @@ class SmoothingSystem:
     def link_rows(self, state: Array, number: int, k: int) -> tuple[Indices, Array, Array]:
         """Linearize the odometry between visits ``k`` and ``k + 1``; see :meth:`field_rows`."""
         robot, link = self.robots[number], self.robots[number].links[k]
+        assert link is not None
         constant = self.robot_columns[number][-CONSTANT_ERROR_COUNT:]
         first, second = self.visit_columns[number][k : k + 2]
+        own = self.link_columns[number][k]
         start, start_by_unknowns = bin_pose_with_gradient(
             robot.visits[k].trace, -1, state[first], state[constant]
         )
@@ -523,9 +655,8 @@ class SmoothingSystem:
         )
         local, by_start, by_end = relative_pose_with_gradient(start, end)
         by_constant, walk = np.split(link.correction[-1], [CONSTANT_ERROR_COUNT], axis=1)
-        # Constant errors bend a long path too much for the linearization.
-        path = correct_constant_errors(link.pose, state[constant], link.drift)
-        residual = local - path[-1]
+        path = link.without_constant_errors(state[constant])
+        residual = local - path[-1] - walk @ state[own]
         residual[2] = math.remainder(residual[2], math.tau)
         first_part = by_start @ start_by_unknowns
         second_part = by_end @ end_by_unknowns
@@ -533,24 +664,24 @@ class SmoothingSystem:
             [
                 first_part[:, : len(first)],
                 second_part[:, : len(second)],
+                -walk,
                 # Both ends depend on the constant errors, and so does the path between them.
                 first_part[:, len(first) :] + second_part[:, len(second) :] - by_constant,
             ]
         )
-        covariance = walk @ walk.T + np.diag(MIN_ODOMETRY_SIGMA**2)
-        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        unknowns = np.concatenate([first, second, constant])
-        return unknowns, whitening @ jacobian, whitening @ residual
+        unknowns = np.concatenate([first, second, own, constant])
+        return unknowns, jacobian / MIN_ODOMETRY_SIGMA[:, None], residual / MIN_ODOMETRY_SIGMA
 
     def result(self, state: Array, solve: Solve, residual_sigma: float) -> SmoothingResult:
         """Return the estimates at a state; ``solve`` applies the inverse normal matrix."""
+        inflation = max(1.0, residual_sigma) ** 2
         visits = []
         for number, columns_of in enumerate(self.visit_columns):
             constant = self.robot_columns[number][-CONSTANT_ERROR_COUNT:]
             poses = []
             for own in columns_of:
                 columns = np.concatenate([own[:POSE_SIZE], constant, own[POSE_SIZE:]])
-                covariance = self._covariance(columns, solve, residual_sigma)
+                covariance = self.covariance(columns, solve) * inflation
                 pose, corrections = state[own[:POSE_SIZE]], state[columns[POSE_SIZE:]]
                 poses.append(VisitPose(pose, corrections, covariance))
             visits.append(poses)
@@ -558,7 +689,7 @@ class SmoothingSystem:
         for cell, prior in self.landmarks.items():
             columns = self.landmark_columns[cell][: POSE_SIZE + 4]
             unit = np.concatenate([prior.sigma, prior.strength_sigma])
-            covariance = self._covariance(columns, solve, residual_sigma)
+            covariance = self.covariance(columns, solve) * inflation
             landmarks[cell] = LandmarkEstimate(
                 self._landmark_pose(state, cell),
                 prior.strength + prior.strength_sigma * state[columns[POSE_SIZE:]],
@@ -570,10 +701,15 @@ class SmoothingSystem:
         prior = self.landmarks[cell]
         return prior.pose + prior.sigma * state[self.landmark_columns[cell][:POSE_SIZE]]
 
-    def _covariance(self, columns: Indices, solve: Solve, residual_sigma: float) -> Array:
+    def covariance(self, columns: Indices, solve: Solve) -> Array:
+        """Return the covariance of some unknowns, if the residuals are those of the priors."""
         right = np.zeros((self.size, len(columns)))
         right[columns, np.arange(len(columns))] = 1
-        return np.asarray(solve(right)[columns]) * max(1.0, residual_sigma) ** 2
+        return np.asarray(solve(right)[columns])
+
+
+def _walk_size(link: OdometryLink) -> int:
+    return link.correction.shape[2] - CONSTANT_ERROR_COUNT
 
 
 def relative_pose_with_gradient(origin: Array, pose: Array) -> tuple[Array, Array, Array]:

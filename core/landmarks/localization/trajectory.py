@@ -1,35 +1,38 @@
 """Trajectory of a robot at the times of its odometry, from the poses of its visits.
 
 Within a visit the odometry is corrected by the estimated errors. Between two visits the remaining
-difference is distributed in proportion to the variance of the random walk (a Brownian bridge).
-Before the first and after the last visit the trajectory is dead reckoning.
+difference is distributed in proportion to the variance of the random walk (a Brownian bridge). If
+a wheel slipped between them, at an unknown moment, each pose is the mean of dead reckoning from
+both visits. If the robot was carried between them, there are no poses. Before the first and after
+the last visit the trajectory is dead reckoning.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import quaternion_from_heading
-from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.trace import (
     CONSTANT_ERROR_COUNT,
     compose,
-    correct_constant_errors,
     planar_rotation,
     relative,
 )
+from locatk.core.landmarks.localization.odometry_path import OdometryPath
 from locatk.core.landmarks.localization.smoothing import (
     MIN_ODOMETRY_SIGMA,
     POSE_SIZE,
+    OdometryLink,
+    RobotMeasurements,
+    VisitMeasurement,
     VisitPose,
-    odometry_between,
     odometry_link,
 )
-from locatk.core.landmarks.preprocessing import VisitSegment, planar_poses
+from locatk.core.landmarks.preprocessing import VisitSegment
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -39,33 +42,39 @@ TimedPoses = tuple[NDArray[np.int64], Array, Array]
 
 def estimate_trajectory(
     device: str,
-    segments: list[VisitSegment],
+    robot: RobotMeasurements,
     estimates: list[VisitPose],
     odometry: Trajectory,
-    priors: ModelPriors,
+    slipped_links: Collection[int] = (),
 ) -> Trajectory:
     """Estimate the poses of a robot on the map at the times of its odometry.
 
     Parameters
     ----------
     device : str
-    segments : list of VisitSegment
-        At least one, in order of time.
+        Name of the robot.
+    robot : RobotMeasurements
     estimates : list of VisitPose
-        Of each segment.
+        Of each visit.
     odometry : Trajectory
-    priors : ModelPriors
+    slipped_links : collection of int
+        Links between whose visits a wheel slipped.
 
     Returns
     -------
     Trajectory
-        In the frame ``"map"``. Height, roll and pitch are 0; their covariance is ``nan``.
+        In the frame ``"map"``. Height, roll and pitch are 0; their covariance is ``nan``. There
+        are no poses between two visits without a link.
     """
-    visits = list(zip(segments, estimates, strict=True))
-    parts = [_before(*visits[0], odometry, priors)]
-    for visit, following in pairwise(visits):
-        parts += [_during(*visit, odometry), _between(visit, following, odometry, priors)]
-    parts += [_during(*visits[-1], odometry), _after(*visits[-1], odometry, priors)]
+    path = OdometryPath.of(odometry)
+    visits = [_Visit(*each) for each in zip(robot.visits, estimates, strict=True)]
+    parts = [_before(visits[0], path)]
+    for k, link in enumerate(robot.links):
+        parts.append(_during(visits[k], path))
+        if link is not None:
+            bridge = _between_with_slip if k in slipped_links else _between
+            parts.append(bridge(visits[k], visits[k + 1], link))
+    parts += [_during(visits[-1], path), _after(visits[-1], path)]
     time_ns, pose, planar_covariance = (np.concatenate(each) for each in zip(*parts, strict=True))
     covariance = np.full((len(pose), 6, 6), np.nan)
     rows = np.array([0, 1, 5])
@@ -104,33 +113,43 @@ def pose_probability(
     return map_probability * np.minimum(of_visit[begun], of_visit[unfinished])
 
 
-def _during(segment: VisitSegment, estimate: VisitPose, odometry: Trajectory) -> TimedPoses:
+@dataclass(frozen=True)
+class _Visit:
+    """Measurement and estimate of one visit."""
+
+    measurement: VisitMeasurement
+    estimate: VisitPose
+
+    @property
+    def segment(self) -> VisitSegment:
+        return self.measurement.segment
+
+    def bin_pose(self, index: int) -> tuple[Array, Array]:
+        """Return pose (3,) and covariance (3, 3) at one bin."""
+        trace = self.segment.trace
+        pose, covariance = _to_map(self.estimate, trace.pose[[index]], trace.correction[[index]])
+        return pose[0], covariance[0]
+
+
+def _during(visit: _Visit, path: OdometryPath) -> TimedPoses:
     """Correct the odometry during a visit."""
-    bin_ns = segment.time_ns
-    is_inside = (odometry.time_ns >= bin_ns[0]) & (odometry.time_ns <= bin_ns[-1])
-    time_ns, pose = odometry.time_ns[is_inside], planar_poses(odometry)[is_inside]
+    segment, bin_ns = visit.segment, visit.segment.time_ns
+    inside = path.between(bin_ns[0] - 1, bin_ns[-1] + 1)
+    time_ns, pose = path.time_ns[inside], path.pose[inside]
     index = np.interp(time_ns - bin_ns[0], bin_ns - bin_ns[0], np.arange(len(bin_ns)))
     low = np.minimum(index.astype(int), max(len(bin_ns) - 2, 0))
     high = np.minimum(low + 1, len(bin_ns) - 1)
     fraction = (index - low)[:, None, None]
     by_errors = segment.trace.correction
     correction = (1 - fraction) * by_errors[low] + fraction * by_errors[high]
-    return time_ns, *_to_map(estimate, relative(pose, segment.origin), correction)
+    return time_ns, *_to_map(visit.estimate, relative(pose, segment.origin), correction)
 
 
-def _between(
-    visit: tuple[VisitSegment, VisitPose],
-    following: tuple[VisitSegment, VisitPose],
-    odometry: Trajectory,
-    priors: ModelPriors,
-) -> TimedPoses:
+def _between(visit: _Visit, following: _Visit, link: OdometryLink) -> TimedPoses:
     """Fit the odometry between two visits to the poses at both ends."""
-    time_ns, path = odometry_between(odometry, visit[0], following[0])
-    link = odometry_link(path, priors)
-    start, start_covariance = _bin_pose(*visit, -1)
-    end, end_covariance = _bin_pose(*following, 0)
-    constant_errors = visit[1].corrections[:CONSTANT_ERROR_COUNT]
-    local = correct_constant_errors(link.pose, constant_errors, priors.drift)
+    start, start_covariance = visit.bin_pose(-1)
+    end, end_covariance = following.bin_pose(0)
+    local = link.without_constant_errors(visit.estimate.corrections)
     walk = link.correction[:, :, CONSTANT_ERROR_COUNT:]
     rotation = planar_rotation(start[2])
     difference = rotation.T @ (end - start) - local[-1]
@@ -141,72 +160,98 @@ def _between(
     conditional = np.eye(walk.shape[2]) - gain @ last
     bridge = rotation @ (walk @ conditional @ walk.swapaxes(1, 2)) @ rotation.T
     # The covariances of the ends are interpolated by the variance of the walk.
-    variance = np.einsum("nim,nim->n", walk, walk)
-    fraction = (variance / max(variance[-1], 1e-300))[:, None, None]
+    fraction = _walk_fraction(walk)[:, None, None]
     covariance = (1 - fraction) * start_covariance + fraction * end_covariance + bridge
-    return time_ns, compose(start, local)[1:-1], covariance[1:-1]
+    return link.time_ns, compose(start, local)[1:-1], covariance[1:-1]
 
 
-def _before(
-    segment: VisitSegment, estimate: VisitPose, odometry: Trajectory, priors: ModelPriors
-) -> TimedPoses:
-    """Dead reckoning backward from the first visit."""
-    is_before = odometry.time_ns < segment.time_ns[0]
-    path = planar_poses(odometry)[is_before][::-1]
-    pose, covariance = _dead_reckoning(segment, estimate, 0, path, priors, is_reversed=True)
-    return odometry.time_ns[is_before], pose[::-1], covariance[::-1]
+def _between_with_slip(visit: _Visit, following: _Visit, link: OdometryLink) -> TimedPoses:
+    """Return the mean of dead reckoning from both visits, and its covariance.
 
-
-def _after(
-    segment: VisitSegment, estimate: VisitPose, odometry: Trajectory, priors: ModelPriors
-) -> TimedPoses:
-    """Dead reckoning from the last visit."""
-    is_after = odometry.time_ns > segment.time_ns[-1]
-    path = planar_poses(odometry)[is_after]
-    return odometry.time_ns[is_after], *_dead_reckoning(
-        segment, estimate, -1, path, priors, is_reversed=False
+    The slip is equally likely at any effort of the path: a pose is that of the first visit's dead
+    reckoning with the probability of a later slip.
+    """
+    forward, forward_covariance = _dead_reckoning(visit, -1, link)
+    reverse = slice(None, None, -1)
+    velocity = None if link.velocity is None else link.velocity[reverse]
+    local = relative(link.pose[reverse], link.pose[-1])
+    if velocity is not None:
+        velocity = velocity @ planar_rotation(link.pose[-1, 2])
+    back = odometry_link(link.time_ns[reverse], local, link.drift, velocity)
+    backward, backward_covariance = (
+        each[reverse] for each in _dead_reckoning(following, 0, back, is_reversed=True)
     )
+    fraction = _walk_fraction(link.correction[:, :, CONSTANT_ERROR_COUNT:])[:, None]
+    difference = backward - forward
+    difference[:, 2] = np.remainder(difference[:, 2] + np.pi, 2 * np.pi) - np.pi
+    pose = forward + fraction * difference
+    fraction = fraction[:, None]
+    covariance = (1 - fraction) * forward_covariance + fraction * backward_covariance
+    spread = difference[:, :, None] * difference[:, None]
+    covariance = covariance + fraction * (1 - fraction) * spread
+    return link.time_ns, pose[1:-1], covariance[1:-1]
+
+
+def _walk_fraction(walk: Array) -> Array:
+    """Return the variance (n,) of the random walk relative to that at the end."""
+    variance = np.einsum("nim,nim->n", walk, walk)
+    return np.asarray(variance / max(variance[-1], 1e-300))
+
+
+def _before(visit: _Visit, path: OdometryPath) -> TimedPoses:
+    """Dead reckoning backward from the first visit."""
+    first_ns = visit.segment.time_ns[0]
+    before = path.between(path.time_ns[0] - 1, first_ns)
+    link = _open_link(visit, 0, path.time_ns[before][::-1], path)
+    pose, covariance = _dead_reckoning(visit, 0, link, is_reversed=True)
+    return path.time_ns[before], pose[:0:-1], covariance[:0:-1]
+
+
+def _after(visit: _Visit, path: OdometryPath) -> TimedPoses:
+    """Dead reckoning from the last visit."""
+    after = path.between(visit.segment.time_ns[-1], path.time_ns[-1] + 1)
+    link = _open_link(visit, -1, path.time_ns[after], path)
+    pose, covariance = _dead_reckoning(visit, -1, link)
+    return path.time_ns[after], pose[1:], covariance[1:]
+
+
+def _open_link(
+    visit: _Visit, index: int, time_ns: NDArray[np.int64], path: OdometryPath
+) -> OdometryLink:
+    """Return the link from one bin of a visit along all poses of the odometry at some times."""
+    segment = visit.segment
+    start = segment.odometry_pose(index)
+    pose = relative(np.vstack([start, path.pose_at(time_ns)]), start)
+    velocity = path.velocity(np.append(segment.time_ns[index], time_ns)) @ planar_rotation(start[2])
+    drift = visit.measurement.drift
+    return odometry_link(time_ns, pose, drift, velocity)
 
 
 def _dead_reckoning(
-    segment: VisitSegment,
-    estimate: VisitPose,
-    index: int,
-    path: Array,
-    priors: ModelPriors,
-    *,
-    is_reversed: bool,
+    visit: _Visit, index: int, link: OdometryLink, *, is_reversed: bool = False
 ) -> tuple[Array, Array]:
-    """Continue from one bin of a visit along poses (n, 3) of the odometry.
+    """Continue from one bin of a visit along a link.
 
     Returns
     -------
     pose : (n, 3) ndarray
     covariance : (n, 3, 3) ndarray
     """
-    link = odometry_link(np.vstack([segment.odometry_pose(index), path]), priors)
-    start, start_covariance = _bin_pose(segment, estimate, index)
+    start, start_covariance = visit.bin_pose(index)
     # Curvature has the opposite sign on a path that is traversed backward.
-    sign = np.array([1.0, 1.0, -1.0 if is_reversed else 1.0])
-    constant_errors = sign * estimate.corrections[:CONSTANT_ERROR_COUNT]
-    local = correct_constant_errors(link.pose, constant_errors, priors.drift)
+    sign = np.array([1.0, 1.0, -1.0 if is_reversed else 1.0, 1.0])
+    constant_errors = sign * visit.estimate.corrections[:CONSTANT_ERROR_COUNT]
+    local = link.without_constant_errors(constant_errors)
     by_constant = link.correction[:, :, :CONSTANT_ERROR_COUNT] * sign
     walk = link.correction[:, :, CONSTANT_ERROR_COUNT:]
     columns = slice(POSE_SIZE, POSE_SIZE + CONSTANT_ERROR_COUNT)
-    constant_covariance = estimate.covariance[columns, columns]
+    constant_covariance = visit.estimate.covariance[columns, columns]
     own = by_constant @ constant_covariance @ by_constant.swapaxes(1, 2)
     own = own + walk @ walk.swapaxes(1, 2)
     rotation = planar_rotation(start[2])
     by_start = _gradient_by_pose(rotation, local)
     covariance = by_start @ start_covariance @ by_start.swapaxes(1, 2) + rotation @ own @ rotation.T
-    return compose(start, local)[1:], covariance[1:]
-
-
-def _bin_pose(segment: VisitSegment, estimate: VisitPose, index: int) -> tuple[Array, Array]:
-    """Return pose (3,) and covariance (3, 3) at one bin of a visit."""
-    trace = segment.trace
-    pose, covariance = _to_map(estimate, trace.pose[[index]], trace.correction[[index]])
-    return pose[0], covariance[0]
+    return compose(start, local), covariance
 
 
 def _to_map(estimate: VisitPose, local: Array, correction: Array) -> tuple[Array, Array]:

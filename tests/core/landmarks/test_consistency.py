@@ -11,11 +11,6 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.localization import consistency
 from locatk.core.landmarks.localization.cell_filter import CellEstimate, IdentifiedVisit
-from locatk.core.landmarks.localization.smoothing import (
-    LandmarkEstimate,
-    LandmarkPrior,
-    SmoothingResult,
-)
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.preprocessing import VisitSegment
 from locatk.core.landmarks.simulation.session import (
@@ -105,17 +100,3 @@ def test_contradictions_are_counted(
     visits = visits_of(misread, unexplained, correct)
     on_map = [visit for visit in visits if visit.estimate is not None]
     assert consistency.is_map_contradicted(visits, on_map, 1.0) == contradicted
-
-
-@pytest.mark.parametrize(
-    ("count", "sigmas", "displaced"), [(3, 2.6, True), (3, 2.4, False), (2, 9.0, False)]
-)
-def test_displaced_landmarks_are_found(count: int, sigmas: float, displaced: bool) -> None:
-    cells = [(2, k) for k in range(count)]
-    sigma = np.array([1e-3, 1e-3, 0.01])
-    priors = {cell: LandmarkPrior(np.zeros(3), sigma, np.ones(4), np.ones(4)) for cell in cells}
-    estimates = {cell: LandmarkEstimate(np.zeros(3), np.ones(4), np.eye(7)) for cell in cells}
-    shift = np.array([0.0, -sigmas * 1e-3, 0.0])
-    estimates[2, 0] = replace(estimates[2, 0], pose=shift)
-    result = consistency.find_displaced_landmarks(priors, SmoothingResult([], estimates, 1.0))
-    assert result == ({(2, 0): pytest.approx(sigmas * 1e-3)} if displaced else {})

@@ -84,10 +84,13 @@ def session(
             np.ones(len(observed)),
             15,
         )
-        visits.append(VisitMeasurement(trace, cell, true[15] + [0.001, -0.001, 0.01]))
+        guess = true[15] + [0.001, -0.001, 0.01]
+        segment = VisitSegment(0, 31, 1000 * number + np.arange(31), trace, own[15])
+        visits.append(VisitMeasurement(segment, cell, guess, PRIORS.drift))
     for one, other in pairwise(measured):
         between = np.linspace(one[-1], other[0], 20)
-        links.append(odometry_link(between, PRIORS))
+        time_ns = np.arange(18, dtype=np.int64)
+        links.append(odometry_link(time_ns, relative(between, between[0]), PRIORS.drift))
     sigma = np.array([1.5e-3, 1.5e-3, 0.012])
     landmarks = {
         cell: LandmarkPrior(POSES[cell], sigma, signs(code), np.full(4, 0.04))
@@ -111,8 +114,8 @@ def test_derivatives_of_relative_poses() -> None:
 def test_derivatives_of_a_bin() -> None:
     trace = session()[0].visits[0].trace
     random = np.random.default_rng(1)
-    own = random.normal(size=3 + trace.correction.shape[2] - 3)
-    constant = random.normal(size=3)
+    own = random.normal(size=3 + trace.correction.shape[2] - 4)
+    constant = random.normal(size=4)
     slope = bin_pose_with_gradient(trace, -1, own, constant)[1]
     both = np.concatenate([own, constant])
     count = len(own)
@@ -226,13 +229,13 @@ def test_links_take_large_constant_errors_exactly() -> None:
     robot, landmarks = session()
     system = SmoothingSystem([robot], landmarks, GEOMETRY, PRIORS)
     state = system.initial_state()
-    constant = np.array([0.0, 0.0, 8.0])
-    state[system.robot_columns[0][-3:]] = constant
+    constant = np.array([0.0, 0.0, 8.0, 0.0])
+    state[system.robot_columns[0][-4:]] = constant
     first, second = robot.visits[:2]
     start = bin_pose_with_gradient(first.trace, -1, state[system.visit_columns[0][0]], constant)[0]
     path = correct_constant_errors(robot.links[0].pose, constant, PRIORS.drift)
     end = compose(start, path[-1])
-    local = second.trace.pose[0] + second.trace.correction[0][:, :3] @ constant
+    local = second.trace.pose[0] + second.trace.correction[0][:, :4] @ constant
     pose = np.array([0.0, 0.0, end[2] - local[2]])
     pose[:2] = end[:2] - compose(pose, local)[:2]
     state[system.visit_columns[0][1][:3]] = pose

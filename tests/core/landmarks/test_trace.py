@@ -15,7 +15,9 @@ from locatk.core.landmarks.detection.trace import (
     Trace,
     compose,
     correct_constant_errors,
+    known_drift,
     odometry_corrections,
+    planar_rotation,
     relative,
     sensor_positions,
 )
@@ -173,3 +175,37 @@ def test_thinned_keeps_the_reference_and_the_number_of_samples(
     assert len(thin) <= most
     assert thin.pose[thin.reference, 0] == 0
     assert thin.thinning * len(thin) == pytest.approx(count, abs=thin.thinning)
+
+
+def test_lag_shifts_the_path_in_time() -> None:
+    """On an arc with increasing speed, which a circle of another radius would not explain."""
+    time = np.linspace(0, 2, 401)
+    angle = 0.3 * time + 0.4 * time**2
+
+    def path(at: Array) -> Array:
+        own = 0.3 * at + 0.4 * at**2
+        return np.column_stack([0.2 * np.sin(own), 0.2 - 0.2 * np.cos(own), own])
+
+    lag, reference = 0.01, 150
+    rate = (0.3 + 0.8 * time)[:, None]
+    velocity = rate * np.column_stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), np.ones(401)])
+    observed = path(time - lag)
+    origin = observed[reference]
+    local = relative(observed, origin)
+    drift = OdometryDrift(0, 0, 0, 0, 0, lag_s=1.0)
+    turned = velocity @ planar_rotation(origin[2])
+    column = odometry_corrections(local, reference, drift, turned)[:, :, 3]
+    true = relative(path(time), path(time)[reference])
+    assert np.abs(local - true).max() > 3e-3
+    np.testing.assert_allclose(local + lag * column, true, atol=2e-4)
+    assert not odometry_corrections(local, reference, drift)[:, :, 3].any()
+
+
+def test_known_noise_and_lag_replace_the_drift() -> None:
+    drift = OdometryDrift()
+    known = known_drift(drift, math.radians(1), 0.02)
+    heading_sigma = known.walk_rad / math.sqrt(0.15)
+    assert math.degrees(heading_sigma) == pytest.approx(1)
+    assert known.walk_m / known.walk_rad == pytest.approx(drift.walk_m / drift.walk_rad)
+    assert known.lag_s == 0
+    assert known_drift(drift, None, None) == drift

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,14 +14,19 @@ from numpy.typing import NDArray
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks import solver
 from locatk.core.landmarks.localization.cell_filter import select_visits_on_map
+from locatk.core.landmarks.localization.odometry_path import OdometryPath
 from locatk.core.landmarks.localization.smoothing import (
+    RobotMeasurements,
+    VisitMeasurement,
     VisitPose,
     landmark_priors,
+    link_visits,
     measure_visits,
     smooth,
 )
 from locatk.core.landmarks.localization.trajectory import estimate_trajectory, pose_probability
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.landmarks.preprocessing import VisitSegment
 from locatk.core.landmarks.simulation.session import (
     NONE,
     Errors,
@@ -72,6 +78,16 @@ def test_probabilities_of_poses_agree_with_the_facts() -> None:
     facts = solver.solve(one.samples, FLOOR, odometry=one.odometry).facts.robots["robot"]
     assert trajectory.min_probability == pytest.approx(facts.probability)
     assert facts.provisional == trajectory.is_provisional
+
+
+def measured(
+    segments: list[VisitSegment], recording: solver.IdentifiedRecording
+) -> RobotMeasurements:
+    """Return visits that are linked by the odometry."""
+    path, drift = OdometryPath.of(recording.odometry), recording.priors.drift
+    visits = [VisitMeasurement(one, (0, 0), np.zeros(3), drift) for one in segments]
+    links = [link_visits(one, other, path, drift) for one, other in pairwise(visits)]
+    return RobotMeasurements(visits, links)
 
 
 def errors_of(one: SimulatedSession, trajectory: Trajectory) -> tuple[Array, Array]:
@@ -151,13 +167,7 @@ def test_dead_reckoning_before_and_after_all_visits() -> None:
     middle = on_map[2:4]
     measurements = measure_visits(middle, recording.odometry, recording.priors, FLOOR)
     smoothed = smooth([measurements], landmarks, FLOOR.geometry, recording.priors)
-    trajectory = estimate_trajectory(
-        "robot",
-        [item.segment for item in middle],
-        smoothed.visits[0],
-        recording.odometry,
-        recording.priors,
-    )
+    trajectory = estimate_trajectory("robot", measurements, smoothed.visits[0], recording.odometry)
     off, squares = errors_of(one, trajectory)
     inside = (trajectory.time_ns >= middle[0].segment.time_ns[0]) & (
         trajectory.time_ns <= middle[-1].segment.time_ns[-1]
@@ -179,9 +189,8 @@ def test_backward_dead_reckoning_removes_constant_errors() -> None:
     corrections = np.zeros(width)
     corrections[2] = 1.5  # curvature
     estimate = VisitPose(np.array([0.3, 0.2, 0.4]), corrections, np.eye(3 + width) * 1e-8)
-    trajectory = estimate_trajectory(
-        "robot", [item.segment], [estimate], recording.odometry, recording.priors
-    )
+    robot = measured([item.segment], recording)
+    trajectory = estimate_trajectory("robot", robot, [estimate], recording.odometry)
     # The whole path has 1.5 sigma more curvature.
     heading = np.unwrap(heading_from_quaternion(trajectory.quaternion))
     own = np.unwrap(heading_from_quaternion(recording.odometry.quaternion))
@@ -218,7 +227,8 @@ def test_difference_of_odometry_is_distributed_between_visits() -> None:
         pose = visit.origin + [*(number * off), 0.0]
         width = visit.trace.correction.shape[2]
         estimates.append(VisitPose(pose, np.zeros(width), np.eye(3 + width) * 1e-8))
-    trajectory = estimate_trajectory("robot", pair, estimates, recording.odometry, recording.priors)
+    robot = measured(pair, recording)
+    trajectory = estimate_trajectory("robot", robot, estimates, recording.odometry)
     shift = trajectory.position[:, :2] - recording.odometry.position[:, :2]
     between = (trajectory.time_ns > pair[0].time_ns[-1]) & (trajectory.time_ns < pair[1].time_ns[0])
     assert between.sum() > 20

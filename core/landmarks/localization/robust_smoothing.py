@@ -1,0 +1,467 @@
+"""Smoothing of a robot with slipping wheels and displaced landmarks: which priors do not hold.
+
+The random walk of the odometry and the pose of each landmark have Gaussian priors
+(:mod:`.smoothing`). After each minimization every prior is compared with what all other
+measurements say of the same unknowns (data snooping; Baarda, A testing procedure for use in
+geodetic networks, 1968). For unknowns z with a prior N(0, I) and a posterior N(m, P), the others
+alone have the information L = P^-1 - I with L z = P^-1 m. Their probability with a prior of any
+covariance follows in closed form: with I if the prior holds, with a far wider one if a wheel
+slipped or a landmark is displaced. If the second is more probable, the prior is widened, and
+everything is estimated again. The same comparison takes a wide prior back.
+
+The variance of the random walk is estimated from the same numbers, as a variance component
+(Foerstner, Zeitschrift fuer Vermessungswesen 104 (1979) 446): the sum of squares of its unknowns
+over their redundancy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from locatk.core.landmarks.detection.fit import ModelPriors
+from locatk.core.landmarks.detection.trace import (
+    CONSTANT_ERROR_COUNT,
+    OdometryDrift,
+    compose,
+    relative,
+    walk_units,
+)
+from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.localization.smoothing import (
+    POSE_SIZE,
+    Indices,
+    LandmarkPrior,
+    RobotMeasurements,
+    SmoothingResult,
+    SmoothingSystem,
+    Solve,
+)
+from locatk.core.landmarks.map.floor import Cell
+
+Array = NDArray[np.float64]
+
+SLIP_PROBABILITY = 0.01
+"""Probability that a wheel slips between two visits or during one, as in :mod:`.cell_steps`."""
+
+DISPLACEMENT_PROBABILITY = 0.01
+"""Probability that a landmark is displaced."""
+
+SLIP_SCALE_M, SLIP_SCALE_RAD = 0.03, math.radians(10)
+"""Standard deviations of a slip, as in :mod:`.cell_steps` ..."""
+
+SLIP_SCALES = (0.3, 1.0, 3.0, 9.0)
+"""... times any of these factors: slips have long tails."""
+
+DISPLACED_LANDMARK_SIGMA = np.array([0.02, 0.02, 0.1])
+"""Standard deviations (m, m, rad) of a displaced landmark about its pose on the map."""
+
+MIN_RELEASE_ODDS = 10.0
+"""Odds of a slip or displacement from which on it is assumed."""
+
+MIN_ALTERNATIVE_ODDS = 0.05
+"""Odds of another explanation, relative to the best, from which on it is reported as well."""
+
+FREE_WEIGHT = 1e-8
+"""Weight of the prior of a released random walk: tens of metres."""
+
+MIN_REDUNDANCY = 0.05
+"""Fraction of an unknown that other measurements determine, from which on its prior is tested."""
+
+MAX_LINEAR_M, MAX_LINEAR_RAD = 0.03, math.radians(10)
+"""Differences between odometry and landmarks beyond which the linearization fails; a slip is then
+assumed from the start."""
+
+WALK_PRIOR_FREEDOM = 4.0
+"""Degrees of freedom of the prior of the variance of the random walk: its root is known to a factor
+of about two."""
+
+MAX_WALK_ROUNDS, MAX_RELEASE_ROUNDS = 5, 12
+
+MIN_WALK_CHANGE = 0.05
+"""Relative change of the standard deviation of the walk below which it has converged."""
+
+
+@dataclass(frozen=True)
+class WheelSlip:
+    """Slip of a wheel.
+
+    Attributes
+    ----------
+    first_ns, last_ns : int
+        Times between which it occurred.
+    distance_m, rotation_rad : float
+        Difference between the motion by odometry and the true one.
+    """
+
+    first_ns: int
+    last_ns: int
+    distance_m: float
+    rotation_rad: float
+
+
+@dataclass(frozen=True)
+class DisplacedLandmark:
+    """Landmark that is not at its pose on the map, and by how much."""
+
+    cell: Cell
+    distance_m: float
+    rotation_rad: float
+
+
+Cause = WheelSlip | DisplacedLandmark
+
+
+@dataclass(frozen=True)
+class RobustSmoothing:
+    """Result of :func:`smooth_robustly`.
+
+    Attributes
+    ----------
+    measurements : RobotMeasurements
+        With corrections in units of the estimated random walk.
+    result : SmoothingResult
+    causes : list of tuple of Cause
+        Priors that do not hold; alternatives of one inconsistency are in one tuple.
+    slipped_links, slipped_visits : frozenset of int
+        Links between visits, and visits, with a slip.
+    drift : OdometryDrift
+        With the estimated random walk.
+    """
+
+    measurements: RobotMeasurements
+    result: SmoothingResult
+    causes: list[tuple[Cause, ...]]
+    slipped_links: frozenset[int]
+    slipped_visits: frozenset[int]
+    drift: OdometryDrift
+
+
+def smooth_robustly(
+    robot: RobotMeasurements,
+    landmarks: Mapping[Cell, LandmarkPrior],
+    geometry: Geometry,
+    priors: ModelPriors,
+    *,
+    estimate_walk: bool = True,
+) -> RobustSmoothing:
+    """Smooth the visits of one robot; release the priors that do not hold.
+
+    Parameters
+    ----------
+    robot, landmarks, geometry, priors
+        See :func:`.smoothing.smooth`.
+    estimate_walk : bool
+        Estimate the variance of the random walk of the odometry; else it is that of ``priors``.
+    """
+    snooping = _Snooping(SmoothingSystem([robot], landmarks, geometry, priors), priors.drift)
+    snooping.release_nonlinear_links()
+    for _ in range(MAX_WALK_ROUNDS if estimate_walk else 0):
+        snooping.minimize()
+        if not snooping.raise_walk():
+            break
+    for _ in range(MAX_RELEASE_ROUNDS):
+        snooping.minimize()
+        has_changed = snooping.update_released()
+        if estimate_walk and snooping.update_walk():
+            has_changed = True
+        if not has_changed:
+            break
+    snooping.minimize()
+    return snooping.result()
+
+
+@dataclass
+class _Candidate:
+    """Unknowns whose common prior may not hold.
+
+    Attributes
+    ----------
+    columns : (k,) ndarray
+    scales : (s, k) ndarray
+        Standard deviations if it does not, in those of the prior: alternatives.
+    log_odds : float
+        That it does not, before any measurement.
+    free_weight : (k,) ndarray
+        Weights of the prior after its release.
+    visit : int
+        Visit during or after which a wheel may slip; -1 for a landmark.
+    unit : int
+        Unit of the random walk of the visit, or -1 for the link after it.
+    cell : (row, column) or None
+        Landmark that may be displaced.
+    alternatives : list of _Candidate
+        Other explanations of the same inconsistency.
+    """
+
+    columns: Indices
+    scales: Array
+    log_odds: float
+    free_weight: Array
+    visit: int = -1
+    unit: int = -1
+    cell: Cell | None = None
+    is_released: bool = False
+    alternatives: list[_Candidate] = field(default_factory=list)
+    information: Array = field(default_factory=lambda: np.empty(0))
+    mean_information: Array = field(default_factory=lambda: np.empty(0))
+
+    def update(self, covariance: Array, mean: Array, weight: Array) -> None:
+        """Compute the information of all other measurements from the posterior."""
+        inverse = np.asarray(np.linalg.inv(covariance), float)
+        self.information = inverse - np.diag(weight)
+        self.mean_information = inverse @ mean
+
+    def log_posterior_odds(self) -> float:
+        """Return the log odds that the prior does not hold."""
+        wide = np.logaddexp.reduce([self._log_evidence(scale) for scale in self.scales])
+        return float(
+            self.log_odds
+            + wide
+            - math.log(len(self.scales))
+            - self._log_evidence(np.ones(len(self.columns)))
+        )
+
+    def _log_evidence(self, scale: Array) -> float:
+        """Return the log evidence of all other measurements with a prior, up to a constant."""
+        matrix = np.eye(len(scale)) + scale[:, None] * self.information * scale
+        vector = scale * self.mean_information
+        _, log_determinant = np.linalg.slogdet(matrix)
+        return float(vector @ np.linalg.solve(matrix, vector) - log_determinant) / 2
+
+    def chi_square(self) -> tuple[float, int]:
+        """Return the statistic of the test that the prior holds, and its degrees of freedom."""
+        value, vector = np.linalg.eigh(self.information)
+        is_tested = value > MIN_REDUNDANCY / (1 - MIN_REDUNDANCY)
+        value = value[is_tested]
+        along = vector.T[is_tested] @ self.mean_information
+        return float(np.sum(along**2 / (value * (1 + value)))), int(is_tested.sum())
+
+
+class _Snooping:
+    """State of the smoothing of one robot, and the candidates whose priors are tested."""
+
+    def __init__(self, system: SmoothingSystem, drift: OdometryDrift) -> None:
+        self.system, self.prior_drift, self.drift = system, drift, drift
+        self.state = system.initial_state()
+        self.solve: Solve = lambda right: right
+        self.residual_sigma = 1.0
+        self.candidates = [*self._walk_candidates(), *self._landmark_candidates()]
+
+    @property
+    def robot(self) -> RobotMeasurements:
+        return self.system.robots[0]
+
+    def minimize(self) -> None:
+        """Minimize with the present priors, and update all candidates."""
+        system = self.system
+        self.state, self.solve, self.residual_sigma = system.minimize(self.state)
+        for one in self.candidates:
+            one.update(
+                system.covariance(one.columns, self.solve),
+                self.state[one.columns],
+                system.prior_weight[one.columns],
+            )
+
+    # ---- candidates
+
+    def _walk_candidates(self) -> list[_Candidate]:
+        candidates = []
+        for k, visit in enumerate(self.robot.visits):
+            columns = self.system.visit_columns[0][k][POSE_SIZE:]
+            units = walk_units(visit.trace.correction.shape[2])
+            for number, unit in enumerate(units):
+                span = np.ptp(visit.trace.correction[:, :, unit], axis=0)
+                own = columns[unit - CONSTANT_ERROR_COUNT]
+                candidates.append(_slip_candidate(own, span[[2, 0, 1], [0, 1, 2]], 1, k, number))
+        for k, link in enumerate(self.robot.links):
+            if link is None:
+                continue
+            units = walk_units(link.correction.shape[2])
+            span = np.abs(link.correction[-1][np.repeat([2, 0, 1], len(units)), units.T.ravel()])
+            own = self.system.link_columns[0][k]
+            candidates.append(_slip_candidate(own, span, len(units), k, -1))
+        return [one for one in candidates if np.isfinite(one.scales).all()]
+
+    def _landmark_candidates(self) -> list[_Candidate]:
+        candidates = []
+        for cell, prior in self.system.landmarks.items():
+            scale = np.maximum(DISPLACED_LANDMARK_SIGMA / prior.sigma, 1.0)
+            columns = self.system.landmark_columns[cell][:POSE_SIZE]
+            odds = math.log(DISPLACEMENT_PROBABILITY / (1 - DISPLACEMENT_PROBABILITY))
+            candidates.append(_Candidate(columns, scale[None], odds, scale**-2, cell=cell))
+        return candidates
+
+    # ---- releases
+
+    def release_nonlinear_links(self) -> None:
+        """Release the links that contradict the landmarks by more than the linearization takes."""
+        visits = self.robot.visits
+        for one in self.candidates:
+            link = self.robot.links[one.visit] if one.cell is None and one.unit < 0 else None
+            if link is None:
+                continue
+            first, second = visits[one.visit : one.visit + 2]
+            start = compose(first.pose, first.trace.pose[-1])
+            end = compose(second.pose, second.trace.pose[0])
+            difference = relative(end[None], start)[0] - link.pose[-1]
+            distance = float(np.hypot(*difference[:2]))
+            rotation = abs(math.remainder(difference[2], math.tau))
+            if distance > MAX_LINEAR_M or rotation > MAX_LINEAR_RAD:
+                self._set_released(one, True)
+
+    def update_released(self) -> bool:
+        """Release the priors that do not hold, and take others back; return if any changed.
+
+        Of neighbouring candidates the best is released, because it may explain the others.
+        """
+        odds = np.array([one.log_posterior_odds() for one in self.candidates])
+        limit = math.log(MIN_RELEASE_ODDS)
+        has_changed = False
+        for one, own in zip(self.candidates, odds, strict=True):
+            if one.is_released and not one.alternatives and own < limit:
+                self._set_released(one, False)
+                has_changed = True
+        if has_changed:
+            return True
+        held = [n for n, one in enumerate(self.candidates) if not one.is_released]
+        if not held:
+            return False
+        best = max(held, key=lambda n: odds[n])
+        if odds[best] < limit:
+            return False
+        chosen = self.candidates[best]
+        alternatives = [
+            n
+            for n in held
+            if n != best
+            and odds[n] > odds[best] + math.log(MIN_ALTERNATIVE_ODDS)
+            and self._explains(best, n)
+        ]
+        chosen.alternatives = [self.candidates[n] for n in alternatives]
+        for n in [best, *alternatives]:
+            self._set_released(self.candidates[n], True)
+        return True
+
+    def _explains(self, first: int, second: int) -> bool:
+        """Return if two candidates explain the same inconsistency: they are correlated."""
+        one, other = self.candidates[first], self.candidates[second]
+        columns = np.concatenate([one.columns, other.columns])
+        covariance = self.system.covariance(columns, self.solve)
+        size = len(one.columns)
+        cross = covariance[:size, size:]
+        return bool(np.abs(cross).max() > MIN_REDUNDANCY)
+
+    def _set_released(self, one: _Candidate, is_released: bool) -> None:
+        one.is_released = is_released
+        if not is_released:
+            one.alternatives = []
+        self.system.prior_weight[one.columns] = one.free_weight if is_released else 1.0
+
+    # ---- random walk
+
+    def raise_walk(self) -> bool:
+        """Raise the random walk until half of its units agree with it; return if it changed."""
+        tests = [one.chi_square() for one in self.candidates if one.cell is None]
+        ratios = [value / chi2.ppf(0.5, count) for value, count in tests if count]
+        ratios += [1.0] * round(WALK_PRIOR_FREEDOM / POSE_SIZE)
+        factor = math.sqrt(float(np.median(ratios)))
+        if factor < 1 + MIN_WALK_CHANGE:
+            return False
+        self._scale_walk(factor, factor)
+        return True
+
+    def update_walk(self) -> bool:
+        """Estimate the variances of the random walk; return if they changed."""
+        squares, redundancy = np.zeros(2), np.zeros(2)
+        for one in self.candidates:
+            if one.cell is not None or one.is_released:
+                continue
+            is_heading = np.arange(len(one.columns)) < len(one.columns) // 3
+            posterior = np.linalg.inv(one.information + np.eye(len(one.columns)))
+            mean = posterior @ one.mean_information
+            for kind, mask in enumerate((is_heading, ~is_heading)):
+                squares[kind] += float(np.sum(mean[mask] ** 2))
+                redundancy[kind] += float(np.sum(1 - np.diag(posterior)[mask]))
+        now, before = self.drift, self.prior_drift
+        scale = np.array([now.walk_rad / before.walk_rad, now.walk_m / before.walk_m])
+        factor = np.sqrt(
+            (WALK_PRIOR_FREEDOM / scale**2 + squares) / (WALK_PRIOR_FREEDOM + redundancy)
+        )
+        self._scale_walk(*factor.tolist())
+        return bool(np.abs(np.log(factor)).max() > MIN_WALK_CHANGE)
+
+    def _scale_walk(self, heading: float, position: float) -> None:
+        """Change the unit of the random walk; the path stays the same."""
+        self.drift = replace(
+            self.drift,
+            walk_rad=heading * self.drift.walk_rad,
+            walk_m=position * self.drift.walk_m,
+        )
+        for one in self.candidates:
+            if one.cell is None:
+                factor = np.full(len(one.columns), position)
+                factor[: len(factor) // 3] = heading
+                self.state[one.columns] /= factor
+                one.scales = np.maximum(one.scales / factor, 1.0)
+        self.system.robots = [self.robot.with_drift(self.drift)]
+
+    # ---- result
+
+    def result(self) -> RobustSmoothing:
+        """Return the estimates."""
+        result = self.system.result(self.state, self.solve, self.residual_sigma)
+        causes, reported = [], set()
+        for one in self.candidates:
+            if one.is_released and one.alternatives:
+                causes.append((self._cause(one), *map(self._cause, one.alternatives)))
+                reported |= {id(one), *map(id, one.alternatives)}
+        for one in self.candidates:
+            if one.is_released and id(one) not in reported:
+                causes.append((self._cause(one),))
+        slips = [one for one in self.candidates if one.is_released and one.cell is None]
+        return RobustSmoothing(
+            self.robot,
+            result,
+            causes,
+            slipped_links=frozenset(one.visit for one in slips if one.unit < 0),
+            slipped_visits=frozenset(one.visit for one in slips if one.unit >= 0),
+            drift=self.drift,
+        )
+
+    def _cause(self, one: _Candidate) -> Cause:
+        state = self.state[one.columns]
+        if one.cell is not None:
+            shift = self.system.landmarks[one.cell].sigma * state
+            return DisplacedLandmark(one.cell, float(np.hypot(*shift[:2])), float(shift[2]))
+        visits = self.robot.visits
+        times = visits[one.visit].segment.time_ns
+        heading, x, y = state.reshape(3, -1)
+        link = self.robot.links[one.visit] if one.unit < 0 else None
+        if link is not None:
+            units, correction = walk_units(link.correction.shape[2]).T, link.correction[-1]
+            first_ns, last_ns = times[-1], visits[one.visit + 1].segment.time_ns[0]
+        else:
+            trace = visits[one.visit].trace
+            units = walk_units(trace.correction.shape[2])[[one.unit]].T
+            correction = trace.correction[-1] - trace.correction[0]
+            changes = np.flatnonzero(np.diff(trace.correction[:, 0, units[1, 0]]))
+            first_ns, last_ns = times[changes[0]], times[changes[-1] + 1]
+        distance = math.hypot(correction[0, units[1]] @ x, correction[1, units[2]] @ y)
+        rotation = float(correction[2, units[0]] @ heading)
+        return WheelSlip(int(first_ns), int(last_ns), distance, rotation)
+
+
+def _slip_candidate(columns: Indices, span: Array, units: int, visit: int, unit: int) -> _Candidate:
+    """Return the candidate of a slip; ``span`` is the effect of one unit of each column."""
+    slip = np.repeat([SLIP_SCALE_RAD, SLIP_SCALE_M, SLIP_SCALE_M], units) / math.sqrt(units)
+    with np.errstate(divide="ignore"):
+        scales = np.array(SLIP_SCALES)[:, None] * (slip / span)
+    odds = math.log(SLIP_PROBABILITY / (1 - SLIP_PROBABILITY))
+    free = np.full(len(columns), FREE_WEIGHT)
+    return _Candidate(columns, np.maximum(scales, 1.0), odds, free, visit, unit)
