@@ -210,9 +210,9 @@ def test_the_same_tag_twice_in_a_row_has_no_correction(tour: tuple[Any, Samples]
     _, recording = tour
     preprocessed = preprocess(recording)
     part = find_passes(preprocessed.samples, preprocessed.noise_t)[0]
-    identified = identify_pass(detect_magnets(preprocessed, part, TAGS), recording, TAGS)
+    identified = identify_pass(detect_magnets(preprocessed, part, TAGS), recording, [TAGS])
     assert identified is not None
-    (observation,) = identified.observations
-    result = localize(recording, [observation, observation], replace(TAGS, site=SITE))
+    observation = replace(identified.observations[0], tags=replace(TAGS, site=SITE))
+    result = localize(recording, [observation, observation])
     assert result.heading_corrections == ()
     assert len(result.trajectories) == 1
