@@ -134,7 +134,7 @@ def _name_designs(tags: Tags | Mapping[str, Tags] | None) -> Mapping[str | None,
     """Return the designs by name; a single design has none."""
     if tags is None:
         return {}
-    return {None: tags} if isinstance(tags, Tags) else {**tags}
+    return {None: tags} if isinstance(tags, Tags) else dict(tags.items())
 
 
 @dataclass(frozen=True)
@@ -221,9 +221,11 @@ def _identify_passes(
     """
 
     def identify(part: PassRange) -> IdentifiedPass | None:
-        # The magnets of each design are expected in turn, until a tag of any design is read.
+        # The magnets of each design are expected in turn, until a tag of any design is read. A
+        # design of few magnets limits the number of sources.
+        expected = sorted(designs, key=lambda tags: -tags.magnets)
         hypotheses = chain.from_iterable(
-            detect_magnets(preprocessed, part, tags, path_m) for tags in designs or (None,)
+            detect_magnets(preprocessed, part, tags, path_m) for tags in expected or (None,)
         )
         return identify_pass(hypotheses, preprocessed.samples, designs)
 

@@ -206,9 +206,14 @@ class IdentifiedPass:
     observations: tuple[TagObservation, ...]
 
     @property
+    def tag_count(self) -> int:
+        """Number of observations that have an id."""
+        return sum(each.tag_id is not None for each in self.observations)
+
+    @property
     def is_identified(self) -> bool:
         """Whether an observation has an id."""
-        return any(each.tag_id is not None for each in self.observations)
+        return self.tag_count > 0
 
 
 def identify_pass(
@@ -240,7 +245,9 @@ def identify_pass(
             magnets.is_path_estimated
             and magnets.robust_residual_sigma < TYPICAL_ROBUST_RESIDUAL_SIGMAS
         )
-        if is_explained and (not designs or result.is_identified):
+        # The magnets of a tag of another design do not depend on the initial guess.
+        is_other = len(designs) == 1 and result.observations[0].refused == "other_design"
+        if is_explained and (not designs or result.is_identified or is_other):
             return result
         tried.append(result)
         on_grid = _identify_on_grid(hypothesis, result, samples, designs)
@@ -250,7 +257,7 @@ def identify_pass(
         return None
     limit = MAX_EQUIVALENT_RESIDUAL_RATIO * min(each.magnets.residual_sigma for each in tried)
     equivalent = [each for each in tried if each.magnets.residual_sigma <= limit]
-    return min(equivalent, key=lambda each: (not each.is_identified, each.magnets.residual_sigma))
+    return max(equivalent, key=lambda each: (each.tag_count, -each.magnets.residual_sigma))
 
 
 def _identify_on_grid(

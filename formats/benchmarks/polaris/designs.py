@@ -9,8 +9,9 @@ field and the counts of an MLX90393.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,10 @@ from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.codec import capacity, layout_of
 from locatk.core.polaris.simulation.field import Discs, disc_field
 from locatk.core.polaris.simulation.floor import to_site_frame
+from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import Magnet, PlanarPose, Tags, cell_positions, symbol_angles
+from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.timing import FIRST_SEED
 
 Array = NDArray[np.float64]
 Random = np.random.Generator
@@ -33,7 +37,12 @@ DESIGNS = tuple(
 )  # fmt: skip
 """Designs that are on the floor, or given, or both."""
 
-PASSES = 120
+PASSES = {
+    "part of a larger tag": 100,
+    "another spacing": 40,
+    "the given design": 40,
+    "two tags in a pass": 40,
+}
 """Number of passes of each kind."""
 
 SENSORS, SENSOR_SPACING_M, RATE_HZ = 9, 0.020, 100.0
@@ -123,3 +132,58 @@ def random_tag(
     tag_id = int.from_bytes(rng.bytes(16), "little") % capacity(tags)
     lateral = rng.uniform(-max_lateral_m, max_lateral_m)
     return PlacedTag(tags, tag_id, PlanarPose(x_m, lateral, rng.uniform(0, math.tau)))
+
+
+# ---- figures
+
+
+def design_figures() -> list[Figure]:
+    """Return all figures of passes over tags of other designs, and of several designs."""
+    figures = []
+    for number, (kind, count) in enumerate(PASSES.items()):
+        first_seed = FIRST_SEED + 9000 + 200 * number
+        results = [pass_result(kind, first_seed + k) for k in range(count)]
+        wrong = sum(bool(read - present) for read, present, _ in results)
+        reasons = Counter(reason for *_, refused in results for reason in set(refused))
+        how = f"{count} passes, random ids, headings and heights of 8 to 15 mm; refused: " + (
+            ", ".join(f"{times} {reason}" for reason, times in reasons.most_common()) or "none"
+        )
+        figures.append(Figure(f"{kind}: wrong ids", wrong, "passes", how, 0.0))
+        if results[0][1]:
+            read = sum(present <= read for read, present, _ in results)
+            figures.append(
+                Figure(f"{kind}: all read", 100 * read / count, "%", how, better="higher")
+            )
+    return figures
+
+
+def pass_result(kind: str, seed: int) -> tuple[set[int], set[int], list[str]]:
+    """Simulate and solve a pass; return the ids read, those of the given design, and reasons."""
+    rng = np.random.default_rng(seed)
+    clearance_m = rng.uniform(0.008, 0.015)
+    given = DESIGNS[int(rng.integers(len(DESIGNS)))]
+    if kind == "part of a larger tag":
+        given = DESIGNS[0]
+        placed = [random_tag(DESIGNS[1 + seed % 3], rng, max_lateral_m=0.06)]
+        # Most headings at which a grid of five cells fits under the bar are quarter turns.
+        if seed % 2:
+            heading = math.pi / 2 * rng.integers(4) + 0.05 * rng.normal()
+            placed = [replace(placed[0], pose=replace(placed[0].pose, heading_rad=heading))]
+    elif kind == "another spacing":
+        factor = 1 + rng.choice([-1, 1]) * rng.uniform(0.05, 0.12)
+        other = replace(given, spacing_m=given.spacing_m * factor)
+        placed = [random_tag(other, rng)]
+    elif kind == "two tags in a pass":
+        first = random_tag(given, rng, max_lateral_m=0.01)
+        width_m = math.sqrt(2) * (given.order - 1) * given.spacing_m
+        second = random_tag(given, rng, max_lateral_m=0.01, x_m=width_m + rng.uniform(0.06, 0.12))
+        placed = [first, second]
+    else:
+        placed = [random_tag(given, rng)]
+    samples = record_pass(placed, rng, clearance_m=clearance_m, screws=seed % 3)
+    detections = solve([samples], given, SolveOptions()).detections
+    return (
+        {each.tag_id for each in detections if each.tag_id is not None},
+        {each.tag_id for each in placed if each.tags is given},
+        [each.refused for each in detections if each.refused],
+    )

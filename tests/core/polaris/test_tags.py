@@ -286,6 +286,148 @@ def test_two_tags_side_by_side(world: Any) -> None:
         assert item.match.y_m == pytest.approx(tag.y, abs=1e-6)
 
 
+LARGE = Tags(order=4, magnets=8)
+LARGE_CELLS = ((0, 0), (2, 1), (0, 2), (1, 2), (2, 2), (0, 3), (3, 3), (3, 1))
+"""A tag of 4 x 4 whose first three columns and rows 0 to 2 hold a tag of 3 x 3: all but its
+corner (2, 2) are also in one of ``SMALL_CELLS``."""
+LARGE_SYMBOLS = (0, 3, 5, 2, 6, 1, 4, 7)
+
+
+def large_tag(world: Any, **more: Any) -> Any:
+    return world.Tag(LARGE_CELLS, LARGE_SYMBOLS, order=4, **more)
+
+
+def large_id() -> int:
+    order = sorted(range(8), key=lambda k: LARGE_CELLS[k][::-1])
+    cells, symbols = (tuple(each[k] for k in order) for each in (LARGE_CELLS, LARGE_SYMBOLS))
+    return codec.id_of(LARGE, TagLayout(cells, symbols))
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.4, 2.0])
+def test_a_part_of_a_larger_tag_is_no_tag(heading: float, world: Any) -> None:
+    """Five magnets of it are a perfect tag of 3 x 3, and three continue its grid."""
+    magnets = detected_magnets(large_tag(world, heading=heading), is_path_estimated=True)
+    part = detected_magnets(large_tag(world, heading=heading), keep=[0, 1, 2, 3, 4])
+    assert one(identify_tags(part, recording(0.28), [TAGS])).tag_id is not None
+    result = one(identify_tags(magnets, recording(0.28), [TAGS]))
+    assert (result.tag_id, result.refused) == (None, "other_design")
+    detection = result.detection("bar", np.arange(400, dtype=np.int64))
+    assert len(detection.magnets) == 8
+
+
+@pytest.mark.parametrize(
+    ("moment", "is_read"), [(1.0, False), (0.7, False), (1.6, False), (0.4, True), (2.5, True)]
+)
+def test_a_source_on_the_grid_counts_if_it_is_as_strong_as_the_magnets(
+    moment: float, is_read: bool, world: Any
+) -> None:
+    screw = world.Tag(((0, 0),), (0,), x=-0.08, y=0.0, order=1)
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS), screw)
+    strength = np.r_[np.full(5, 1.8e-3), moment * 1.8e-3]
+    result = one(identify_tags(replace(magnets, moment_am2=strength), recording(), [TAGS]))
+    assert (result.tag_id is not None) is is_read
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "is_read"),
+    [
+        (-0.065, 0.01, True),  # Beside the tag, not on its grid.
+        (0.02, 0.012, True),  # A single one in it.
+        (0.02, 0.02, False),  # On the grid of half the spacing.
+        (-0.04, 0.04, False),  # Corner v4, which no tag occupies.
+        (-0.32, 0.0, True),  # On the grid, but far away.
+    ],
+)
+def test_a_magnet_beside_a_tag_is_reported(x: float, y: float, is_read: bool, world: Any) -> None:
+    stray = world.Tag(((0, 0),), (2,), x=x, y=y, order=1)
+    cells, symbols = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2)), SYMBOLS
+    magnets = detected_magnets(world.Tag(cells, symbols), stray)
+    result = one(identify_tags(magnets, recording(), [TAGS]))
+    assert (result.tag_id is not None) is is_read
+    if is_read:
+        (other,) = result.detection("bar", np.arange(400, dtype=np.int64)).other_magnets
+        assert (other.x_m, other.y_m) == pytest.approx((x, y))
+        assert other.moment_am2 == pytest.approx(1.8e-3)
+    else:
+        assert result.refused in ("other_design", "too_many_magnets")
+
+
+def test_several_strong_magnets_within_the_grid(world: Any) -> None:
+    strays = [world.Tag(((0, 0),), (2,), x=0.012, y=y, order=1) for y in (0.03, -0.03)]
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS), *strays)
+    assert one(identify_tags(magnets, recording(), [TAGS])).refused == "other_design"
+
+
+@pytest.mark.parametrize("designs", [[TAGS, LARGE], [LARGE, TAGS]])
+def test_the_design_that_explains_all_magnets_is_chosen(designs: list[Tags], world: Any) -> None:
+    for tag, tags, tag_id in (
+        (large_tag(world), LARGE, large_id()),
+        (world.Tag(CELLS, SYMBOLS), TAGS, id_of()),
+    ):
+        result = one(identify_tags(detected_magnets(tag), recording(), designs))
+        assert (result.tag_id, result.tags is tags) == (tag_id, True)
+
+
+def test_tags_of_two_designs_in_a_pass_are_in_order_of_time(world: Any) -> None:
+    """The larger one is matched first, and passed last."""
+    placed = [world.Tag(CELLS, SYMBOLS, x=-0.12, heading=0.3), large_tag(world, x=0.12)]
+    magnets = detected_magnets(*placed)
+    expected = [(id_of(), TAGS), (large_id(), LARGE)]
+    result = identify_tags(magnets, recording(), [TAGS, LARGE])
+    assert [(each.tag_id, each.tags) for each in result] == expected
+    backward = replace(magnets, path_m=-magnets.path_m)
+    result = identify_tags(backward, recording(), [TAGS, LARGE])
+    assert [(each.tag_id, each.tags) for each in result] == expected[::-1]
+
+
+def test_two_designs_that_fit_are_ambiguous(world: Any) -> None:
+    """Every tag of 8 orientations is one of 16, too; families tell them apart."""
+    fine = replace(TAGS, orientations=16)
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS))
+    result = one(identify_tags(magnets, recording(), [TAGS, fine]))
+    assert (result.tag_id, result.refused) == (None, "ambiguous")
+    family = replace(TAGS, ids=(id_of(OTHER),))
+    result = one(identify_tags(magnets, recording(), [family, fine]))
+    assert (result.tags, result.refused) == (fine, "")
+
+
+@pytest.mark.parametrize(
+    ("spacing", "moment", "height", "refused"),
+    [
+        (0.040, 1.0, 1.0, ""),
+        (0.0404, 0.55, 1.18, ""),  # The published recordings.
+        (0.037, 1.0, 1.0, "other_design"),
+        (0.043, 1.0, 1.0, "other_design"),
+        (0.040, 4.5, 1.0, "other_design"),
+        (0.040, 0.25, 1.0, "other_design"),
+        (0.040, 1.0, 2.2, "other_design"),
+        (0.040, 1.0, 0.4, "other_design"),
+    ],
+)
+def test_spacing_moment_and_height_are_those_of_the_design(
+    spacing: float, moment: float, height: float, refused: str, world: Any
+) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, spacing=spacing, heading=0.5)
+    magnets = detected_magnets(
+        tag,
+        is_path_estimated=True,
+        moment_am2=np.full(5, moment * TAGS.magnet.moment),
+        height_m=height * TAGS.clearance_m,
+    )
+    assert one(identify_tags(magnets, recording(), [TAGS])).refused == refused
+
+
+def test_an_unreadable_tag_beside_a_read_one_is_reported(world: Any) -> None:
+    """On the same lattice, as if both were parts of one tag: both are complete."""
+    family = replace(TAGS, ids=(id_of(),))
+    placed = [world.Tag(CELLS, SYMBOLS, x=-0.06), world.Tag(CELLS, OTHER, x=0.06)]
+    result = identify_tags(detected_magnets(*placed), recording(), [family])
+    assert [(each.tag_id, each.refused) for each in result] == [
+        (id_of(), ""),
+        (None, "not_in_family"),
+    ]
+
+
 def test_a_tag_and_what_is_left_of_another(world: Any) -> None:
     tags = [
         world.Tag(CELLS, SYMBOLS, x=-0.1, heading=0.2),
