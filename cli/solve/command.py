@@ -104,6 +104,12 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
         "--camera",
         help="Dots: camera (.toml) to use instead of the session's.",
     ),
+    options.input_option(
+        "--tag",
+        many=True,
+        help="Polaris: tags (.toml) to use instead of the session's; several times if the site has "
+        "tags of several designs.",
+    ),
     scene_option,
     speed_option,
     templates_option,
@@ -150,6 +156,7 @@ def command(
     scene: str | None,
     artifact: Path | None,
     camera: Path | None,
+    tag: tuple[Path, ...],
     speed: float | None,
     templates: str | None,
     odometry_noise: float | None,
@@ -182,6 +189,7 @@ def command(
       locatk solve "s3://lab/*.mcap" -o s3://lab/out --scheduler tcp://host:8786
       locatk solve frames.mcap -o solved.mcap --camera camera.toml
       locatk solve pass.mcap -o solved.mcap --artifact tag.toml --speed 0.105
+      locatk solve pass.mcap --tag small.toml --tag large.toml
       locatk solve pass.mcap --speed 0.105 --method paper --templates 72,9,80
       locatk solve drive.mcap -o solved.mcap --artifact map.toml --method field
     """
@@ -197,9 +205,17 @@ def command(
     names = found.sessions
     if save_scene is not None:
         _check_scene(names)
-    input_files = [path for path in (artifact, camera) if path is not None]
+    input_files = [path for path in (artifact, camera, *tag) if path is not None]
     request = pipeline.SolveRequest(
-        method, scene, artifact, camera, speed, templates, odometry_noise, odometry_lag
+        method,
+        scene,
+        artifact,
+        camera,
+        speed,
+        templates,
+        tag=tag or None,
+        odometry_noise=odometry_noise,
+        odometry_lag=odometry_lag,
     )
     try:
         outputs = pipeline.plan_outputs(names, output, is_folder=found.has_folder)

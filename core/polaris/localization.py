@@ -13,7 +13,7 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.identification.tags import TagObservation
 from locatk.core.polaris.results import HeadingCorrection
-from locatk.core.polaris.tag import PlanarPose, Tags
+from locatk.core.polaris.tag import PlanarPose
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -57,7 +57,6 @@ class Localization:
 def localize(
     samples: Samples,
     observations: Sequence[TagObservation],
-    tags: Tags | None,
     odometry: Trajectory | None = None,
 ) -> Localization:
     """Estimate the poses of an array while it was over identified tags.
@@ -69,20 +68,23 @@ def localize(
     samples : Samples
     observations : sequence of TagObservation
         Identified tags in order of time.
-    tags : Tags or None
     odometry : Trajectory, optional
         It fills the gaps between tags.
     """
-    if tags is None or not observations:
+    if not observations:
         return Localization()
-    first_id = observations[0].tag_id
-    frame, site = "site", tags.site
-    if not site and first_id is not None:
-        frame, site = f"tag-{first_id}", {first_id: PlanarPose(0.0, 0.0, 0.0)}
+    first = observations[0]
+    frame = "site"
+    if not any(each.tags is not None and each.tags.site for each in observations):
+        frame = f"tag-{first.tag_id}"
     parts, warnings = [], []
     for observation in observations:
-        if observation.tag_id is not None and observation.tag_id in site:
-            parts.append(_poses_over_tag(samples, observation, site[observation.tag_id]))
+        site_pose = observation.site_pose
+        is_first = observation.tags is first.tags and observation.tag_id == first.tag_id
+        if frame != "site" and is_first:
+            site_pose = PlanarPose(0.0, 0.0, 0.0)
+        if site_pose is not None:
+            parts.append(_poses_over_tag(samples, observation, site_pose))
         else:
             location = "on the site" if frame == "site" else f"in the frame of {frame}"
             message = f"tag {observation.tag_id} has no position {location}"
@@ -92,7 +94,7 @@ def localize(
     poses = _concatenate(samples.device, frame, parts)
     if odometry is not None:
         poses = _fill_gaps(poses, odometry)
-    corrections = _heading_corrections(samples, observations, tags)
+    corrections = _heading_corrections(samples, observations)
     return Localization((poses,), corrections, tuple(warnings))
 
 
@@ -127,8 +129,9 @@ def _poses_over_tag(
     magnets, match = observation.magnets, observation.match
     if match is None:
         raise ValueError("an identified tag has a match")
-    is_over = magnets.path_m >= magnets.position_m[:, 0].min() - POSE_MARGIN_M
-    is_over &= magnets.path_m <= magnets.position_m[:, 0].max() + POSE_MARGIN_M
+    along = magnets.position_m[list(match.magnets), 0]
+    is_over = magnets.path_m >= along.min() - POSE_MARGIN_M
+    is_over &= magnets.path_m <= along.max() + POSE_MARGIN_M
     is_over &= np.nan_to_num(magnets.path_sigma_m) < MAX_PATH_SIGMA_M
     path = magnets.path_m[is_over]
     n = len(path)
@@ -237,7 +240,7 @@ def _poses_in_gap(
 
 
 def _heading_corrections(
-    samples: Samples, observations: Sequence[TagObservation], tags: Tags
+    samples: Samples, observations: Sequence[TagObservation]
 ) -> tuple[HeadingCorrection, ...]:
     """Return the rotations that point the robot from each tag to the next one.
 
@@ -245,14 +248,15 @@ def _heading_corrections(
     8.3.7).
     """
     on_site = [
-        (o, o.tag_id) for o in observations if o.tag_id is not None and o.tag_id in tags.site
+        (observation, observation.tag_id, observation.site_pose)
+        for observation in observations
+        if observation.tag_id is not None and observation.site_pose is not None
     ]
     corrections = []
-    for (observation, from_tag), (_, to_tag) in itertools.pairwise(on_site):
-        if from_tag == to_tag:
+    for (observation, from_tag, tag_pose), (_, to_tag, target) in itertools.pairwise(on_site):
+        if tag_pose == target:
             continue
-        poses = _poses_over_tag(samples, observation, tags.site[from_tag])
-        target = tags.site[to_tag]
+        poses = _poses_over_tag(samples, observation, tag_pose)
         offset = np.array([target.x_m, target.y_m]) - poses.position[-1, :2]
         distance = float(np.hypot(*offset))
         if distance == 0:

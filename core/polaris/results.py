@@ -43,6 +43,25 @@ class MagnetDetection:
 
 
 @dataclass(frozen=True)
+class OtherMagnet:
+    """Magnet that belongs to no tag, in the frame of the array at the time of a detection.
+
+    Attributes
+    ----------
+    x_m, y_m : float
+    angle_rad : float
+        Direction of the moment, counter-clockwise from x.
+    moment_am2 : float
+        Magnitude of the moment, comparable with that of the tag's magnets.
+    """
+
+    x_m: float
+    y_m: float
+    angle_rad: float
+    moment_am2: float
+
+
+@dataclass(frozen=True)
 class TagDetection:
     """Tag that the array passed over, or magnets that may be one.
 
@@ -80,7 +99,11 @@ class TagDetection:
         Steps between the observed orientations and those of the id, and magnets of the id that
         were not observed; None if no grid fits.
     other_sources : int
-        Sources in the pass that are no magnets of a tag (iron, screws).
+        Sources in the pass that are much weaker than magnets (iron, screws).
+    other_magnets : tuple of OtherMagnet
+        Magnets of the pass that belong to no tag and are nearest to this one.
+    design : str or None
+        Name of the tag's design if several were given.
     """
 
     time_s: float
@@ -103,6 +126,8 @@ class TagDetection:
     corrected: int | None
     erased: int | None
     other_sources: int
+    other_magnets: tuple[OtherMagnet, ...] = ()
+    design: str | None = None
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.magnets import detect_magnets
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
+    TagObservation,
     identify_pass,
     identify_tags,
     may_be_one_tag,
@@ -73,7 +75,7 @@ class SolveOptions:
 
 def solve(
     samples: Sequence[Samples],
-    tags: Tags | None = None,
+    tags: Tags | Mapping[str, Tags] | None = None,
     options: SolveOptions | None = None,
     *,
     odometry: Sequence[Trajectory] = (),
@@ -84,9 +86,9 @@ def solve(
     ----------
     samples : sequence of Samples
         One per device.
-    tags : Tags or None
-        Design of the tags, and their positions on the site. Without it, magnets are detected but
-        not identified.
+    tags : Tags, mapping of str to Tags, or None
+        Design of the tags, and their positions on the site; several designs by name. Without it,
+        magnets are detected but not identified.
     options : SolveOptions, optional
     odometry : sequence of Trajectory
         At most one per device, selected by its name. It measures the path, and joins the poses
@@ -100,22 +102,39 @@ def solve(
     Raises
     ------
     InputError
-        A recording is empty or too short, or the method needs a speed or the tags.
+        A recording is empty or too short, the method needs a speed or the tags, or supports only
+        one design.
     """
     options = options or SolveOptions()
-    results = [_solve_array(recording, tags, options, odometry) for recording in samples]
+    designs = _name_designs(tags)
+    if options.method == "paper" and len(designs) > 1:
+        raise InputError(
+            "the published algorithm supports only one design of tags",
+            hint="Give one --tag, or leave out --method paper",
+        )
+    results = [_solve_array(recording, designs, options, odometry) for recording in samples]
+    detections = tuple(d for each in results for d in each.detections)
+    read = {d.design for d in detections if d.tag_id is not None} or set(designs)
     return Solution(
         system="polaris",
         method=options.method,
         trajectories=tuple(t for each in results for t in each.localization.trajectories),
         rejected=add_counts(*(each.rejected for each in results)),
-        detections=tuple(d for each in results for d in each.detections),
-        artifact=tags,
+        detections=detections,
+        # Ids of another design have no meaning in a design.
+        artifact=designs[read.pop()] if len(read) == 1 else None,
         warnings=tuple(w for each in results for w in each.warnings),
         facts=PolarisFacts(
             tuple(c for each in results for c in each.localization.heading_corrections)
         ),
     )
+
+
+def _name_designs(tags: Tags | Mapping[str, Tags] | None) -> Mapping[str | None, Tags]:
+    """Return the designs by name; a single design has none."""
+    if tags is None:
+        return {}
+    return {None: tags} if isinstance(tags, Tags) else dict(tags.items())
 
 
 @dataclass(frozen=True)
@@ -129,34 +148,55 @@ class _ArrayResult:
 
 
 def _solve_array(
-    recording: Samples, tags: Tags | None, options: SolveOptions, odometry: Sequence[Trajectory]
+    recording: Samples,
+    named_designs: Mapping[str | None, Tags],
+    options: SolveOptions,
+    odometry: Sequence[Trajectory],
 ) -> _ArrayResult:
     """Preprocess, detect, identify and localize for one array."""
+    designs = tuple(named_designs.values())
     driven = next((t for t in odometry if t.device == recording.device), None)
     preprocessed = preprocess(recording)
     recording = preprocessed.samples
     rejected: Counter[str] = Counter()
     if options.method == "paper":
-        passes = _identify_published(recording, tags, options)
+        passes = _identify_published(recording, designs, options)
     else:
         path_m = _known_path(recording, options.speed_mps, driven)
-        passes, unexplained = _identify_passes(preprocessed, tags, path_m)
+        passes, unexplained = _identify_passes(preprocessed, designs, path_m)
         rejected["no_magnets"] = unexplained
     observations = [each for part in passes for each in part.observations]
     rejected.update(each.refused for each in observations if each.refused)
     identified = [each for each in observations if each.tag_id is not None]
-    localization = localize(recording, identified, tags, driven)
+    localization = localize(recording, identified, driven)
+    names = {id(tags): name for name, tags in named_designs.items()}
     of_passes = dict.fromkeys(w for each in observations for w in each.magnets.warnings)
     return _ArrayResult(
         localization,
-        [each.detection(recording.device, recording.time_ns) for each in observations],
+        [
+            each.detection(recording.device, recording.time_ns, names.get(id(each.tags)))
+            for each in observations
+        ],
         rejected,
         [
             *preprocessed.warnings,
             *localization.warnings,
             *(warning.about(recording.device) for warning in of_passes),
+            *_other_magnets(recording.device, observations),
         ],
     )
+
+
+def _other_magnets(device: str, observations: Sequence[TagObservation]) -> list[SolverWarning]:
+    """Report the strong magnets beside tags that were read."""
+    return [
+        SolverWarning(
+            "other_magnets",
+            f"{len(each.unexplained)} further magnets near tag {each.tag_id} belong to no tag",
+        ).about(device)
+        for each in observations
+        if each.tag_id is not None and each.unexplained
+    ]
 
 
 def _known_path(
@@ -169,7 +209,7 @@ def _known_path(
 
 
 def _identify_passes(
-    preprocessed: PreprocessedSamples, tags: Tags | None, path_m: Array | None
+    preprocessed: PreprocessedSamples, designs: Sequence[Tags], path_m: Array | None
 ) -> tuple[list[IdentifiedPass], int]:
     """Detect and identify the tags of all passes, in order of time.
 
@@ -181,8 +221,13 @@ def _identify_passes(
     """
 
     def identify(part: PassRange) -> IdentifiedPass | None:
-        hypotheses = detect_magnets(preprocessed, part, tags, path_m)
-        return identify_pass(hypotheses, preprocessed.samples, tags)
+        # The magnets of each design are expected in turn, until a tag of any design is read. A
+        # design of few magnets limits the number of sources.
+        expected = sorted(designs, key=lambda tags: -tags.magnets)
+        hypotheses = chain.from_iterable(
+            detect_magnets(preprocessed, part, tags, path_m) for tags in expected or (None,)
+        )
+        return identify_pass(hypotheses, preprocessed.samples, designs)
 
     passes: list[IdentifiedPass] = []
     unexplained = 0
@@ -191,7 +236,7 @@ def _identify_passes(
         if current is None:
             unexplained += 1
             continue
-        if passes and tags is not None and may_be_one_tag(passes[-1], current, tags):
+        if passes and any(may_be_one_tag(passes[-1], current, tags) for tags in designs):
             merged = identify(PassRange(passes[-1].magnets.first, current.magnets.stop))
             if merged is not None and merged.is_identified:
                 passes[-1] = merged
@@ -201,13 +246,15 @@ def _identify_passes(
 
 
 def _identify_published(
-    recording: Samples, tags: Tags | None, options: SolveOptions
+    recording: Samples, designs: Sequence[Tags], options: SolveOptions
 ) -> list[IdentifiedPass]:
     """Detect the magnets of all passes by the published algorithm, and identify the tags."""
-    if tags is None:
+    if not designs:
         raise InputError(
             "the published algorithm needs the tag",
             hint="Give it as --artifact, or import with --tag",
         )
-    passes = published.detect_magnets(recording, tags, options.speed_mps, options.templates)
-    return [IdentifiedPass(magnets, identify_tags(magnets, recording, tags)) for magnets in passes]
+    passes = published.detect_magnets(recording, designs[0], options.speed_mps, options.templates)
+    return [
+        IdentifiedPass(magnets, identify_tags(magnets, recording, designs)) for magnets in passes
+    ]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -225,6 +226,33 @@ TAGS: Artifact[Tags] = Artifact(
 
 dumps_tags, loads_tags, attached_tags = TAGS.dumps, TAGS.loads, TAGS.attached
 write_tags, read_tags = TAGS.write, TAGS.read
+
+
+def read_designs(paths: Sequence[Path]) -> dict[str, Tags]:
+    """Read several designs of tags, by the names of their files.
+
+    Raises
+    ------
+    ArtifactError
+        A file is damaged.
+    InputError
+        Two files have the same name, or the same tags.
+    """
+    designs: dict[str, Tags] = {}
+    for path in paths:
+        tags = read_tags(path)
+        if path.name in designs:
+            raise InputError(
+                f"two designs of tags are named {path.name}",
+                file=path,
+                hint="Rename one: the results refer to designs by the names of their files",
+            )
+        text = dumps_tags(tags)
+        twin = next((name for name, other in designs.items() if dumps_tags(other) == text), None)
+        if twin is not None:
+            raise InputError(f"the same tags as in {twin}", file=path, hint="Give each design once")
+        designs[path.name] = tags
+    return designs
 
 
 # ---- arrays

@@ -14,6 +14,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from locatk.core.errors import LocatkError
 from locatk.core.solution import Solution
@@ -55,11 +56,16 @@ def options_digest(request: SolveRequest) -> str:
     LocatkError
         A file cannot be read.
     """
-    values = {
-        name: hashlib.sha256(read_bytes(value)).hexdigest() if isinstance(value, Path) else value
-        for name, value in asdict(request).items()
-        if value is not None
-    }
+
+    def digest(value: Any) -> Any:
+        if isinstance(value, Path):
+            return hashlib.sha256(read_bytes(value)).hexdigest()
+        # Results refer to one of several files by its name.
+        if isinstance(value, tuple):
+            return [(part.name, digest(part)) for part in value]
+        return value
+
+    values = {name: digest(value) for name, value in asdict(request).items() if value is not None}
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
@@ -70,10 +76,12 @@ def command_line(session: str, request: SolveRequest) -> str:
     """
     words = ["locatk", "solve", session]
     for name, value in asdict(request).items():
-        if value is not None:
+        if value is None:
+            continue
+        for part in value if isinstance(value, tuple) else (value,):
             words += [
                 f"--{name.replace('_', '-')}",
-                value.name if isinstance(value, Path) else str(value),
+                part.name if isinstance(part, Path) else str(part),
             ]
     return shlex.join(words)
 

@@ -20,6 +20,7 @@ from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.published.templates import TemplateGrid
+from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution, SolverWarning
 from locatk.formats.artifacts import maps, scene, sheets, tags
 from locatk.formats.artifacts.registry import ARTIFACTS
@@ -48,6 +49,8 @@ class SolveRequest:
         Polaris: speed of the array over the tags [m/s].
     templates : str, optional
         Polaris, method ``paper``: resolution of the templates, as in ``"36,5,80"``.
+    tag : tuple of Path, optional
+        Polaris: designs of the tags on a site, instead of the one in the session.
     odometry_noise : float, optional
         Landmarks: random walk of the heading by odometry [deg/sqrt(m)].
     odometry_lag : float, optional
@@ -60,6 +63,7 @@ class SolveRequest:
     camera: Path | None = None
     speed: float | None = None
     templates: str | None = None
+    tag: tuple[Path, ...] | None = None
     odometry_noise: float | None = None
     odometry_lag: float | None = None
 
@@ -191,11 +195,7 @@ def _prepare_dots(session: Session, request: SolveRequest) -> Callable[[], Solut
 
 def _prepare_polaris(session: Session, request: SolveRequest) -> Callable[[], Solution]:
     """Read magnetometer samples, tags and odometry."""
-    known = (
-        observations.read_tags(session)
-        if request.artifact is None
-        else tags.read_tags(request.artifact)
-    )
+    known = _read_designs(session, request)
     samples = observations.read_magnetometers(session)
     odometry = observations.read_odometry(session)
     grid = None
@@ -205,6 +205,16 @@ def _prepare_polaris(session: Session, request: SolveRequest) -> Callable[[], So
         polaris.SolveOptions, method=request.method, speed_mps=request.speed, templates=grid
     )
     return lambda: polaris.solve(samples, known, options, odometry=odometry)
+
+
+def _read_designs(session: Session, request: SolveRequest) -> Tags | dict[str, Tags] | None:
+    """Read the designs of the tags, by the names of their files if there are several."""
+    paths = request.tag or ()
+    if request.artifact is not None:
+        paths = (request.artifact, *paths)
+    if len(paths) > 1:
+        return tags.read_designs(paths)
+    return tags.read_tags(paths[0]) if paths else observations.read_tags(session)
 
 
 def _prepare_landmarks(session: Session, request: SolveRequest) -> Callable[[], Solution]:
@@ -251,7 +261,7 @@ SYSTEMS: dict[str, Solver] = {
             estimates_scene=True,
         ),
         System("dots", ("lattice", "paper"), ("camera",), _prepare_dots),
-        System("polaris", ("joint", "paper"), ("speed", "templates"), _prepare_polaris),
+        System("polaris", ("joint", "paper"), ("tag", "speed", "templates"), _prepare_polaris),
         System(
             "landmarks", ("field", "paper"), ("odometry_noise", "odometry_lag"), _prepare_landmarks
         ),
@@ -324,3 +334,5 @@ def check_artifacts(request: SolveRequest) -> None:
             entry.artifact.read(artifact)
     if request.camera is not None:
         sheets.read_camera(request.camera)
+    if request.tag is not None:
+        tags.read_designs(request.tag)

@@ -31,6 +31,10 @@ DEGREES_PER_RADIAN = math.degrees(1)
 # ---- tables
 
 
+OPTIONAL_COLUMNS = ("other magnets", "design", "refused")
+"""Columns that are omitted if they are empty."""
+
+
 def tag_table(
     detections: Sequence[TagDetection], limit: int | None = None, *, compact: bool = False
 ) -> Table:
@@ -51,7 +55,9 @@ def tag_table(
             "tag": "-" if detection.tag_id is None else str(detection.tag_id),
             "margin [steps]": format_value(detection.margin, 1, ".2f"),
             "magnets": str(len(detection.magnets)),
+            "other magnets": str(len(detection.other_magnets) or ""),
             **_pose_cells(detection, compact),
+            "design": detection.design or "",
             "refused": reason_text(detection.refused),
         }
 
@@ -84,13 +90,14 @@ def _table(
     rows: Sequence[Mapping[str, str]], limit: int | None = None, device_column: str = ""
 ) -> Table:
     """Return the first rows, without the column of devices if there is only one device, and
-    without that of refusals if it is empty."""
+    without :data:`OPTIONAL_COLUMNS` that are empty."""
     shown = rows[:limit]
     omitted_columns = set()
     if len({row.get(device_column) for row in rows}) < 2:
         omitted_columns.add(device_column)
-    if not any(row.get("refused") for row in shown):
-        omitted_columns.add("refused")
+    omitted_columns |= {
+        name for name in OPTIONAL_COLUMNS if not any(row.get(name) for row in shown)
+    }
     header = tuple(name for name in rows[0] if name not in omitted_columns) if rows else ()
     cells = [tuple(row[name] for name in header) for row in shown]
     return Table(header, cells, len(rows) - len(shown))

@@ -122,7 +122,7 @@ def match_tags(
     limits = (GOOD_MISFIT_SPACINGS, MAX_MISFIT_SPACINGS)
     # A complete tag is preferred: more magnets on cells may be those of two tags.
     attempts = [(tags.magnets, limit) for limit in limits]
-    attempts += [(count, limit) for limit in limits for count in counts if count > 2]
+    attempts += [(count, limit) for count in counts for limit in limits if count > 2]
     attempts += [(2, MAX_MISFIT_SPACINGS)]
     for count, limit in attempts:
         matches = [m for m in by_count.get(count, []) if m.misfit_m < limit * tags.spacing_m]
@@ -143,6 +143,39 @@ def refit_match(
     """Fit a match again, to positions (M, 2) of the magnets of the tag as it was built."""
     (refitted,) = _fit_grids(detected, tags, [(match.magnets, match.cells)], positions_m)
     return refitted
+
+
+def measure_spacing(detected: DetectedMagnets, tags: Tags, match: TagMatch) -> tuple[float, float]:
+    """Measure the spacing of a matched tag relative to its design, across the track.
+
+    The spacing of the sensors is the ruler. Along the track, the scale of the path is one.
+
+    Returns
+    -------
+    spacing, sigma : float
+        Relative to the design, and its standard deviation from the misfit of the magnets.
+    """
+    cells = cell_positions(tags, match.cells)
+    cos, sin = np.cos(match.heading_rad), np.sin(match.heading_rad)
+    rotated = cells @ np.array([[cos, sin], [-sin, cos]])
+    magnets = detected.position_m[list(match.magnets)]
+    if detected.is_path_estimated:
+        magnets = magnets * [match.scale, 1.0]
+    # Unknowns: x, y, a small rotation, and the scales along and across the track.
+    m = len(magnets)
+    design = np.zeros((m, 2, 5))
+    design[:, 0, 0] = design[:, 1, 1] = 1.0
+    design[:, 0, 2], design[:, 1, 2] = -rotated[:, 1], rotated[:, 0]
+    design[:, 0, 3], design[:, 1, 4] = rotated[:, 0], rotated[:, 1]
+    residual = (magnets - rotated - [match.x_m, match.y_m]).ravel()
+    matrix = design.reshape(2 * m, 5)
+    if 2 * m <= matrix.shape[1]:
+        return 1.0, np.inf
+    solution, *_ = np.linalg.lstsq(matrix, residual, rcond=None)
+    left = residual - matrix @ solution
+    variance = max(left @ left / (2 * m - 5), HAND_BUILT_SIGMA_M**2)
+    covariance = variance * np.linalg.pinv(matrix.T @ matrix)
+    return 1.0 + float(solution[4]), float(np.sqrt(covariance[4, 4]))
 
 
 def apply_scale(detected: DetectedMagnets, match: TagMatch) -> DetectedMagnets:

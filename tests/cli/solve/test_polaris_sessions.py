@@ -574,3 +574,43 @@ def test_tags_of_two_designs_are_not_mixed(locatk, solver: Solver, tmp_path: Pat
     assert result.exit_code == 3
     assert "other.mcap: the spacing of the tags differs from that of the first" in result.stderr
     assert tags.read_tags(tmp_path / "built.toml").built[ID].passes == 3
+
+
+# ---- several designs
+
+
+@pytest.mark.slow
+def test_a_pass_is_solved_by_the_design_of_its_tag(locatk, tmp_path: Path) -> None:
+    small, large, run = (tmp_path / name for name in ("small.toml", "large.toml", "run.mcap"))
+    tags.write_tags(small, replace(TAGS, spacing_m=0.03))
+    tags.write_tags(large, Tags(order=4, magnets=8, spacing_m=0.03))
+    simulated = locatk("simulate", "polaris", large, "-o", run, "--seed", 3)
+    assert simulated.exit_code == 0, simulated.stderr
+    out = tmp_path / "solved.mcap"
+    for files in ((small, large), (large, small)):
+        designs = [word for path in files for word in ("--tag", path)]
+        result = locatk("solve", run, *designs, "-o", out, "--overwrite", "--json")
+        assert result.exit_code == 0, result.stderr
+        (detection,) = json.loads(result.stdout)["sessions"][0]["detections"]
+        assert (detection["design"], len(detection["magnets"])) == ("large.toml", 8)
+        assert detection["other_magnets"] == []
+        solution = solutions.read_solution(out)
+        assert solution.artifact == tags.read_tags(large)
+        assert solution.detections[0].design == "large.toml"
+    wrong = locatk("solve", run, "--tag", small, "-o", out, "--overwrite", "--json")
+    assert wrong.exit_code == 3
+    (detection,) = json.loads(wrong.stdout)["sessions"][0]["detections"]
+    assert (detection["tag_id"], detection.get("design")) == (None, None)
+
+
+def test_designs_are_given_once(locatk, tmp_path: Path) -> None:
+    run, first, again = tmp_path / "run.mcap", tmp_path / "a.toml", tmp_path / "b.toml"
+    for path in (first, again):
+        tags.write_tags(path, TAGS)
+    args = ("import", "polaris-csv", published(tmp_path / "run.csv"), "--rate", 40)
+    assert locatk(*args, "--spacing", 20, "-o", run).exit_code == 0
+    result = locatk("solve", run, "--tag", first, "--tag", again)
+    assert result.exit_code == 1
+    assert "the same tags as in a.toml" in result.stderr
+    result = locatk("solve", run, "--tag", first, "--tag", first)
+    assert "two designs of tags are named a.toml" in result.stderr

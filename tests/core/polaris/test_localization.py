@@ -210,9 +210,29 @@ def test_the_same_tag_twice_in_a_row_has_no_correction(tour: tuple[Any, Samples]
     _, recording = tour
     preprocessed = preprocess(recording)
     part = find_passes(preprocessed.samples, preprocessed.noise_t)[0]
-    identified = identify_pass(detect_magnets(preprocessed, part, TAGS), recording, TAGS)
+    identified = identify_pass(detect_magnets(preprocessed, part, TAGS), recording, [TAGS])
     assert identified is not None
-    (observation,) = identified.observations
-    result = localize(recording, [observation, observation], replace(TAGS, site=SITE))
+    observation = replace(identified.observations[0], tags=replace(TAGS, site=SITE))
+    result = localize(recording, [observation, observation])
     assert result.heading_corrections == ()
     assert len(result.trajectories) == 1
+
+
+@pytest.mark.slow
+def test_poses_of_a_tag_are_over_its_own_magnets(world: Any) -> None:
+    """Two tags in one pass, their middles 0.15 m apart."""
+    x_m = (-0.075, 0.075)
+    tags = [world.Tag(CELLS, symbols, x=x) for x, symbols in zip(x_m, SYMBOLS[:2], strict=True)]
+    course = world.line(length=0.5)
+    recording = world.record(tags, course)
+    preprocessed = preprocess(recording)
+    (part,) = find_passes(preprocessed.samples, preprocessed.noise_t)
+    identified = identify_pass(detect_magnets(preprocessed, part, TAGS), recording, [TAGS])
+    assert identified is not None
+    assert [each.tag_id for each in identified.observations] == list(IDS[:2])
+    for observation, x in zip(identified.observations, x_m, strict=True):
+        (poses,) = localize(recording, [observation]).trajectories
+        driven, _, _ = course.at((poses.time_ns - world.start_ns) * 1e-9)
+        assert np.ptp(driven) == pytest.approx(0.14, abs=0.01)
+        assert np.mean(driven) == pytest.approx(x, abs=0.01)
+        assert poses.position[:, 0] == pytest.approx(driven - x, abs=1e-3)

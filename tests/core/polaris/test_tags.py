@@ -74,7 +74,7 @@ def one(result: tuple[TagObservation, ...]) -> TagObservation:
 @pytest.mark.parametrize("heading", [0.0, 1.0, -2.7])
 def test_reads(heading: float, world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, x=0.02, y=-0.01, heading=heading)
-    result = one(identify_tags(detected_magnets(tag), recording(), TAGS))
+    result = one(identify_tags(detected_magnets(tag), recording(), [TAGS]))
     assert (result.tag_id, result.refused) == (id_of(), "")
     said = result.detection("bar", recording().time_ns)
     assert said.tag_id == id_of()
@@ -91,18 +91,18 @@ def test_reads(heading: float, world: Any) -> None:
 def test_array_in_the_tags_frame(world: Any) -> None:
     """The bar stands 5 cm behind the tag and 1 cm to its right, and looks as it does."""
     tag = world.Tag(CELLS, SYMBOLS, x=0.05, y=0.01, heading=0.0)
-    pose = one(identify_tags(detected_magnets(tag), recording(), TAGS)).array_pose
+    pose = one(identify_tags(detected_magnets(tag), recording(), [TAGS])).array_pose
     assert pose is not None
     assert (pose.x_m, pose.y_m, pose.heading_rad) == pytest.approx((-0.05, -0.01, 0.0))
     # The same floor, looked at by a bar that is turned by a quarter to the left.
     tag = world.Tag(CELLS, SYMBOLS, x=0.01, y=-0.05, heading=-np.pi / 2)
-    pose = one(identify_tags(detected_magnets(tag), recording(), TAGS)).array_pose
+    pose = one(identify_tags(detected_magnets(tag), recording(), [TAGS])).array_pose
     assert pose is not None
     assert (pose.x_m, pose.y_m, pose.heading_rad) == pytest.approx((-0.05, -0.01, np.pi / 2))
 
 
 def test_no_tag_given(world: Any) -> None:
-    result = one(identify_tags(detected_magnets(world.Tag(CELLS, SYMBOLS)), recording(), None))
+    result = one(identify_tags(detected_magnets(world.Tag(CELLS, SYMBOLS)), recording(), []))
     assert result.refused == "no_tag_given"
     assert result.detection("bar", recording().time_ns).x_m is None
 
@@ -122,7 +122,7 @@ def test_magnets_missing_or_beyond_the_bar(
 ) -> None:
     result = one(
         identify_tags(
-            detected_magnets(world.Tag(CELLS, SYMBOLS, y=y), keep=keep), recording(), TAGS
+            detected_magnets(world.Tag(CELLS, SYMBOLS, y=y), keep=keep), recording(), [TAGS]
         )
     )
     assert (result.tag_id, result.refused) == (None, reason)
@@ -130,34 +130,34 @@ def test_magnets_missing_or_beyond_the_bar(
 
 def test_a_pass_that_reaches_the_recordings_end_is_partial(world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS)
-    result = one(identify_tags(detected_magnets(tag, keep=[0, 1, 2], first=0), recording(), TAGS))
+    result = one(identify_tags(detected_magnets(tag, keep=[0, 1, 2], first=0), recording(), [TAGS]))
     assert result.refused == "partial"
 
 
 def test_two_readings_of_the_same_magnets_are_ambiguous(world: Any) -> None:
     """Four magnets on all corners: which three are the position pattern's, none can say."""
     square = world.Tag(((0, 0), (0, 2), (2, 2), (2, 0)), (1, 3, 5, 7))
-    result = one(identify_tags(detected_magnets(square), recording(), replace(TAGS, magnets=4)))
+    result = one(identify_tags(detected_magnets(square), recording(), [replace(TAGS, magnets=4)]))
     assert result.tag_id is None
     extra = world.Tag((*CELLS, (2, 0)), (*SYMBOLS, 1))
     assert all(
-        item.tag_id is None for item in identify_tags(detected_magnets(extra), recording(), TAGS)
+        item.tag_id is None for item in identify_tags(detected_magnets(extra), recording(), [TAGS])
     )
 
 
 def test_not_in_the_family(world: Any) -> None:
     family = replace(TAGS, ids=(0, 100_000, id_of(OTHER)), min_distance=3)
-    result = one(identify_tags(detected_magnets(world.Tag(CELLS, SYMBOLS)), recording(), family))
+    result = one(identify_tags(detected_magnets(world.Tag(CELLS, SYMBOLS)), recording(), [family]))
     assert (result.tag_id, result.refused) == (None, "not_in_family")
     assert one(
-        identify_tags(detected_magnets(world.Tag(CELLS, OTHER)), recording(), family)
+        identify_tags(detected_magnets(world.Tag(CELLS, OTHER)), recording(), [family])
     ).tag_id == id_of(OTHER)
 
 
 def test_orientation_between_two_is_a_tie(world: Any) -> None:
     turned = np.array([0, 0, np.radians(22.5), 0, 0])
     tag = world.Tag(CELLS, SYMBOLS, turned=turned)
-    result = one(identify_tags(detected_magnets(tag), recording(), TAGS))
+    result = one(identify_tags(detected_magnets(tag), recording(), [TAGS]))
     assert (result.tag_id, result.refused) == (None, "tie")
 
 
@@ -165,7 +165,7 @@ def test_bad_residual_is_refused(world: Any) -> None:
     bad = detected_magnets(
         world.Tag(CELLS, SYMBOLS), residual_sigma=50.0, robust_residual_sigma=50.0
     )
-    result = one(identify_tags(bad, recording(), TAGS))
+    result = one(identify_tags(bad, recording(), [TAGS]))
     assert (result.tag_id, result.refused) == (None, "residual")
 
 
@@ -174,7 +174,7 @@ def test_either_residual_refuses(rms: float, usual: float, world: Any) -> None:
     bad = detected_magnets(
         world.Tag(CELLS, SYMBOLS), residual_sigma=rms, robust_residual_sigma=usual
     )
-    assert one(identify_tags(bad, recording(), TAGS)).refused == "residual"
+    assert one(identify_tags(bad, recording(), [TAGS])).refused == "residual"
 
 
 @pytest.mark.parametrize(("rms", "refused"), [(1.2, ""), (2.2, "residual")])
@@ -183,7 +183,9 @@ def test_a_doubtful_residual_needs_a_margin(rms: float, refused: str, world: Any
     tag = world.Tag(CELLS, SYMBOLS, turned=np.radians([0, 0, 17.0, 0, 0]))
     result = one(
         identify_tags(
-            detected_magnets(tag, residual_sigma=rms, robust_residual_sigma=1.0), recording(), TAGS
+            detected_magnets(tag, residual_sigma=rms, robust_residual_sigma=1.0),
+            recording(),
+            [TAGS],
         )
     )
     assert result.decoded is not None
@@ -197,7 +199,7 @@ def test_magnets_off_their_cells_are_refused(world: Any) -> None:
     rng = np.random.default_rng(1)
     tag = world.Tag(CELLS, SYMBOLS, moved=rng.choice([-6e-3, 6e-3], (5, 2)))
     assert all(
-        item.tag_id is None for item in identify_tags(detected_magnets(tag), recording(), TAGS)
+        item.tag_id is None for item in identify_tags(detected_magnets(tag), recording(), [TAGS])
     )
 
 
@@ -207,7 +209,7 @@ def test_a_path_of_another_scale_is_refused(world: Any) -> None:
     sighting = detected_magnets(world.Tag(CELLS, SYMBOLS), is_path_estimated=True)
     for scale, reason in ((0.96, ""), (0.87, "misfit"), (1.14, "misfit")):
         stretched = replace(sighting, position_m=sighting.position_m * [scale, 1.0])
-        assert one(identify_tags(stretched, recording(), TAGS)).refused == reason
+        assert one(identify_tags(stretched, recording(), [TAGS])).refused == reason
 
 
 @pytest.mark.parametrize("gone", range(8))
@@ -215,7 +217,7 @@ def test_redundant_tag_survives_a_missing_magnet(gone: int, world: Any) -> None:
     layout = codec.layout_of(REDUNDANT, 1234)
     tag = world.Tag(layout.cells, layout.symbols, heading=1.0)
     keep = [k for k in range(8) if k != gone]
-    result = one(identify_tags(detected_magnets(tag, keep=keep), recording(), REDUNDANT))
+    result = one(identify_tags(detected_magnets(tag, keep=keep), recording(), [REDUNDANT]))
     assert result.tag_id == 1234
     assert result.decoded is not None
     assert result.decoded.erased == 1
@@ -227,7 +229,7 @@ def test_redundant_tag_survives_a_misread_orientation_too(world: Any) -> None:
     turned[3] = np.radians(100)
     tag = world.Tag(layout.cells, layout.symbols, turned=turned)
     for keep in (list(range(8)), [0, 1, 3, 4, 5, 6, 7]):
-        result = one(identify_tags(detected_magnets(tag, keep=keep), recording(), REDUNDANT))
+        result = one(identify_tags(detected_magnets(tag, keep=keep), recording(), [REDUNDANT]))
         assert result.tag_id == 777
         assert result.decoded is not None
         assert result.decoded.corrected >= 1
@@ -245,7 +247,7 @@ def test_redundant_tag_beyond_its_code_is_refused(world: Any) -> None:
             identify_tags(
                 detected_magnets(world.Tag(layout.cells, layout.symbols, turned=turned)),
                 recording(),
-                REDUNDANT,
+                [REDUNDANT],
             )
         )
         assert result.refused or result.tag_id is not None
@@ -259,8 +261,8 @@ def test_as_built_angles_and_places_are_used(world: Any) -> None:
     moved = 1e-3 * np.array([[1.5, 0], [0, -1], [-1, 0.5], [0.5, 1], [-1, -0.5]])
     tag = world.Tag(CELLS, SYMBOLS, x=0.01, heading=0.7, turned=turned, moved=moved)
     built = replace(TAGS, built={id_of(): AsBuiltTag(moved, turned, 5)})
-    plain = one(identify_tags(detected_magnets(tag), recording(), TAGS))
-    known = one(identify_tags(detected_magnets(tag), recording(), built))
+    plain = one(identify_tags(detected_magnets(tag), recording(), [TAGS]))
+    known = one(identify_tags(detected_magnets(tag), recording(), [built]))
     assert known.tag_id == id_of()
     assert known.decoded is not None
     assert plain.decoded is not None
@@ -276,12 +278,154 @@ def test_two_tags_side_by_side(world: Any) -> None:
         world.Tag(CELLS, SYMBOLS, y=-0.065, heading=0.2),
         world.Tag(CELLS, OTHER, y=0.065, heading=-1.0),
     ]
-    result = identify_tags(detected_magnets(*tags, is_path_estimated=True), recording(0.28), TAGS)
+    result = identify_tags(detected_magnets(*tags, is_path_estimated=True), recording(0.28), [TAGS])
     assert {item.tag_id for item in result} == {id_of(SYMBOLS), id_of(OTHER)}
     for item in result:
         tag = tags[0] if item.tag_id == id_of(SYMBOLS) else tags[1]
         assert item.match is not None
         assert item.match.y_m == pytest.approx(tag.y, abs=1e-6)
+
+
+LARGE = Tags(order=4, magnets=8)
+LARGE_CELLS = ((0, 0), (2, 1), (0, 2), (1, 2), (2, 2), (0, 3), (3, 3), (3, 1))
+"""A tag of 4 x 4 whose first three columns and rows 0 to 2 hold a tag of 3 x 3: all but its
+corner (2, 2) are also in one of ``SMALL_CELLS``."""
+LARGE_SYMBOLS = (0, 3, 5, 2, 6, 1, 4, 7)
+
+
+def large_tag(world: Any, **more: Any) -> Any:
+    return world.Tag(LARGE_CELLS, LARGE_SYMBOLS, order=4, **more)
+
+
+def large_id() -> int:
+    order = sorted(range(8), key=lambda k: LARGE_CELLS[k][::-1])
+    cells, symbols = (tuple(each[k] for k in order) for each in (LARGE_CELLS, LARGE_SYMBOLS))
+    return codec.id_of(LARGE, TagLayout(cells, symbols))
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.4, 2.0])
+def test_a_part_of_a_larger_tag_is_no_tag(heading: float, world: Any) -> None:
+    """Five magnets of it are a perfect tag of 3 x 3, and three continue its grid."""
+    magnets = detected_magnets(large_tag(world, heading=heading), is_path_estimated=True)
+    part = detected_magnets(large_tag(world, heading=heading), keep=[0, 1, 2, 3, 4])
+    assert one(identify_tags(part, recording(0.28), [TAGS])).tag_id is not None
+    result = one(identify_tags(magnets, recording(0.28), [TAGS]))
+    assert (result.tag_id, result.refused) == (None, "other_design")
+    detection = result.detection("bar", np.arange(400, dtype=np.int64))
+    assert len(detection.magnets) == 8
+
+
+@pytest.mark.parametrize(
+    ("moment", "is_read"), [(1.0, False), (0.7, False), (1.6, False), (0.4, True), (2.5, True)]
+)
+def test_a_source_on_the_grid_counts_if_it_is_as_strong_as_the_magnets(
+    moment: float, is_read: bool, world: Any
+) -> None:
+    screw = world.Tag(((0, 0),), (0,), x=-0.08, y=0.0, order=1)
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS), screw)
+    strength = np.r_[np.full(5, 1.8e-3), moment * 1.8e-3]
+    result = one(identify_tags(replace(magnets, moment_am2=strength), recording(), [TAGS]))
+    assert (result.tag_id is not None) is is_read
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "is_read"),
+    [
+        (-0.065, 0.01, True),  # Beside the tag, not on its grid.
+        (0.02, 0.012, True),  # A single one in it.
+        (0.02, 0.02, False),  # On the grid of half the spacing.
+        (-0.04, 0.04, False),  # Corner v4, which no tag occupies.
+        (-0.32, 0.0, True),  # On the grid, but far away.
+    ],
+)
+def test_a_magnet_beside_a_tag_is_reported(x: float, y: float, is_read: bool, world: Any) -> None:
+    stray = world.Tag(((0, 0),), (2,), x=x, y=y, order=1)
+    cells, symbols = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2)), SYMBOLS
+    magnets = detected_magnets(world.Tag(cells, symbols), stray)
+    result = one(identify_tags(magnets, recording(), [TAGS]))
+    assert (result.tag_id is not None) is is_read
+    if is_read:
+        (other,) = result.detection("bar", np.arange(400, dtype=np.int64)).other_magnets
+        assert (other.x_m, other.y_m) == pytest.approx((x, y))
+        assert other.moment_am2 == pytest.approx(1.8e-3)
+    else:
+        assert result.refused in ("other_design", "too_many_magnets")
+
+
+def test_several_strong_magnets_within_the_grid(world: Any) -> None:
+    strays = [world.Tag(((0, 0),), (2,), x=0.012, y=y, order=1) for y in (0.03, -0.03)]
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS), *strays)
+    assert one(identify_tags(magnets, recording(), [TAGS])).refused == "other_design"
+
+
+@pytest.mark.parametrize("designs", [[TAGS, LARGE], [LARGE, TAGS]])
+def test_the_design_that_explains_all_magnets_is_chosen(designs: list[Tags], world: Any) -> None:
+    for tag, tags, tag_id in (
+        (large_tag(world), LARGE, large_id()),
+        (world.Tag(CELLS, SYMBOLS), TAGS, id_of()),
+    ):
+        result = one(identify_tags(detected_magnets(tag), recording(), designs))
+        assert (result.tag_id, result.tags is tags) == (tag_id, True)
+
+
+def test_tags_of_two_designs_in_a_pass_are_in_order_of_time(world: Any) -> None:
+    """The larger one is matched first, and passed last."""
+    placed = [world.Tag(CELLS, SYMBOLS, x=-0.12, heading=0.3), large_tag(world, x=0.12)]
+    magnets = detected_magnets(*placed)
+    expected = [(id_of(), TAGS), (large_id(), LARGE)]
+    result = identify_tags(magnets, recording(), [TAGS, LARGE])
+    assert [(each.tag_id, each.tags) for each in result] == expected
+    backward = replace(magnets, path_m=-magnets.path_m)
+    result = identify_tags(backward, recording(), [TAGS, LARGE])
+    assert [(each.tag_id, each.tags) for each in result] == expected[::-1]
+
+
+def test_two_designs_that_fit_are_ambiguous(world: Any) -> None:
+    """Every tag of 8 orientations is one of 16, too; families tell them apart."""
+    fine = replace(TAGS, orientations=16)
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS))
+    result = one(identify_tags(magnets, recording(), [TAGS, fine]))
+    assert (result.tag_id, result.refused) == (None, "ambiguous")
+    family = replace(TAGS, ids=(id_of(OTHER),))
+    result = one(identify_tags(magnets, recording(), [family, fine]))
+    assert (result.tags, result.refused) == (fine, "")
+
+
+@pytest.mark.parametrize(
+    ("spacing", "moment", "height", "refused"),
+    [
+        (0.040, 1.0, 1.0, ""),
+        (0.0404, 0.55, 1.18, ""),  # The published recordings.
+        (0.037, 1.0, 1.0, "other_design"),
+        (0.043, 1.0, 1.0, "other_design"),
+        (0.040, 4.5, 1.0, "other_design"),
+        (0.040, 0.25, 1.0, "other_design"),
+        (0.040, 1.0, 2.2, "other_design"),
+        (0.040, 1.0, 0.4, "other_design"),
+    ],
+)
+def test_spacing_moment_and_height_are_those_of_the_design(
+    spacing: float, moment: float, height: float, refused: str, world: Any
+) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, spacing=spacing, heading=0.5)
+    magnets = detected_magnets(
+        tag,
+        is_path_estimated=True,
+        moment_am2=np.full(5, moment * TAGS.magnet.moment),
+        height_m=height * TAGS.clearance_m,
+    )
+    assert one(identify_tags(magnets, recording(), [TAGS])).refused == refused
+
+
+def test_an_unreadable_tag_beside_a_read_one_is_reported(world: Any) -> None:
+    """On the same lattice, as if both were parts of one tag: both are complete."""
+    family = replace(TAGS, ids=(id_of(),))
+    placed = [world.Tag(CELLS, SYMBOLS, x=-0.06), world.Tag(CELLS, OTHER, x=0.06)]
+    result = identify_tags(detected_magnets(*placed), recording(), [family])
+    assert [(each.tag_id, each.refused) for each in result] == [
+        (id_of(), ""),
+        (None, "not_in_family"),
+    ]
 
 
 def test_a_tag_and_what_is_left_of_another(world: Any) -> None:
@@ -290,7 +434,7 @@ def test_a_tag_and_what_is_left_of_another(world: Any) -> None:
         world.Tag(CELLS, OTHER, x=0.1, heading=-1.0),
     ]
     result = identify_tags(
-        detected_magnets(*tags, keep=[0, 1, 2, 3, 4, 5, 6, 7]), recording(), TAGS
+        detected_magnets(*tags, keep=[0, 1, 2, 3, 4, 5, 6, 7]), recording(), [TAGS]
     )
     assert [item.tag_id for item in result if item.tag_id is not None] == [id_of(SYMBOLS)]
 
@@ -299,23 +443,23 @@ def test_a_tag_and_what_is_left_of_another(world: Any) -> None:
 def test_ends_of_one_tag_are_near_each_other(gap: int, expected: bool, world: Any) -> None:
     """Steps of 2 mm; a tag of three cells of 40 mm is at most 180 mm away."""
     part = detected_magnets(world.Tag(CELLS, SYMBOLS), keep=[0, 1])
-    before = IdentifiedPass(part, identify_tags(part, recording(), TAGS))
+    before = IdentifiedPass(part, identify_tags(part, recording(), [TAGS]))
     later = replace(part, first=part.stop + gap, stop=part.stop + gap + 101)
     after = IdentifiedPass(later, before.observations)
     assert may_be_one_tag(before, after, TAGS) is expected
     whole = detected_magnets(world.Tag(CELLS, SYMBOLS))
-    identified = IdentifiedPass(whole, identify_tags(whole, recording(), TAGS))
+    identified = IdentifiedPass(whole, identify_tags(whole, recording(), [TAGS]))
     assert not may_be_one_tag(identified, after, TAGS)
 
 
 def test_the_same_tag_twice_in_a_pass_is_ambiguous(world: Any) -> None:
     tags = [world.Tag(CELLS, SYMBOLS, x=x) for x in (-0.1, 0.1)]
-    observations = identify_tags(detected_magnets(*tags), recording(), TAGS)
+    observations = identify_tags(detected_magnets(*tags), recording(), [TAGS])
     assert [each.refused for each in observations] == ["ambiguous", "ambiguous"]
     assert all(each.tag_id is None for each in observations)
 
 
 def test_a_white_residual_needs_no_margin(world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, turned=np.radians([0, 0, 17.0, 0, 0]))
-    result = one(identify_tags(detected_magnets(tag, residual_sigma=1.59), recording(), TAGS))
+    result = one(identify_tags(detected_magnets(tag, residual_sigma=1.59), recording(), [TAGS]))
     assert result.tag_id == id_of()

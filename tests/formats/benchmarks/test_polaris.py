@@ -18,6 +18,7 @@ from locatk.core.polaris.simulation.session import SimulatedSession, SimulationO
 from locatk.core.polaris.tag import Tags, cell_positions, symbol_angles
 from locatk.formats.benchmarks import timing
 from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.polaris import designs
 from locatk.formats.benchmarks.polaris import passes as polaris_passes
 from locatk.formats.benchmarks.polaris import speed as polaris_speed
 from locatk.formats.benchmarks.polaris import suite as polaris
@@ -368,3 +369,19 @@ def test_the_window_that_is_timed_is_one_of_the_templates() -> None:
     assert (window.shape, field.shape) == ((80, 3), (180, 80, 3))
     assert distances(window, prepare(field)).argmin() == 60
     assert polaris_speed.window_and_templates(1800)[1].shape == (1800, 80, 3)
+
+
+# ---- passes over tags of other designs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", designs.PASSES)
+def test_a_pass_over_tags_of_several_designs(kind: str) -> None:
+    for seed in (700_000, 700_001):
+        read, present, refused = designs.pass_result(kind, seed)
+        assert read <= present
+        assert read == present or refused
+    if kind in ("part of a larger tag", "another spacing"):
+        assert present == set()
+    else:
+        assert present
