@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.magnets import detect_magnets
+from locatk.core.polaris.given_path import (
+    compare_path,
+    contradicted_scale,
+    contradiction_warning,
+)
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
     identify_pass,
@@ -136,12 +141,17 @@ def _solve_array(
     preprocessed = preprocess(recording)
     recording = preprocessed.samples
     rejected: Counter[str] = Counter()
+    contradiction = None
     if options.method == "paper":
         passes = _identify_published(recording, tags, options)
     else:
         path_m = _known_path(recording, options.speed_mps, driven)
         passes, unexplained = _identify_passes(preprocessed, tags, path_m)
         rejected["no_magnets"] = unexplained
+        if path_m is not None:
+            contradiction = contradiction_warning(
+                (compare_path(path_m, each.observations[0]) for each in passes), options.speed_mps
+            )
     observations = [each for part in passes for each in part.observations]
     rejected.update(each.refused for each in observations if each.refused)
     identified = [each for each in observations if each.tag_id is not None]
@@ -155,6 +165,7 @@ def _solve_array(
             *preprocessed.warnings,
             *localization.warnings,
             *(warning.about(recording.device) for warning in of_passes),
+            *((contradiction.about(recording.device),) if contradiction else ()),
         ],
     )
 
@@ -182,7 +193,15 @@ def _identify_passes(
 
     def identify(part: PassRange) -> IdentifiedPass | None:
         hypotheses = detect_magnets(preprocessed, part, tags, path_m)
-        return identify_pass(hypotheses, preprocessed.samples, tags)
+        result = identify_pass(hypotheses, preprocessed.samples, tags)
+        if path_m is None or tags is None or result is None or result.magnets.is_path_estimated:
+            return result
+        scale = contradicted_scale(result.observations[0], tags)
+        if scale is None:
+            return result
+        hypotheses = detect_magnets(preprocessed, part, tags, scale * path_m)
+        rescaled = identify_pass(hypotheses, preprocessed.samples, tags)
+        return rescaled if rescaled is not None and rescaled.is_identified else result
 
     passes: list[IdentifiedPass] = []
     unexplained = 0

@@ -138,9 +138,12 @@ def _rounded_misfit(match: TagMatch) -> float:
 
 
 def refit_match(
-    detected: DetectedMagnets, tags: Tags, match: TagMatch, positions_m: Array
+    detected: DetectedMagnets,
+    tags: Tags,
+    match: TagMatch,
+    positions_m: Array | None,
 ) -> TagMatch:
-    """Fit a match again, to positions (M, 2) of the magnets of the tag as it was built."""
+    """Fit a match again, to positions (M, 2) of the magnets as built; None for the cells."""
     (refitted,) = _fit_grids(detected, tags, [(match.magnets, match.cells)], positions_m)
     return refitted
 
