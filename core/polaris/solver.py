@@ -28,6 +28,8 @@ from locatk.core.polaris.preprocessing import (
     PassRange,
     PreprocessedSamples,
     find_passes,
+    is_no_pass,
+    least_magnet_field,
     preprocess,
 )
 from locatk.core.polaris.published import pipeline as published
@@ -146,8 +148,8 @@ def _solve_array(
         passes = _identify_published(recording, tags, options)
     else:
         path_m = _known_path(recording, options.speed_mps, driven)
-        passes, unexplained = _identify_passes(preprocessed, tags, path_m)
-        rejected["no_magnets"] = unexplained
+        passes, counts = _identify_passes(preprocessed, tags, path_m)
+        rejected.update(counts)
         if path_m is not None:
             contradiction = contradiction_warning(
                 (compare_path(path_m, each.observations[0]) for each in passes), options.speed_mps
@@ -181,14 +183,15 @@ def _known_path(
 
 def _identify_passes(
     preprocessed: PreprocessedSamples, tags: Tags | None, path_m: Array | None
-) -> tuple[list[IdentifiedPass], int]:
+) -> tuple[list[IdentifiedPass], Counter[str]]:
     """Detect and identify the tags of all passes, in order of time.
 
     Returns
     -------
     passes : list of IdentifiedPass
-    unexplained : int
-        Number of passes in which the field changes, but no magnet explains that.
+    counts : Counter
+        Changes of the field without a detection: ``no_magnets`` explain them, or ``no_pass`` over a
+        tag caused them.
     """
 
     def identify(part: PassRange) -> IdentifiedPass | None:
@@ -204,11 +207,21 @@ def _identify_passes(
         return rescaled if rescaled is not None and rescaled.is_identified else result
 
     passes: list[IdentifiedPass] = []
-    unexplained = 0
-    for part in find_passes(preprocessed.samples, preprocessed.noise_t):
+    counts: Counter[str] = Counter(no_magnets=0)
+    samples, noise_t = preprocessed.samples, preprocessed.noise_t
+    magnet_field_t = None
+    if tags is not None:
+        magnet_field_t = least_magnet_field(samples, tags.magnet.moment, tags.clearance_m)
+    for part in find_passes(samples, noise_t):
         current = identify(part)
+        if (current is None or not current.is_identified) and (
+            (current is not None and _is_at_rest(current))
+            or is_no_pass(samples, part, noise_t, path_m, magnet_field_t)
+        ):
+            counts["no_pass"] += 1
+            continue
         if current is None:
-            unexplained += 1
+            counts["no_magnets"] += 1
             continue
         if passes and tags is not None and may_be_one_tag(passes[-1], current, tags):
             merged = identify(PassRange(passes[-1].magnets.first, current.magnets.stop))
@@ -216,7 +229,13 @@ def _identify_passes(
                 passes[-1] = merged
                 continue
         passes.append(current)
-    return passes, unexplained
+    return passes, counts
+
+
+def _is_at_rest(current: IdentifiedPass) -> bool:
+    """Return whether an array moved less than its height: the field hardly changes over that."""
+    magnets = current.magnets
+    return bool(np.ptp(magnets.path_m) < magnets.height_m)
 
 
 def _identify_published(
