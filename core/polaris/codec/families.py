@@ -111,13 +111,14 @@ def closest_pair(tags: Tags, ids: tuple[int, ...]) -> tuple[int, tuple[int, ...]
         The codec does not have one of the ids.
     """
     rows = symbol_table(tags, ids)
+    counts = _weight_counts(tags.magnets, tags.orientations)
     for radius in range(tags.orientations // 2):
-        deltas = _rotations_of_weight(tags.magnets, tags.orientations, radius)
-        if IDS_PER_NEAR_TAG * len(deltas) > len(ids):
+        if IDS_PER_NEAR_TAG * counts[radius] > len(ids):
             break
+        deltas = _rotations_of_weight(tags.magnets, tags.orientations, radius)
         table = _NearTags(tags, rows)
         pairs = [
-            (start + later, earlier)
+            (start + int(later), int(earlier))
             for start in range(0, len(ids), BATCH_IDS)
             for later, earlier in table.find(rows[start : start + BATCH_IDS], deltas)
             if earlier < start + later
@@ -337,7 +338,7 @@ def _near_any(
             words = [_rotations_of_weight(magnets, base, steps) for steps in range(radius + 1)]
             pairs = _NearTags(tags, member_rows).find(rows, np.vstack(words))
             near = np.zeros(len(rows), bool)
-            near[[row for row, _ in pairs]] = True
+            near[pairs[:, 0]] = True
             return near
     return np.asarray((_distances(tags, rows, member_rows) <= radius).any(axis=1))
 
@@ -359,8 +360,8 @@ class _NearTags:
         self.order = np.argsort(keys, kind="stable")
         self.keys = keys[self.order]
 
-    def find(self, rows: NDArray[np.int16], deltas: NDArray[np.int16]) -> list[tuple[int, int]]:
-        """Return pairs of an index in ``rows`` and one in the table.
+    def find(self, rows: NDArray[np.int16], deltas: NDArray[np.int16]) -> NDArray[np.intp]:
+        """Return pairs (k, 2) of an index in ``rows`` and one in the table.
 
         The orientations of the second differ from those of the first by one of ``deltas`` (v, M).
         """
@@ -373,19 +374,26 @@ class _NearTags:
         keys = np.repeat(keys, len(deltas), axis=1)
         for magnet in range(self.magnets):
             keys += changes[:, magnet, deltas[:, magnet]]
-        first = np.searchsorted(self.keys, keys)
-        is_match = self.keys[np.minimum(first, len(self.keys) - 1)] == keys
-        pairs = []
-        for row, k in np.argwhere(is_match):
-            expected = rows[row].copy()
-            expected[cells[row]] = rotated[row, np.arange(self.magnets), deltas[k]]
-            position = int(first[row, k])
-            while position < len(self.keys) and self.keys[position] == keys[row, k]:
-                index = int(self.order[position])
-                if np.array_equal(self.rows[index], expected):
-                    pairs.append((int(row), index))
-                position += 1
-        return pairs
+        position = np.searchsorted(self.keys, keys)
+        last = len(self.keys) - 1
+        row, word = np.nonzero(self.keys[np.minimum(position, last)] == keys)
+        position, keys = position[row, word], keys[row, word]
+        expected = rows[row]
+        by_magnet = np.arange(self.magnets)
+        expected[np.arange(len(row))[:, None], cells[row]] = rotated[
+            row[:, None], by_magnet, deltas[word]
+        ]
+        found = [np.empty((0, 2), np.intp)]
+        # Several tags of the table have the same key if it has one of them twice.
+        while len(row):
+            index = self.order[position]
+            is_equal = (self.rows[index] == expected).all(axis=1)
+            found.append(np.column_stack([row, index])[is_equal])
+            position = position + 1
+            is_next = (position <= last) & (self.keys[np.minimum(position, last)] == keys)
+            row, position, keys = row[is_next], position[is_next], keys[is_next]
+            expected = expected[is_next]
+        return np.vstack(found)
 
 
 @functools.cache
