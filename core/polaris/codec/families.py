@@ -49,6 +49,9 @@ for the default design)."""
 PROGRESS_STEPS = 100
 """Number of steps in which :func:`generate_family` reports its progress."""
 
+TRIED_ORIENTATIONS = (8, 16, 20, 32)
+"""Numbers of orientations that are proposed if a family cannot have as many members."""
+
 KEY_SEED = 20
 """Seed of the keys of :class:`_NearTags`. They do not change any result."""
 
@@ -236,18 +239,16 @@ def _feasible_hint(tags: Tags, count: int, min_distance: int) -> str:
         if max_family_size(tags, distance) >= count:
             options.append(f"a minimum distance of {distance}")
             break
-    for name, values in (
-        ("magnets", range(tags.magnets + 1, tags.order**2)),
-        ("orientations", (8, 16, 20, 32)),
-    ):
-        for value in values:
-            changed = replace(tags, **{name: value})
+    more_magnets = [replace(tags, magnets=n) for n in range(tags.magnets + 1, tags.order**2)]
+    finer = [replace(tags, orientations=p) for p in TRIED_ORIENTATIONS if p > tags.orientations]
+    for designs, quantity in ((more_magnets, "magnets"), (finer, "orientations")):
+        for design in designs:
             try:
-                is_feasible = max_family_size(changed, min_distance) >= count
+                is_feasible = max_family_size(design, min_distance) >= count
             except InputError:
-                continue
-            if is_feasible and value > getattr(tags, name):
-                options.append(f"{value} {name}")
+                continue  # The codec does not have this design.
+            if is_feasible:
+                options.append(f"{getattr(design, quantity)} {quantity}")
                 break
     if not options:
         return "Use a smaller count or minimum distance, or a larger order"
