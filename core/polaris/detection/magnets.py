@@ -93,7 +93,7 @@ UNRELATED_RESIDUAL_SIGMAS = 3.0
 MAX_GIVEN_PATH_RESIDUAL_RATIO = 1.2
 """Largest rms residual with a given path, relative to that with a free one. With 0.5 uT of noise,
 paths that are 3 to 4 % too short or too long reach it, and the spacing of a tag corrects smaller
-errors. The true path reaches 1.00 (by definition up to noise; in simulation)."""
+errors. True paths reach 1.00 in simulation, and on the published runs."""
 
 DEBRIS_RESIDUAL_SIGMAS = 1.3
 """Rms residual above which weak sources are added as well."""
