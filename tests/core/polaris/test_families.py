@@ -217,6 +217,7 @@ def test_near_tags_are_those_of_a_full_comparison(
 ) -> None:
     """Families and closest pairs are the same with and without the table of keys."""
     monkeypatch.setattr(families, "IDS_PER_NEAR_TAG", 0.05)
+    monkeypatch.setattr(families, "BATCH_IDS", 64)  # the table is used from the second batch on
     count = 60 if tags.codec == "redundant" else 400
     ids = families.generate_family(tags, count, distance)
     lists = (ids, ids[:50] + tuple(i + 1 for i in ids[:50]), (*ids[:40], ids[7]))
@@ -229,7 +230,7 @@ def test_near_tags_are_those_of_a_full_comparison(
 
 def test_equal_keys_of_different_tags_do_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
     """Numbers of which most are equal make most keys equal."""
-    usual = families.generate_family(Tags(magnets=4), 300, 2)
+    usual = families.generate_family(Tags(magnets=4), 2000, 2)
 
     class Coarse(families._NearTags):
         def __init__(self, tags: Tags, rows: np.ndarray) -> None:
@@ -241,7 +242,7 @@ def test_equal_keys_of_different_tags_do_no_harm(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(families, "IDS_PER_NEAR_TAG", 0.05)
     monkeypatch.setattr(families, "_NearTags", Coarse)
-    assert families.generate_family(Tags(magnets=4), 300, 2) == usual
+    assert families.generate_family(Tags(magnets=4), 2000, 2) == usual
 
 
 @pytest.mark.parametrize(
