@@ -160,8 +160,9 @@ def command(
         ids=ids or None,
     )
     if count is not None:
-        with console.working("Generating"):
-            tags = replace(tags, ids=families.generate_family(tags, count, min_distance))
+        with console.steps(families.PROGRESS_STEPS, "Generating") as advance:
+            ids = families.generate_family(tags, count, min_distance, advance)
+        tags = replace(tags, ids=ids)
         tags = replace(
             tags, notes=(f"family of rule {families.FAMILY_RULE_VERSION}, count {count}",)
         )

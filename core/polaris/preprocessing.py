@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
+from locatk.core.magnetics import dipole_field
 from locatk.core.polaris.array import Samples
 from locatk.core.solution import SolverWarning
 
@@ -45,6 +46,28 @@ MIN_PASS_MARGIN_SAMPLES = 10
 
 PASS_TO_MARGIN_RATIO = 6
 """Duration of a pass relative to its margins, whose samples determine the background."""
+
+MIN_MOTION_M = 1e-3
+"""Distance that an array must have moved in a pass, if its path is known [m]: a tenth of the usual
+height over the magnets, so that their field has hardly changed."""
+
+SINGULAR_VALUE_MARGIN = 5.0
+"""Distance above ``sqrt(n) + sqrt(channels)`` from which a singular value is not that of noise.
+Noise reaches it with a probability below exp(-12) (Davidson and Szarek, Handbook of the Geometry of
+Banach Spaces 1 (2001), Theorem II.13)."""
+
+MIN_RANK_RATIO = 3.0
+"""Ratio of the largest singular value to that limit from which the second one of a moving array
+would be seen: it is a third of the first or more over a dipole whose field is measured by at least
+two sensors."""
+
+SIGNAL_COMPONENTS = 3
+"""Number of singular values that hold most of the signal of a pass: one per axis of the field."""
+
+MIN_TAG_FIELD_FRACTION = 0.2
+"""Change of the bar's field in a pass over a tag, relative to that of one magnet by its design. The
+weakest magnets of the published recordings (1.0 instead of 1.8 mA m^2, 11.8 instead of 10 mm above)
+reach 0.34."""
 
 MIN_NOISE_T = 2e-8
 """Lower limit of the noise [T]; a quarter of the quantum if that is larger."""
@@ -96,6 +119,7 @@ def preprocess(samples: Samples) -> PreprocessedSamples:
         There are too few samples, no sensor has a value, or time stamps do not ascend.
     """
     _check(samples)
+    samples = replace(samples, time_ns=_separate_equal_times(samples.time_ns))
     warnings = []
     field = np.where(np.isfinite(samples.field_t), samples.field_t, np.nan)
     is_stuck = _stuck_samples(field)
@@ -133,6 +157,25 @@ def _check(samples: Samples) -> None:
         raise InputError(
             f"the time stamps of {samples.device} do not ascend", hint="Check the recording"
         )
+
+
+def _separate_equal_times(time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return strictly ascending times (n,): a host may stamp several samples at once.
+
+    Equal times become those of samples at a constant rate from one stamp to the next; each stamp
+    remains the mean of its samples, as far as the stamps beside it allow.
+    """
+    stamps, first, counts = np.unique(time_ns, return_index=True, return_counts=True)
+    if len(stamps) == len(time_ns):
+        return time_ns
+    middle = first + (counts - 1) / 2
+    # Before the first stamp and after the last one, times continue at the rate beside them.
+    middle = np.concatenate([[2 * middle[0] - middle[1]], middle, [2 * middle[-1] - middle[-2]]])
+    offset = stamps - stamps[0]
+    offset = np.concatenate([[-offset[1]], offset, [2 * offset[-1] - offset[-2]]])
+    index = np.arange(len(time_ns))
+    separated = stamps[0] + np.rint(np.interp(index, middle, offset)).astype(np.int64)
+    return np.asarray(np.maximum.accumulate(separated - index) + index)
 
 
 def _stuck_samples(field: Array) -> NDArray[np.bool_]:
@@ -216,23 +259,95 @@ def find_passes(samples: Samples, noise_t: Array) -> list[PassRange]:
 def _field_change(samples: Samples, noise_t: Array) -> Array:
     """Return the change of the bar's field around each sample (n,), in sigmas of pure noise.
 
-    A field that all sensors share (the Earth's, while the robot rotates) does not count.
+    A field that all sensors share (the Earth's, while the robot rotates) does not count, and
+    neither does a sensor that lacks one of the two samples.
     """
     n = len(samples)
     scaled = samples.field_t / noise_t
-    is_finite = np.isfinite(scaled)
-    scaled = np.nan_to_num(scaled)
-    degrees_of_freedom = 3 * len(samples.array)
-    if len(samples.array) > 2:
-        count = np.maximum(is_finite.sum(axis=1, keepdims=True), 1)
-        scaled = np.where(is_finite, scaled - scaled.sum(axis=1, keepdims=True) / count, 0.0)
-        degrees_of_freedom -= 3
     largest = np.zeros(n)
     for lag in CHANGE_LAGS_SAMPLES:
         if lag >= n:
             break
-        squares = ((scaled[lag:] - scaled[:-lag]) ** 2).sum(axis=(1, 2)) / 2
-        change = (squares - degrees_of_freedom) / np.sqrt(2 * degrees_of_freedom)
+        difference = scaled[lag:] - scaled[:-lag]
+        is_finite = np.isfinite(difference)
+        count = is_finite.sum(axis=1)
+        difference = np.where(is_finite, difference, 0.0)
+        degrees_of_freedom = count.sum(axis=1)
+        if len(samples.array) > 2:
+            difference = _subtract_shared(difference, is_finite)
+            degrees_of_freedom = degrees_of_freedom - (count > 0).sum(axis=1)
+        squares = (difference**2).sum(axis=(1, 2)) / 2
+        change = (squares - degrees_of_freedom) / np.sqrt(2 * np.maximum(degrees_of_freedom, 1))
         middle = slice(lag // 2, lag // 2 + n - lag)
         largest[middle] = np.maximum(largest[middle], change)
     return largest
+
+
+def _subtract_shared(values: Array, is_finite: NDArray[np.bool_]) -> Array:
+    """Subtract the mean of all sensors from values (n, N, 3); those that are missing become 0."""
+    count = np.maximum(is_finite.sum(axis=1, keepdims=True), 1)
+    shared = np.where(is_finite, values, 0.0).sum(axis=1, keepdims=True) / count
+    return np.where(is_finite, values - shared, 0.0)
+
+
+def is_no_pass(
+    samples: Samples,
+    part: PassRange,
+    noise_t: Array,
+    path_m: Array | None = None,
+    magnet_field_t: float | None = None,
+) -> bool:
+    """Return whether the field of a pass can have changed without a motion over a tag.
+
+    It can if the known path hardly moves; if all channels change by one function of time, as when
+    a motor starts (over a dipole, the three axes differ); or if the change is far smaller than that
+    of a tag's magnet, as by drift or by people and iron that move nearby.
+
+    Parameters
+    ----------
+    samples : Samples
+    part : PassRange
+    noise_t : (N, 3) ndarray
+        Standard deviation of one sample [T].
+    path_m : (n,) ndarray, optional
+        Distance that the array had moved at each sample of the recording.
+    magnet_field_t : float, optional
+        Least change of the bar's field by a magnet of the tag (:func:`least_magnet_field`) [T].
+    """
+    rows = slice(part.first, part.stop)
+    if path_m is not None and np.ptp(path_m[rows]) < MIN_MOTION_M:
+        return True
+    field = samples.field_t[rows]
+    is_finite = np.isfinite(field)
+    count = np.maximum(is_finite.sum(axis=0), 1)
+    level = np.where(is_finite, field, 0.0).sum(axis=0) / count
+    deviation = np.where(is_finite, field - level, 0.0)
+    if len(samples.array) > 2:
+        deviation = _subtract_shared(deviation, is_finite)
+    scaled = (deviation / noise_t).reshape(len(field), -1)
+    series, size, _ = np.linalg.svd(scaled, full_matrices=False)
+    limit = np.sqrt(scaled.shape[0]) + np.sqrt(scaled.shape[1]) + SINGULAR_VALUE_MARGIN
+    if size[0] > MIN_RANK_RATIO * limit and np.all(size[1:] < limit):
+        return True
+    if magnet_field_t is None:
+        return False
+    # The strongest components hold the signal and little of the noise of all channels.
+    signal = (series * size)[:, :SIGNAL_COMPONENTS]
+    strongest_t = np.sqrt((signal**2).sum(axis=1).max() * np.mean(noise_t**2))
+    return bool(strongest_t < MIN_TAG_FIELD_FRACTION * magnet_field_t)
+
+
+def least_magnet_field(samples: Samples, moment_am2: float, height_m: float) -> float:
+    """Return the least change of the bar's field by a magnet that passes between two sensors [T].
+
+    It is the root of the sum of squares over the bar, without the part that all sensors share.
+    """
+    sensors = samples.array.position_m
+    order = np.argsort(sensors[:, 1])
+    middle = (sensors[order[1:]] + sensors[order[:-1]]) / 2 if len(sensors) > 1 else sensors
+    offsets = sensors - middle[:, None] + [0.0, 0.0, height_m]
+    moments = moment_am2 * np.eye(3)[:2, None, None]
+    field = dipole_field(offsets, moments).reshape(-1, len(sensors), 3)
+    if len(sensors) > 2:
+        field = field - field.mean(axis=1, keepdims=True)
+    return float(np.sqrt((field**2).sum(axis=(1, 2)).min()))

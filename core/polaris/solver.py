@@ -13,6 +13,11 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.magnets import detect_magnets
+from locatk.core.polaris.given_path import (
+    compare_path,
+    contradicted_scale,
+    contradiction_warning,
+)
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
     TagObservation,
@@ -25,6 +30,8 @@ from locatk.core.polaris.preprocessing import (
     PassRange,
     PreprocessedSamples,
     find_passes,
+    is_no_pass,
+    least_magnet_field,
     preprocess,
 )
 from locatk.core.polaris.published import pipeline as published
@@ -159,12 +166,17 @@ def _solve_array(
     preprocessed = preprocess(recording)
     recording = preprocessed.samples
     rejected: Counter[str] = Counter()
+    contradiction = None
     if options.method == "paper":
         passes = _identify_published(recording, designs, options)
     else:
         path_m = _known_path(recording, options.speed_mps, driven)
-        passes, unexplained = _identify_passes(preprocessed, designs, path_m)
-        rejected["no_magnets"] = unexplained
+        passes, counts = _identify_passes(preprocessed, designs, path_m)
+        rejected.update(counts)
+        if path_m is not None:
+            contradiction = contradiction_warning(
+                (compare_path(path_m, each.observations[0]) for each in passes), options.speed_mps
+            )
     observations = [each for part in passes for each in part.observations]
     rejected.update(each.refused for each in observations if each.refused)
     identified = [each for each in observations if each.tag_id is not None]
@@ -183,6 +195,7 @@ def _solve_array(
             *localization.warnings,
             *(warning.about(recording.device) for warning in of_passes),
             *_other_magnets(recording.device, observations),
+            *((contradiction.about(recording.device),) if contradiction else ()),
         ],
     )
 
@@ -210,17 +223,28 @@ def _known_path(
 
 def _identify_passes(
     preprocessed: PreprocessedSamples, designs: Sequence[Tags], path_m: Array | None
-) -> tuple[list[IdentifiedPass], int]:
+) -> tuple[list[IdentifiedPass], Counter[str]]:
     """Detect and identify the tags of all passes, in order of time.
 
     Returns
     -------
     passes : list of IdentifiedPass
-    unexplained : int
-        Number of passes in which the field changes, but no magnet explains that.
+    counts : Counter
+        Changes of the field without a detection: ``no_magnets`` explain them, or ``no_pass`` over a
+        tag caused them.
     """
 
     def identify(part: PassRange) -> IdentifiedPass | None:
+        result = identify_with(part, path_m)
+        if path_m is None or result is None or result.magnets.is_path_estimated:
+            return result
+        scale = contradicted_scale(result.observations[0])
+        if scale is None:
+            return result
+        rescaled = identify_with(part, scale * path_m)
+        return rescaled if rescaled is not None and rescaled.is_identified else result
+
+    def identify_with(part: PassRange, path_m: Array | None) -> IdentifiedPass | None:
         # The magnets of each design are expected in turn, until a tag of any design is read. A
         # design of few magnets limits the number of sources.
         expected = sorted(designs, key=lambda tags: -tags.magnets)
@@ -230,11 +254,22 @@ def _identify_passes(
         return identify_pass(hypotheses, preprocessed.samples, designs)
 
     passes: list[IdentifiedPass] = []
-    unexplained = 0
-    for part in find_passes(preprocessed.samples, preprocessed.noise_t):
+    counts: Counter[str] = Counter(no_magnets=0)
+    samples, noise_t = preprocessed.samples, preprocessed.noise_t
+    fields_t = [
+        least_magnet_field(samples, tags.magnet.moment, tags.clearance_m) for tags in designs
+    ]
+    magnet_field_t = min(fields_t, default=None)
+    for part in find_passes(samples, noise_t):
         current = identify(part)
+        if (current is None or not current.is_identified) and (
+            (current is not None and _is_at_rest(current))
+            or is_no_pass(samples, part, noise_t, path_m, magnet_field_t)
+        ):
+            counts["no_pass"] += 1
+            continue
         if current is None:
-            unexplained += 1
+            counts["no_magnets"] += 1
             continue
         if passes and any(may_be_one_tag(passes[-1], current, tags) for tags in designs):
             merged = identify(PassRange(passes[-1].magnets.first, current.magnets.stop))
@@ -242,7 +277,13 @@ def _identify_passes(
                 passes[-1] = merged
                 continue
         passes.append(current)
-    return passes, unexplained
+    return passes, counts
+
+
+def _is_at_rest(current: IdentifiedPass) -> bool:
+    """Return whether an array moved less than its height: the field hardly changes over that."""
+    magnets = current.magnets
+    return bool(np.ptp(magnets.path_m) < magnets.height_m)
 
 
 def _identify_published(

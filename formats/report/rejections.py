@@ -96,7 +96,10 @@ def _count_observations(solution: Solution, rejected: Counter[str]) -> dict[str,
             "moments": rejected["moments"] - solved + solution.poses,
         }
     return {
-        "polaris": {"passes": len(detections) + solution.rejected.get("no_magnets", 0)},
+        "polaris": {
+            "passes": len(detections)
+            + sum(solution.rejected.get(code, 0) for code in ("no_magnets", "no_pass"))
+        },
         "landmarks": {"visits": len(detections)},
         "dots": {"frames": rejected["frames"] + len(detections)},
     }.get(solution.system, {})
@@ -218,6 +221,7 @@ def _dots_reasons() -> dict[str, Reason]:
 def _polaris_reasons() -> dict[str, Reason]:
     passes = {
         "no_magnets": "The field changed, but no magnet explains the change.",
+        "no_pass": "The field changed while the array rested, or far less than by a tag.",
         "no_tag_given": "The design of the tags (tag.toml) is not known: magnets were detected, "
         "but not identified.",
         "partial": "The tag extends beyond the bar, or the recording begins or ends over it.",

@@ -44,8 +44,8 @@ AS_BUILT_SIGMA_M = 1e-4
 """The same if the magnets of the tag were measured as built [m]."""
 
 SCALE_SIGMA = 0.03
-"""Standard deviation of the scale of a path that was estimated from the field alone: on each of
-the published recordings it is 2.5 % short (docs/polaris.md)."""
+"""Standard deviation of the scale of a path that was estimated from the field alone: the spacing of
+the tag gives 0.985 to 1.043 on 57 recordings of the authors of the paper (docs/polaris.md)."""
 
 FIXED_SCALE_SIGMA = 1e-6
 """The same if the path was known: the scale is fixed at 1."""
@@ -138,9 +138,12 @@ def _rounded_misfit(match: TagMatch) -> float:
 
 
 def refit_match(
-    detected: DetectedMagnets, tags: Tags, match: TagMatch, positions_m: Array
+    detected: DetectedMagnets,
+    tags: Tags,
+    match: TagMatch,
+    positions_m: Array | None,
 ) -> TagMatch:
-    """Fit a match again, to positions (M, 2) of the magnets of the tag as it was built."""
+    """Fit a match again, to positions (M, 2) of the magnets as built; None for the cells."""
     (refitted,) = _fit_grids(detected, tags, [(match.magnets, match.cells)], positions_m)
     return refitted
 

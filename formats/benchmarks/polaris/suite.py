@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from locatk.core.errors import LocatkError
 from locatk.core.geometry import umeyama
@@ -59,6 +60,9 @@ on GitHub) run again on the ten recordings of each set."""
 SCATTER_DEG = {"default": 4.7, "varying": 9.8}
 HEADING_DEG = {"default": 1.14, "varying": 1.78}
 """Scatter of orientations and mean absolute headings of the authors' own results."""
+
+SCALE_RANGE = (0.8, 1.25)
+"""Range in which the scale of a track is fitted for cross-validation."""
 
 SAME_RUNS = "authors, the same runs"
 SAME_RUNS_WRONG_BITS = 1.0
@@ -187,6 +191,32 @@ def rigid_error(position_m: Array, tag_id: int) -> float:
     return 1e3 * float(np.linalg.norm(aligned - nominal, axis=1).mean())
 
 
+def cross_validated_error(position_m: Array, tag_id: int) -> float:
+    """Return the mean distance [mm] of each magnet from its cell, predicted by the other four.
+
+    Scale along the track, rotation and translation are fitted to four magnets of (5, 2) positions
+    that were not scaled by the tag, so that no magnet takes part in its own alignment. ``nan`` if
+    the magnets were not detected.
+    """
+    if not np.isfinite(position_m).all():
+        return math.nan
+    nominal = cell_positions(PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, tag_id).cells)
+    errors = []
+    for k in range(len(nominal)):
+        others = np.arange(len(nominal)) != k
+
+        def misfit(scale: float, others: NDArray[np.bool_] = others) -> float:
+            scaled = position_m[others] * [scale, 1.0]
+            aligned = umeyama(scaled, nominal[others], with_scale=False).apply(scaled)
+            return float(((aligned - nominal[others]) ** 2).sum())
+
+        scale = minimize_scalar(misfit, bounds=SCALE_RANGE, method="bounded").x
+        scaled = position_m * [scale, 1.0]
+        alignment = umeyama(scaled[others], nominal[others], with_scale=False)
+        errors.append(np.linalg.norm(alignment.apply(scaled[k : k + 1]) - nominal[k]))
+    return 1e3 * float(np.mean(errors))
+
+
 def anchored_error(position_m: Array, tag_id: int) -> float:
     """Return the authors' metric [mm]: no rotation, and two anchors instead of the best shift.
 
@@ -249,6 +279,9 @@ READ_PERCENT = _mean(lambda run: 100.0 * (run.is_read and not run.wrong_bits))
 RIGID_ERROR = _mean(lambda run: rigid_error(run.position_m, run.tag_id))
 ANCHORED_ERROR = _mean(lambda run: anchored_error(run.position_m, run.tag_id))
 UNSCALED_RIGID_ERROR = _mean(lambda run: rigid_error(run.unscaled_position_m, run.tag_id))
+CROSS_VALIDATED_ERROR = _mean(
+    lambda run: cross_validated_error(run.unscaled_position_m, run.tag_id)
+)
 UNSCALED_ANCHORED_ERROR = _mean(lambda run: anchored_error(run.unscaled_position_m, run.tag_id))
 ABSOLUTE_HEADING = _mean(lambda run: abs(math.degrees(run.heading_rad)))
 PATTERN_HEADING = _mean(lambda run: absolute_pattern_heading_deg(run.position_m))
@@ -305,6 +338,12 @@ def _joint() -> Iterator[DeclaredFigure]:
     for name in SET_RUNS:
         yield _rigid(name, ", without the ruler", without, None, UNSCALED_RIGID_ERROR)
         yield _anchored(name, ", without the ruler", without, None, UNSCALED_ANCHORED_ERROR)
+    validated = "scale along the track and alignment by four magnets, error of the fifth; mean"
+    for name in SET_RUNS:
+        yield DeclaredFigure(
+            (name,), CROSS_VALIDATED_ERROR,
+            Figure(f"{name}: position, cross-validated ruler", None, "mm", validated),
+        )  # fmt: skip
     own = "rms about the mean of each magnet over the runs"
     for name, peer in SCATTER_DEG.items():
         for label, how, statistic in (

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -152,7 +155,7 @@ def test_ids_beyond_the_codec_are_refused() -> None:
     with pytest.raises(InputError, match="the codec has 64 ids"):
         families.generate_family(tags, 65, 1)
     with pytest.raises(InputError, match=r"\d+ found among all 64 ids") as caught:
-        families.generate_family(tags, 64, 3)
+        families.generate_family(tags, 9, 3)
     result = int(str(caught.value).split(": ")[1].split()[0])
     # As many as it says are there indeed.
     assert len(families.generate_family(tags, result, 3)) == result
@@ -163,7 +166,7 @@ def test_ids_beyond_the_codec_are_refused() -> None:
 def test_the_search_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(families, "MAX_CANDIDATES", 3000)
     with pytest.raises(InputError, match="found among the first 3000 of 327680 ids"):
-        families.generate_family(Tags(), 1000, 8)
+        families.generate_family(Tags(), 900, 8)
 
 
 @pytest.mark.parametrize(("count", "distance"), [(0, 1), (-3, 1), (5, 0)])
@@ -193,3 +196,126 @@ def test_the_two_closest_are_named() -> None:
 def test_a_list_that_is_no_family_is_refused(ids, distance: int, said: str) -> None:
     with pytest.raises(InputError, match=said):
         families.check_family(Tags(ids=ids, min_distance=distance))
+
+
+# ---- large families
+
+
+@pytest.mark.parametrize(
+    ("tags", "distance"),
+    [
+        (Tags(), 2),
+        (Tags(), 4),
+        (Tags(magnets=4, orientations=7), 3),
+        (Tags(order=4, magnets=8, orientations=16), 5),
+        (Tags(magnets=8, codec="redundant"), 3),
+        (LARGE, 3),
+    ],
+)
+def test_near_tags_are_those_of_a_full_comparison(
+    tags: Tags, distance: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Families and closest pairs are the same with and without the table of keys."""
+    monkeypatch.setattr(families, "IDS_PER_NEAR_TAG", 0.05)
+    monkeypatch.setattr(families, "BATCH_IDS", 64)  # the table is used from the second batch on
+    count = 60 if tags.codec == "redundant" else 400
+    ids = families.generate_family(tags, count, distance)
+    lists = (ids, ids[:50] + tuple(i + 1 for i in ids[:50]), (*ids[:40], ids[7]))
+    pairs = [families.closest_pair(tags, each) for each in lists]
+    monkeypatch.setattr(families, "IDS_PER_NEAR_TAG", math.inf)
+    assert families.generate_family(tags, count, distance) == ids
+    assert [families.closest_pair(tags, each) for each in lists] == pairs
+    assert pairs[-1] == (0, (ids[7], ids[7]))
+
+
+def test_equal_keys_of_different_tags_do_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numbers of which most are equal make most keys equal."""
+    usual = families.generate_family(Tags(magnets=4), 2000, 2)
+
+    class Coarse(families._NearTags):
+        def __init__(self, tags: Tags, rows: np.ndarray) -> None:
+            super().__init__(tags, rows)
+            self.numbers = self.numbers % np.uint64(3)
+            keys = self.numbers[np.arange(rows.shape[1]), rows].sum(axis=1, dtype=np.uint64)
+            self.order = np.argsort(keys, kind="stable")
+            self.keys = keys[self.order]
+
+    monkeypatch.setattr(families, "IDS_PER_NEAR_TAG", 0.05)
+    monkeypatch.setattr(families, "_NearTags", Coarse)
+    assert families.generate_family(Tags(magnets=4), 2000, 2) == usual
+
+
+@pytest.mark.parametrize(
+    ("magnets", "orientations"), [(3, 2), (3, 4), (3, 5), (3, 6), (4, 3), (4, 4)]
+)
+def test_no_family_exceeds_the_bound(magnets: int, orientations: int) -> None:
+    """Against families by greedy search in several orders; small ones of order 2 and 3."""
+    tags = Tags(order=2 if magnets == 3 else 3, magnets=magnets, orientations=orientations)
+    capacity = codec.capacity(tags)
+    rows = families.symbol_table(tags, tuple(range(capacity)))
+    distances = families._distances(tags, rows, rows)
+    bounds = []
+    for distance in range(1, magnets * (orientations // 2) + 2):
+        bounds.append(families.max_family_size(tags, distance))
+        for seed in range(4):
+            order = np.arange(capacity)
+            if seed:
+                np.random.default_rng(seed).shuffle(order)
+            is_open = np.ones(capacity, bool)
+            size = 0
+            for tag_id in order:
+                if is_open[tag_id]:
+                    size += 1
+                    is_open &= distances[tag_id] >= distance
+            assert size <= bounds[-1], distance
+    assert bounds[0] == capacity
+    assert bounds[-1] == 1
+    assert bounds == sorted(bounds, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("magnets", "orientations", "distance", "words"),
+    [
+        (3, 7, 3, 49),  # perfect Lee code of radius 1 (Golomb and Welch, 1970)
+        (3, 8, 2, 256),  # even sums
+        (3, 4, 2, 32),  # even sums
+        (3, 8, 12, 2),  # a word and its opposite
+        (3, 2, 3, 2),  # repetition
+    ],
+)
+def test_the_bound_is_reached_by_known_codes(
+    magnets: int, orientations: int, distance: int, words: int
+) -> None:
+    tags = Tags(order=2, magnets=magnets, orientations=orientations)
+    assert families.max_family_size(tags, distance) == words
+
+
+def test_the_impossible_is_refused_before_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(families, "_near_any", None)
+    with pytest.raises(InputError, match="there are at most 29780") as caught:
+        families.generate_family(Tags(), 100_000, 3)
+    assert caught.value.hint == (
+        "Possible at best with a minimum distance of 2 or 6 magnets or 16 orientations"
+    )
+    with pytest.raises(InputError, match="there are at most 2") as caught:
+        families.generate_family(Tags(order=2, magnets=3, orientations=4), 3, 5)
+    assert "a minimum distance of 4" in caught.value.hint
+
+
+def test_progress_is_reported() -> None:
+    calls: list[None] = []
+    families.generate_family(Tags(), 3000, 2, partial(calls.append, None))
+    assert 60 <= len(calls) <= families.PROGRESS_STEPS
+    calls.clear()
+    tags = Tags(magnets=4, orientations=4)
+    count = families.max_family_size(tags, 2)
+    with pytest.raises(InputError):
+        families.generate_family(tags, count, 2, partial(calls.append, None))
+    assert len(calls) == families.PROGRESS_STEPS
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_tags() -> None:
+    """A family of distance 2 with six magnets; all pairs are checked by keys."""
+    ids = families.generate_family(Tags(magnets=6), 100_000, 2)
+    assert families.closest_pair(Tags(magnets=6), ids)[0] == 2

@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import magpylib
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -16,8 +17,12 @@ from locatk.core.polaris.preprocessing import (
     PassRange,
     estimate_noise,
     find_passes,
+    is_no_pass,
+    least_magnet_field,
     preprocess,
 )
+
+Array = NDArray[np.float64]
 
 CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
 SYMBOLS = (0, 3, 5, 2, 6)
@@ -211,3 +216,101 @@ def test_equal_time_stamps_are_an_error() -> None:
     frozen = replace(recording, time_ns=np.zeros_like(recording.time_ns))
     with pytest.raises(InputError, match="time stamps"):
         preprocess(frozen)
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ([0, 10, 10, 30], [0, 7, 17, 30]),  # one stamp was late
+        ([0, 40, 40, 40, 40, 80, 80, 80, 80], [0, 16, 32, 45, 55, 65, 75, 85, 95]),
+    ],
+)
+def test_equal_time_stamps_are_separated(times: list[int], expected: list[int]) -> None:
+    recording = samples()
+    later = 1_000 + 10 * np.arange(len(recording) - len(times))
+    time_ns = np.concatenate([np.array(times), later])
+    result = preprocess(replace(recording, time_ns=time_ns)).samples.time_ns
+    assert list(result[: len(times) - 2]) == expected[:-2]
+    assert np.all(np.diff(result) > 0)
+    np.testing.assert_array_equal(result[len(times) :], later)
+
+
+def test_different_time_stamps_are_kept() -> None:
+    recording = samples()
+    assert preprocess(recording).samples.time_ns is recording.time_ns
+
+
+def test_missing_values_are_no_change_of_the_field(world: Any) -> None:
+    """Sensors have offsets of up to 300 uT, which a missing value must not turn into a signal."""
+    for seed in range(4):
+        resting = world.record([], world.line(length=1.0), offsets=300e-6, seed=seed)
+        field = resting.field_t.copy()
+        field[np.random.default_rng(seed).random(field.shape) < 0.15] = np.nan
+        assert passes_of(world.spoiled(resting, field)) == []
+
+
+def rest(world: Any, seed: int, change_t: Array) -> Samples:
+    """A resting bar of which the field changes by ``change_t`` (n, 9, 3), over three seconds."""
+    resting = world.record([], world.line(length=0.3), noise=0.9e-6, seed=seed)
+    return world.spoiled(resting, resting.field_t + change_t)
+
+
+def is_pass(recording: Samples, **known: Any) -> list[bool]:
+    noise_t = estimate_noise(recording)
+    parts = find_passes(recording, noise_t)
+    return [not is_no_pass(recording, part, noise_t, **known) for part in parts]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_motor_that_starts_is_no_pass(seed: int, world: Any) -> None:
+    """Its field is fixed in shape, however strong it is."""
+    rng = np.random.default_rng(seed)
+    shape = 60e-6 * rng.standard_normal((9, 3))
+    current = 1 / (1 + np.exp(-(np.arange(300) - 150) / rng.uniform(1, 20)))
+    assert is_pass(rest(world, seed, current[:, None, None] * shape)) == [False]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_drift_is_no_pass_over_a_known_tag(seed: int, world: Any) -> None:
+    """Sensors that warm up, each axis at its own rate."""
+    rng = np.random.default_rng(seed)
+    drift = 8e-6 * rng.standard_normal((1, 9, 3))
+    change = drift * (1 - np.exp(-np.arange(300)[:, None, None] / rng.uniform(10, 60, (9, 3))))
+    recording = rest(world, seed, change)
+    field_t = least_magnet_field(recording, 1.8e-3, 0.01)
+    results = is_pass(recording, magnet_field_t=field_t)
+    assert results
+    assert not any(results)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pass_is_one_even_over_a_weak_magnet(seed: int, world: Any) -> None:
+    """A single magnet of a third of the design's field, and the end of the bar over a tag."""
+    rng = np.random.default_rng(seed)
+    kinds = (
+        ({"strength": (0.6, 0.0, 0.0, 0.0, 0.0), "heading": rng.uniform(0, 6)}, 0.012, 0.0),
+        ({"heading": rng.uniform(-0.1, 0.1)}, 0.011, 0.125),
+    )
+    for shape, clearance, lateral in kinds:
+        tag = world.Tag(CELLS, SYMBOLS, **shape)
+        course = world.line(length=0.4, lateral=lateral)
+        recording = world.record([tag], course, clearance=clearance, noise=0.9e-6, seed=seed)
+        field_t = least_magnet_field(recording, 1.8e-3, 0.01)
+        assert is_pass(recording, magnet_field_t=field_t) == [True]
+
+
+def test_a_path_at_rest_is_no_pass(world: Any) -> None:
+    recording = world.record([world.Tag(CELLS, SYMBOLS)], world.line(length=0.4))
+    path = np.linspace(0, 0.4, len(recording))
+    assert is_pass(recording, path_m=path) == [True]
+    assert is_pass(recording, path_m=1e-3 * path) == [False]
+
+
+def test_the_field_of_a_magnet_between_sensors(world: Any) -> None:
+    """Against magpylib, for the midpoint of two sensors and a moment along the track or across."""
+    recording = world.record([], world.line(), array=world.bar(2, 0.03))
+    fields = []
+    for moment in ((1e-3, 0, 0), (0, 1e-3, 0)):
+        magnet = magpylib.misc.Dipole(moment=moment, position=(0, 0, -0.012))
+        fields.append(np.linalg.norm(magnet.getB(recording.array.position_m)))
+    assert least_magnet_field(recording, 1e-3, 0.012) == pytest.approx(min(fields))

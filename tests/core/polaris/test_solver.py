@@ -375,3 +375,32 @@ def test_passes_are_merged_only_if_that_identifies_a_tag(
     assert len(solve([recording], replace(TAGS, spacing_m=0.03)).detections) == 2
     (merged,) = solve([recording], TAGS).detections
     assert merged.tag_id == id_of(SYMBOLS)
+
+
+# ---- before the robot starts, and how hosts stamp samples
+
+
+def test_drift_before_the_start_is_no_refused_pass(world: Any) -> None:
+    """Three seconds at rest, while sensors warm up and a tool is laid down nearby."""
+    tag = world.Tag(CELLS, SYMBOLS)
+    course = world.driven(world.line(length=0.4), [0, 3, 7], [0, 0, 1])
+    samples = world.record([tag], course, noise=0.9e-6, rate=60.0, seed=7)
+    rng = np.random.default_rng(7)
+    time = np.arange(len(samples))[:, None, None] / 60
+    change = 12e-6 * rng.standard_normal((9, 3)) / (1 + np.exp(-(time - 1.0) / 0.05))
+    change = change + 5e-6 * rng.standard_normal((9, 3)) * np.exp(-time / rng.uniform(0.2, 0.6))
+    solution = solve([world.spoiled(samples, samples.field_t + change)], TAGS)
+    assert [d.tag_id for d in solution.detections] == [id_of(SYMBOLS)]
+    assert solution.rejected["no_pass"] >= 1
+    assert sum(solution.rejected.values()) == solution.rejected["no_pass"]
+
+
+def test_equal_time_stamps_do_not_lose_a_pass(world: Any) -> None:
+    tag, course, samples = passed(world)
+    for count in (2, 8):
+        time_ns = samples.time_ns.copy()
+        middle = len(time_ns) // 2
+        time_ns[middle : middle + count] = time_ns[middle + count - 1]
+        result = the_tag(solve([replace(samples, time_ns=time_ns)], TAGS))
+        assert result.tag_id == id_of(SYMBOLS)
+        assert np.all(np.abs(errors(world, result, course, tag)[1:]) < [1e-3, 0.01])

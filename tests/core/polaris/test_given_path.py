@@ -1,0 +1,132 @@
+"""A wrong speed or wrong odometry is corrected and reported; a right one is believed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.geometry import quaternion_from_heading
+from locatk.core.polaris import codec
+from locatk.core.polaris.given_path import PathContradiction, contradiction_warning
+from locatk.core.polaris.solver import SolveOptions, solve
+from locatk.core.polaris.tag import TagLayout, Tags
+from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
+from locatk.formats.benchmarks.polaris import suite
+
+Array = NDArray[np.float64]
+
+TAGS = Tags()
+CELLS = ((0, 0), (1, 1), (0, 2), (1, 2), (2, 2))
+SYMBOLS = (0, 3, 5, 2, 6)
+TAG_ID = codec.id_of(TAGS, TagLayout(CELLS, SYMBOLS))
+SPEED_MPS = 0.1
+
+
+def angle_errors_deg(world: Any, solution: Solution, tag: Any) -> Array:
+    (result,) = solution.detections
+    assert result.tag_id == TAG_ID
+    angles = [magnet.angle_rad for magnet in result.magnets]
+    return np.degrees(np.abs(world.turn(angles, tag.angles)))
+
+
+def driven_odometry(course: Any, scale: float) -> Trajectory:
+    """The true path of a course, with all lengths multiplied by ``scale``."""
+    t = np.linspace(course.t[0], course.t[-1], 400)
+    x, y, heading = course.at(t)
+    position = np.column_stack([scale * x, scale * y, 0 * x])
+    return Trajectory(
+        "bar",
+        "odom",
+        1_700_000_000_000_000_000 + np.rint(t * 1e9).astype(np.int64),
+        position,
+        quaternion_from_heading(heading),
+        np.full((400, 6, 6), np.nan),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.8, 0.93, 0.97, 1.04, 1.09, 1.5])
+@pytest.mark.parametrize("seed", [501, 502])
+def test_a_wrong_speed_is_corrected_and_reported(factor: float, seed: int, world: Any) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, heading=0.3 * seed)
+    samples = world.record([tag], world.line(length=0.3, speed=SPEED_MPS), seed=seed, rate=60.0)
+    solution = solve([samples], TAGS, SolveOptions(speed_mps=factor * SPEED_MPS))
+    assert angle_errors_deg(world, solution, tag).max() < 0.35
+    (warning,) = solution.warnings
+    assert warning.code == "path_contradicted"
+    fitting_mps = float(warning.message.split("(")[1].split(" ")[0])
+    assert fitting_mps == pytest.approx(SPEED_MPS, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(511, 517))
+def test_the_right_speed_is_believed(seed: int, world: Any) -> None:
+    moved = np.random.default_rng(seed).normal(0, 4e-4, (5, 2))
+    tag = world.Tag(CELLS, SYMBOLS, heading=0.3 * seed, moved=moved)
+    samples = world.record([tag], world.line(length=0.3, speed=SPEED_MPS), seed=seed, rate=60.0)
+    solution = solve([samples], TAGS, SolveOptions(speed_mps=SPEED_MPS))
+    assert solution.warnings == ()
+    assert solution.detections[0].scale == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scale", "is_right"), [(1.0, True), (0.96, False), (1.3, False)])
+def test_the_scale_of_odometry(scale: float, is_right: bool, world: Any) -> None:
+    """The robot hesitates over the tag, which no constant speed describes."""
+    tag = world.Tag(CELLS, SYMBOLS, heading=1.2)
+    course = world.driven(world.line(length=0.3), [0.0, 1.2, 1.6, 3.0], [0.0, 0.4, 0.45, 1.0])
+    samples = world.record([tag], course, seed=521)
+    solution = solve([samples], TAGS, odometry=[driven_odometry(course, scale)])
+    assert angle_errors_deg(world, solution, tag).max() < 0.35
+    codes = [warning.code for warning in solution.warnings]
+    assert codes == ([] if is_right else ["path_contradicted"])
+    if not is_right:
+        factor = float(solution.warnings[0].message.split("; ")[1].split(" ")[0])
+        assert factor == pytest.approx(1 / scale, rel=0.015)
+        assert "odometry" in solution.warnings[0].message
+
+
+@pytest.mark.slow
+def test_a_published_run_at_another_speed(recordings: Path) -> None:
+    """With 0.108 m/s the residual is 1.58 times the noise, and angles change by 4.6 degrees."""
+    samples = suite.read_runs(recordings)["varying"][1]
+    free = solve([samples], suite.PUBLISHED_TAGS).detections
+    for speed_mps in np.linspace(0.102, 0.114, 5):
+        solution = solve([samples], suite.PUBLISHED_TAGS, SolveOptions(speed_mps=float(speed_mps)))
+        assert [d.tag_id for d in solution.detections] == [d.tag_id for d in free]
+        np.testing.assert_allclose(
+            [m.angle_rad for m in solution.detections[0].magnets],
+            [m.angle_rad for m in free[0].magnets],
+            atol=np.radians(0.5),
+        )
+        assert [warning.code for warning in solution.warnings] == ["path_contradicted"]
+
+
+@pytest.mark.parametrize(
+    ("scales", "speed_mps", "expected"),
+    [
+        ((None, None), 0.1, None),
+        (
+            (0.5, None),
+            0.1,
+            "the given speed of 0.1 m/s contradicts the samples of 1 of 2 passes; "
+            "0.500 times the given lengths fit (0.0500 m/s)",
+        ),
+        (
+            (1.1, 1.2),
+            None,
+            "the given odometry contradicts the samples of 2 of 2 passes; "
+            "1.100 to 1.200 times the given lengths fit",
+        ),
+        ((np.inf,), None, "the given odometry contradicts the samples of 1 of 1 passes"),
+    ],
+)
+def test_one_warning_for_all_passes(scales: Any, speed_mps: Any, expected: Any) -> None:
+    passes = [None if scale is None else PathContradiction(scale) for scale in scales]
+    warning = contradiction_warning(passes, speed_mps)
+    assert (None if warning is None else warning.message) == expected
