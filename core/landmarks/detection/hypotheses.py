@@ -31,6 +31,7 @@ from locatk.core.landmarks.detection.fit import (
     VisitFitProblem,
     VisitFits,
     fit_visit,
+    neighbour_fields,
 )
 from locatk.core.landmarks.detection.scan import (
     COARSE_GRID,
@@ -39,6 +40,8 @@ from locatk.core.landmarks.detection.scan import (
     ONE_MISSING_STRENGTHS,
     ScanGrid,
     find_candidates,
+    has_strong_field,
+    source_region,
 )
 from locatk.core.landmarks.detection.trace import Trace, planar_rotation
 from locatk.core.landmarks.landmark import (
@@ -89,8 +92,9 @@ FAULTY_STRENGTH_SIGMA = 0.5
 MAX_STRENGTH_SIGMAS = 2.5
 """Deviation of a bar's strength from the nominal one at which faulty bars are considered."""
 
-MAX_INTACT_RESIDUAL_SIGMAS = 1.6
-"""Rms residual of the best intact landmark above which the fine grid and faulty bars are tried."""
+MAX_INTACT_RESIDUAL_SIGMAS = 1.2
+"""Rms residual of the best intact landmark above which the fine grid and faulty bars are tried. It
+is at most 1 if the model holds, plus three times the scatter of a hundred readings (0.07)."""
 
 MIN_PROBABILITY = 1e-9
 """Probability below which a hypothesis is not reported."""
@@ -214,8 +218,8 @@ class VisitHypotheses:
     odometry : (3,) ndarray
         Robot at ``time_ns`` by its own odometry: x, y, heading.
     hypotheses : tuple of Hypothesis
-        The most probable first; empty if the visit is too short or too weak, but kept if it is
-        ``"not_explained"``.
+        The most probable first; empty if the visit is too short or too weak. They are kept if it is
+        ``"not_explained"``, unless there is none within the range of its fields.
     residual_sigma : float
         Rms residual of the best hypothesis in standard deviations of the noise; ``nan`` if the
         method has no model of the samples.
@@ -292,6 +296,7 @@ def detect_landmarks(
     InputError
         The sensors are in the wrong order, or one has the opposite sign.
     """
+    priors = replace(priors, pitch_m=pitch_m)
     visits = detect_visits(recording, geometry, priors, pitch_m)
     best = [
         visit.hypotheses.best.fit
@@ -349,7 +354,10 @@ def detect_landmark(
         hypotheses=(),
     )
     if not fits:
-        return replace(unread, refused="too_short" if is_too_short else "too_weak")
+        if is_too_short:
+            return replace(unread, refused="too_short")
+        is_strong = has_strong_field(trace, geometry)
+        return replace(unread, refused="not_explained" if is_strong else "too_weak")
     hypotheses = []
     for fit in fits:
         pose, covariance = robot_pose(trace, fit, trace.reference)
@@ -393,15 +401,18 @@ def fit_landmarks(
     Returns
     -------
     list of LandmarkFit
-        The most probable first. Their probabilities sum to 1. Empty if no field is strong.
+        The most probable first. Their probabilities sum to 1. Empty if no field is strong, or if
+        no landmark within the range of the fields can be fitted.
     """
-    fits = _fit_intact(trace, geometry, priors, COARSE_GRID)
-    if not fits:
+    if not has_strong_field(trace, geometry):
         return []
+    fits = _fit_intact(trace, geometry, priors, COARSE_GRID)
     if not thorough:
         return _with_probabilities(fits)
-    if _best(fits).residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
-        fits = _fit_intact(trace, geometry, priors, FINE_GRID)
+    if not fits or _best(fits).residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
+        fits = _fit_intact(trace, geometry, priors, FINE_GRID) or fits
+    if not fits:
+        return []
     best = _best(fits)
     deviation = np.abs(best.strength - signs(best.code)) / priors.strength
     if deviation.max() > MAX_STRENGTH_SIGMAS or best.residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
@@ -453,10 +464,12 @@ def estimate_pose_at_known_landmark(
         Robot in the landmark's frame at the reference of the trace.
     covariance : (3, 3) ndarray
     """
-    problem = _fit_problem(trace, geometry, priors, np.asarray(strength, float)[None])
     cos, sin = math.cos(start[2]), math.sin(start[2])
     landmark = [-cos * start[0] - sin * start[1], sin * start[0] - cos * start[1], -start[2]]
-    fits = fit_visit(problem, problem.initial_parameters(np.array([landmark])))
+    problem, initial = _fit_problem(
+        trace, geometry, priors, np.asarray(strength, float)[None], np.array([landmark])
+    )
+    fits = fit_visit(problem, initial)
     return robot_pose(trace, _landmark_fits(problem, fits)[0], trace.reference)
 
 
@@ -508,27 +521,34 @@ def _fit_strengths(
     pose, which = find_candidates(coarse, geometry, strengths, max_candidates, grid)
     if not len(pose):
         return []
-    problem = _fit_problem(coarse, geometry, priors, strengths[which])
-    problem, fits = _fit_and_select(problem, problem.initial_parameters(pose))
+    problem, start = _fit_problem(coarse, geometry, priors, strengths[which], pose)
+    problem, fits = _fit_and_select(problem, start)
     evidence = fits.log_evidence()
     # Bars at the far side are weakly observed: try all other strengths at the best pose.
     best = int(np.argmax(evidence))
     others = strengths[(strengths != problem.strength[best]).any(axis=1)]
-    other_problem = _fit_problem(coarse, geometry, priors, others)
-    start = other_problem.initial_parameters(
-        np.repeat(fits.parameters[[best], :3], len(others), axis=0)
-    )
+    at_best = np.repeat(fits.parameters[[best], :3], len(others), axis=0)
+    other_problem, start = _fit_problem(coarse, geometry, priors, others, at_best)
     other_problem, other_fits = _fit_and_select(other_problem, start, evidence.max())
     evidence = np.concatenate([evidence, other_fits.log_evidence()])
     strength = np.concatenate([problem.strength, other_problem.strength])
-    parameters = np.concatenate([fits.parameters, other_fits.parameters])
+    own = slice(problem.layout.neighbour.start)  # Neighbours differ in number and order.
+    parameters = np.concatenate([fits.parameters[:, own], other_fits.parameters[:, own]])
     if heading_rad is None:
         heading_rad = math.remainder(float(parameters[np.argmax(evidence), 2]), HALF_PI_RAD)
     kept = np.flatnonzero(evidence > evidence.max() - MAX_LOG_ODDS)
-    strength, start = _rotate_frames(strength[kept], parameters[kept], heading_rad)
-    strength, start = _select_distinct(strength, start, evidence[kept])
-    problem = _fit_problem(trace.thinned(MAX_FIT_SAMPLES), geometry, priors, strength)
-    return _landmark_fits(problem, fit_visit(problem, start))
+    strength, parameters = _rotate_frames(strength[kept], parameters[kept], heading_rad)
+    distinct = _select_distinct(strength, parameters, evidence[kept])[:MAX_HYPOTHESES]
+    problem, start = _fit_problem(
+        trace.thinned(MAX_FIT_SAMPLES), geometry, priors, strength[distinct], parameters[distinct]
+    )
+    fits = fit_visit(problem, start)
+    # Different initial guesses may have converged to one minimum, which counts once.
+    distinct = _select_distinct(problem.strength, fits.parameters, fits.log_evidence())
+    middle, radius_m = source_region(trace, geometry)
+    distance_m = np.hypot(*(fits.parameters[distinct, :2] - middle).T)
+    distinct = distinct[distance_m <= radius_m]
+    return _landmark_fits(problem.take(distinct), fits.take(distinct))
 
 
 def _fit_and_select(
@@ -550,11 +570,18 @@ def _fit_and_select(
 
 
 def _fit_problem(
-    trace: Trace, geometry: Geometry, priors: ModelPriors, strength: Array
-) -> VisitFitProblem:
-    """Return the problem for strengths (K, 4), of which 0 stands for a faulty bar."""
+    trace: Trace, geometry: Geometry, priors: ModelPriors, strength: Array, start: Array
+) -> tuple[VisitFitProblem, Array]:
+    """Return the problem for strengths (K, 4), of which 0 stands for a faulty bar.
+
+    Returns its initial parameters as well, of which the leading ones are those of ``start`` (K, m).
+    """
     sigma = np.where(strength == 0, FAULTY_STRENGTH_SIGMA, priors.strength)
-    return VisitFitProblem(trace, geometry, priors, strength, sigma)
+    neighbours = neighbour_fields(trace, geometry, priors, start[:, :3])
+    problem = VisitFitProblem(trace, geometry, priors, strength, sigma, neighbours)
+    parameters = problem.initial_parameters(start[:, :3])
+    parameters[:, : start.shape[1]] = start
+    return problem, parameters
 
 
 def _rotate_frames(strength: Array, parameters: Array, heading_rad: float) -> tuple[Array, Array]:
@@ -566,20 +593,22 @@ def _rotate_frames(strength: Array, parameters: Array, heading_rad: float) -> tu
     return np.take_along_axis(strength, bars, axis=1), rotated_parameters
 
 
-def _select_distinct(strength: Array, parameters: Array, evidence: Array) -> tuple[Array, Array]:
-    """Return the best of each group of equal hypotheses, at most :data:`MAX_HYPOTHESES`."""
+def _select_distinct(strength: Array, parameters: Array, evidence: Array) -> NDArray[np.intp]:
+    """Return the best of each group of equal hypotheses, the best group first."""
     kept: list[int] = []
     for i in np.argsort(-evidence):
         difference = np.abs(parameters[kept, :3] - parameters[i, :3]).max(axis=1)
         has_same_bars = (strength[kept] == strength[i]).all(axis=1)
         is_duplicate = np.any(has_same_bars & (difference < MERGE_DIFFERENCE))
-        if not is_duplicate and len(kept) < MAX_HYPOTHESES:
+        if not is_duplicate:
             kept.append(int(i))
-    return strength[kept], parameters[kept]
+    return np.array(kept, np.intp)
 
 
 def _with_probabilities(fits: list[LandmarkFit]) -> list[LandmarkFit]:
     """Set the probabilities of all fits to a trace; the most probable first."""
+    if not fits:
+        return []
     log_odds = np.array([fit.log_odds for fit in fits])
     probability = np.exp(log_odds - log_odds.max())
     probability /= probability.sum()

@@ -274,9 +274,10 @@ def fit_of(
     )
 
 
-def segment_of(first: int = 0, bins: int = 5) -> VisitSegment:
+def segment_of(first: int = 0, bins: int = 5, field_t: float = 5e-3) -> VisitSegment:
     time_ns = np.arange(first, first + bins, dtype=np.int64)
-    return VisitSegment(first, first + bins, time_ns, line_trace(bins), np.zeros(3))
+    trace = replace(line_trace(bins), field_t=np.full((bins, 4), field_t))
+    return VisitSegment(first, first + bins, time_ns, trace, np.zeros(3))
 
 
 def recording_of() -> HallRecording:
@@ -299,21 +300,27 @@ def test_negative_gain_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bins", "fits", "refused"),
+    ("bins", "field_t", "fits", "refused"),
     [
-        (4, [fit_of(5.9)], ""),
-        (4, [fit_of(6.1)], "not_explained"),
-        (4, [], "too_weak"),
-        (3, [fit_of(1.0)], "too_short"),
+        (4, 5e-3, [fit_of(5.9)], ""),
+        (4, 5e-3, [fit_of(6.1)], "not_explained"),
+        (4, 5e-3, [], "not_explained"),
+        (4, 1e-3, [], "too_weak"),
+        (3, 5e-3, [fit_of(1.0)], "too_short"),
     ],
 )
 def test_visits_are_refused_with_a_reason(
-    bins: int, fits: list[LandmarkFit], refused: str, monkeypatch: pytest.MonkeyPatch
+    bins: int,
+    field_t: float,
+    fits: list[LandmarkFit],
+    refused: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(hypotheses, "fit_landmarks", lambda *_: fits)
-    visit = detect_landmark(segment_of(bins=bins), recording_of(), GEOMETRY, ModelPriors())
+    segment = segment_of(bins=bins, field_t=field_t)
+    visit = detect_landmark(segment, recording_of(), GEOMETRY, ModelPriors())
     assert visit.refused == refused
-    assert bool(visit.hypotheses) == (refused in ("", "not_explained"))
+    assert bool(visit.hypotheses) == (bool(fits) and refused in ("", "not_explained"))
 
 
 @pytest.mark.parametrize(
