@@ -193,8 +193,8 @@ def identify_recording(
     visits, map_probability = identify_visits(
         detected, floor, misread=options.misread, drift=priors.drift
     )
-    assert odometry is not None  # preprocess() requires it
-    return IdentifiedRecording(recording, odometry, priors, visits, map_probability)
+    assert recording.odometry is not None  # preprocess() sets it
+    return IdentifiedRecording(recording, recording.odometry, priors, visits, map_probability)
 
 
 @dataclass(frozen=True)

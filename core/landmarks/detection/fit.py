@@ -125,7 +125,20 @@ class ParameterLayout:
         """Return the layout for numbers of sensors, errors of the odometry and further bars."""
         counts = (3, sensors, sensors, BAR_COUNT, 2 * BAR_COUNT, 1, corrections, neighbours)
         edges = [0, *np.cumsum(counts).tolist()]
-        return cls(*(slice(start, stop) for start, stop in pairwise(edges)), size=edges[-1])
+        pose, gain, offset, strength, bar_position, height, correction, neighbour = (
+            slice(start, stop) for start, stop in pairwise(edges)
+        )
+        return cls(
+            pose,
+            gain,
+            offset,
+            strength,
+            bar_position,
+            height,
+            correction,
+            neighbour,
+            size=edges[-1],
+        )
 
     @classmethod
     def of_trace(cls, trace: Trace, neighbours: int = 0) -> ParameterLayout:

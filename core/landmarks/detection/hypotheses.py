@@ -102,6 +102,12 @@ MIN_PROBABILITY = 1e-9
 MIN_BINS = 4
 """Bins of the path below which a visit is too short."""
 
+MAX_POSE_SIGMA_M = 6e-3
+MAX_POSE_SIGMA_RAD = math.radians(8)
+"""Standard deviations of the best pose above which a visit is too weak: half the distance at which
+two initial guesses converge to different minima. Beyond, the field is not linear within the
+covariance, and minima that were not tried may be as probable."""
+
 MAX_RESIDUAL_SIGMAS = 6.0
 """Rms residual above which no landmark explains a visit."""
 
@@ -374,6 +380,11 @@ def detect_landmark(
             )
         )
     residual = fits[0].residual_sigma
+    sigma = np.sqrt(np.diag(hypotheses[0].covariance))
+    if residual <= MAX_RESIDUAL_SIGMAS and (
+        sigma[:2].max() > MAX_POSE_SIGMA_M or sigma[2] > MAX_POSE_SIGMA_RAD
+    ):
+        return replace(unread, refused="too_weak")
     return replace(
         unread,
         hypotheses=tuple(hypotheses),

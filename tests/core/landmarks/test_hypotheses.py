@@ -270,7 +270,15 @@ def fit_of(
     parameters = np.zeros(layout.size)
     parameters[layout.gain] = gain_sigmas
     return LandmarkFit(
-        5, 0.0, parameters, np.eye(layout.size), signs(5), np.ones(4), residual_sigma, -1, 1.0
+        5,
+        0.0,
+        parameters,
+        1e-6 * np.eye(layout.size),
+        signs(5),
+        np.ones(4),
+        residual_sigma,
+        -1,
+        1.0,
     )
 
 

@@ -365,3 +365,16 @@ def test_residuals_of_the_fields_limit_the_poses(
     assert bool(robot.trajectories) == poses
     assert robot.facts.localised == poses
     assert robot.facts.misfit_sigma == residual_sigma
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_invalid_poses_of_odometry_do_not_stop_the_solver(value: float) -> None:
+    def invalidate(position: Array) -> Array:
+        position[[7, len(position) // 3, -1], [0, 1, 0]] = value
+        return position
+
+    solution = solved(session(), place=invalidate)
+    assert "odometry_invalid" in warning_codes(solution)
+    assert [each.cell for each in solution.detections] == CELLS
+    assert np.isfinite(solution.trajectories[0].position).all()
