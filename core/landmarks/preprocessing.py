@@ -143,6 +143,21 @@ class HallRecording:
         samples = replace(self.samples, field_t=field)
         return replace(self, samples=samples, warnings=(*self.warnings, warning))
 
+    def rescaled(self, scale: float) -> HallRecording:
+        """Return the recording with readings divided by a factor, with a warning."""
+        message = (
+            f"fields are {scale:.2g} times those of the bars of the map; corrected. Check the unit "
+            "and the gain of the readings, the height of the sensors, and the bars of the map"
+        )
+        warning = SolverWarning("sensor_scale", message).about(self.samples.device)
+        return replace(
+            self,
+            samples=replace(self.samples, field_t=self.samples.field_t / scale),
+            offset_t=self.offset_t / scale,
+            noise_t=max(self.noise_t / scale, MIN_NOISE_T),
+            warnings=(*self.warnings, warning),
+        )
+
 
 @dataclass(frozen=True)
 class VisitSegment:

@@ -190,6 +190,7 @@ def identify_recording(
     check_odometry(recording, geometry)
     priors = replace(options.priors, noise_t=recording.noise_t)
     recording, detected = detect_landmarks(recording, geometry, priors, pitch_m)
+    priors = replace(priors, noise_t=recording.noise_t)
     visits, map_probability = identify_visits(
         detected, floor, misread=options.misread, drift=priors.drift
     )

@@ -115,24 +115,44 @@ SAME_LANDMARK_PITCH_FRACTION = 0.2
 """Distance of landmarks, relative to the pitch, below which two successive visits are one."""
 
 MIN_UNEXPLAINED_FRACTION = 0.25
-"""Fraction of unexplained visits above which the sensors are checked."""
+"""Fraction of unexplained visits above which single sensors are checked."""
+
+MIN_DOUBTFUL_FRACTION = 0.1
+"""Fraction of doubtful visits above which order, signs and scale of the sensors are checked."""
+
+MAX_MEAN_SQUARED_DEVIATION = 3.1
+"""Mean square of gains, strengths and height, in standard deviations of their priors, above which
+a visit is doubtful: the 99.9 % quantile of chi-square with nine degrees of freedom, by each."""
+
+CHECKED_SCALES = tuple(2 ** (k / 2) for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
+"""Common scales of the readings that are tried; the steps are smaller than :data:`.GAIN_RANGE`."""
+
+MIN_CHANGE_LOG_ODDS = 20.0
+"""Log evidence of all checked visits in favour of a change from which on it is believed: one in a
+million for the prior probability of a fault, and the same again for errors of the model."""
+
+MAX_CHANGE_LOG_LOSS = 7.0
+"""Log evidence of a single visit against a change from which on it is not believed (1 : 1000)."""
+
+MAX_LOG_EVIDENCE = 1e9
+"""Log evidence against a change with which no landmark can be fitted."""
 
 MAX_CHECKED_VISITS = 3
-"""Unexplained visits that are used for this check; it fits each of them many times."""
+"""Doubtful visits, and others, that are used for these checks, which fit each of them many
+times."""
 
 MAX_PERMUTED_SENSORS = 4
-"""Number of sensors up to which order, signs and faulty sensors are checked on
-unexplained visits."""
+"""Number of sensors up to which order, signs and faulty sensors are checked."""
 
 MAX_REFINED_CHANGES = 3
-"""Most likely changes of the sensors that are tried on all these visits."""
+"""Most likely changes of the sensors by the longest visit, which are tried on all of them."""
 
 MAX_GAIN_SIGMAS = 4.0
 """Deviation of a sensor's gain, in standard deviations of its prior, above which a warning is
 given."""
 
 MIN_RESIDUAL_RATIO = 3.0
-"""Factor by which a change of the sensors must reduce the residual in order to be believed."""
+"""Factor by which the residual must decrease without a sensor so that it is left out."""
 
 
 @dataclass(frozen=True)
@@ -304,6 +324,15 @@ def detect_landmarks(
     """
     priors = replace(priors, pitch_m=pitch_m)
     visits = detect_visits(recording, geometry, priors, pitch_m)
+    scale = check_wiring(visits, recording, geometry, priors)
+    if scale != 1:
+        recording = recording.rescaled(scale)
+        priors = replace(priors, noise_t=recording.noise_t)
+        visits = detect_visits(recording, geometry, priors, pitch_m)
+    faulty_sensor = find_faulty_sensor(visits, recording, geometry, priors)
+    if faulty_sensor is not None:
+        recording = recording.without_sensor(faulty_sensor)
+        visits = detect_visits(recording, geometry, priors, pitch_m)
     best = [
         visit.hypotheses.best.fit
         for visit in visits
@@ -311,10 +340,6 @@ def detect_landmarks(
     ]
     gain_warnings = check_gains(best, recording, priors)
     recording = replace(recording, warnings=(*recording.warnings, *gain_warnings))
-    faulty_sensor = find_faulty_sensor(visits, recording, geometry, priors)
-    if faulty_sensor is not None:
-        recording = recording.without_sensor(faulty_sensor)
-        visits = detect_visits(recording, geometry, priors, pitch_m)
     return recording, visits
 
 
@@ -703,12 +728,95 @@ class SensorChange:
     ----------
     order : tuple of int
         Column of each sensor.
-    factor : tuple of float
-        Of each sensor: -1 for the opposite sign, ``nan`` for a sensor that is left out.
+    sign : tuple of float
+        Of each sensor: -1 if it is the opposite one.
+    scale : float
+        Readings relative to those expected, common to all sensors.
     """
 
     order: tuple[int, ...]
-    factor: tuple[float, ...]
+    sign: tuple[float, ...]
+    scale: float = 1.0
+
+
+def check_wiring(
+    visits: Sequence[DetectedVisit],
+    recording: HallRecording,
+    geometry: Geometry,
+    priors: ModelPriors,
+) -> float:
+    """Check order, signs and common scale of the sensors if visits fit badly.
+
+    A change is believed if it makes these visits more probable, and none of the others less.
+
+    Returns
+    -------
+    float
+        Readings relative to those expected, common to all sensors; 1 if they agree.
+
+    Raises
+    ------
+    InputError
+        The sensors are in the wrong order, or one has the opposite sign; the message names them.
+    """
+    names, device = recording.samples.sensors.names, recording.samples.device
+    longest_first = sorted(visits, key=lambda visit: -len(visit.segment.trace))
+    doubtful = [visit.segment.trace for visit in longest_first if _is_doubtful(visit)]
+    if len(doubtful) <= MIN_DOUBTFUL_FRACTION * len(visits) or len(names) > MAX_PERMUTED_SENSORS:
+        return 1.0
+    others = [
+        visit.segment.trace
+        for visit in longest_first
+        if not (_is_doubtful(visit) or visit.hypotheses.refused)
+    ]
+    traces = [*doubtful[:MAX_CHECKED_VISITS], *others[:MAX_CHECKED_VISITS]]
+
+    @functools.cache
+    def best_fit(change: SensorChange, index: int) -> LandmarkFit | None:
+        trace = traces[index]
+        field = trace.field_t[:, list(change.order)] * change.sign
+        scaled = replace(geometry, remanence_t=change.scale * geometry.remanence_t)
+        fits = fit_landmarks(replace(trace, field_t=field), scaled, priors, thorough=False)
+        return _best(fits) if fits else None
+
+    def evidence(change: SensorChange, index: int) -> float:
+        fit = best_fit(change, index)
+        return fit.log_odds if fit is not None else -MAX_LOG_EVIDENCE
+
+    as_given, *changes = _sensor_changes(len(names))
+    likely = sorted(changes, key=lambda change: -evidence(change, 0))[:MAX_REFINED_CHANGES]
+    indices = range(len(traces))
+    best = max(likely, key=lambda change: sum(evidence(change, index) for index in indices))
+    gains = [evidence(best, index) - evidence(as_given, index) for index in indices]
+    if sum(gains) < MIN_CHANGE_LOG_ODDS or min(gains) < -MAX_CHANGE_LOG_LOSS:
+        return 1.0
+    if best.order != as_given.order:
+        actual = ", ".join(names[best.order.index(k)] for k in as_given.order)
+        raise InputError(
+            f"the hall sensors of {device} are in the wrong order: {', '.join(names)} are {actual}",
+            hint="Name the columns in that order, or correct halls.toml",
+        )
+    if best.sign != as_given.sign:
+        raise _opposite_sign_error(names[best.sign.index(-1)], device)
+    fits = [fit for index in indices if (fit := best_fit(best, index)) is not None]
+    gain = ParameterLayout.of(len(names), 0).gain
+    remaining = [
+        np.mean(1 + priors.gain * fit.parameters[gain]) * np.mean(np.abs(fit.strength))
+        for fit in fits
+    ]
+    return best.scale * float(np.median(remaining))
+
+
+def _is_doubtful(visit: DetectedVisit) -> bool:
+    """Return whether a visit is not explained, or only by improbable bars, gains and heights."""
+    if visit.hypotheses.refused:
+        return visit.hypotheses.refused == "not_explained"
+    fit = visit.hypotheses.best.fit
+    if fit is None:
+        return False
+    layout = ParameterLayout.of_trace(visit.segment.trace)
+    columns = np.r_[layout.gain, layout.strength, layout.height]
+    return float((fit.parameters[columns] ** 2).mean()) > MAX_MEAN_SQUARED_DEVIATION
 
 
 def find_faulty_sensor(
@@ -717,67 +825,41 @@ def find_faulty_sensor(
     geometry: Geometry,
     priors: ModelPriors,
 ) -> int | None:
-    """Find a wrong order, an opposite sign or a faulty sensor if many visits are unexplained.
-
-    Returns
-    -------
-    int or None
-        A sensor without which the visits are explained.
-
-    Raises
-    ------
-    InputError
-        The sensors are in the wrong order, or one has the opposite sign; the message names them.
-    """
+    """Find a sensor without which the visits are explained, if many of them are not."""
     unexplained = [
-        visit.segment.trace
-        for visit in visits
-        if visit.hypotheses.residual_sigma > MAX_RESIDUAL_SIGMAS
+        visit.segment.trace for visit in visits if visit.hypotheses.refused == "not_explained"
     ]
-    names, device = recording.samples.sensors.names, recording.samples.device
+    count = len(recording.samples.sensors)
     if (
         len(unexplained) <= MIN_UNEXPLAINED_FRACTION * len(visits)
-        or len(names) > MAX_PERMUTED_SENSORS
+        or not 1 < count <= MAX_PERMUTED_SENSORS
     ):
         return None
     unexplained = sorted(unexplained, key=len, reverse=True)[:MAX_CHECKED_VISITS]
 
-    @functools.cache
-    def residual(change: SensorChange, index: int) -> float:
-        trace = unexplained[index]
-        field = trace.field_t[:, list(change.order)] * change.factor
-        fits = fit_landmarks(replace(trace, field_t=field), geometry, priors, thorough=False)
-        return fits[0].residual_sigma if fits else math.inf
+    def median_residual(left_out: int | None) -> float:
+        residuals = []
+        for trace in unexplained:
+            field = trace.field_t.copy()
+            if left_out is not None:
+                field[:, left_out] = np.nan
+            fits = fit_landmarks(replace(trace, field_t=field), geometry, priors, thorough=False)
+            residuals.append(fits[0].residual_sigma if fits else math.inf)
+        return float(np.median(residuals))
 
-    def median_residual(change: SensorChange) -> float:
-        return float(np.median([residual(change, index) for index in range(len(unexplained))]))
-
-    as_given, *others = _sensor_changes(len(names))
-    likely = sorted(others, key=lambda change: residual(change, 0))
-    best = min(likely[:MAX_REFINED_CHANGES], key=median_residual)
-    limit = min(MAX_RESIDUAL_SIGMAS, median_residual(as_given) / MIN_RESIDUAL_RATIO)
-    if median_residual(best) > limit:
-        return None
-    if best.order != as_given.order:
-        actual = ", ".join(names[best.order.index(k)] for k in as_given.order)
-        raise InputError(
-            f"the hall sensors of {device} are in the wrong order: {', '.join(names)} are {actual}",
-            hint="Name the columns in that order, or correct halls.toml",
-        )
-    changed = int(np.flatnonzero(np.asarray(best.factor) != 1)[0])
-    if best.factor[changed] == -1:
-        raise _opposite_sign_error(names[changed], device)
-    return changed
+    residual = [median_residual(sensor) for sensor in range(count)]
+    best = int(np.argmin(residual))
+    limit = min(MAX_RESIDUAL_SIGMAS, median_residual(None) / MIN_RESIDUAL_RATIO)
+    return best if residual[best] <= limit else None
 
 
 def _sensor_changes(count: int) -> list[SensorChange]:
     """Return all hypothetical wirings of the sensors, the given one first."""
     given, ones = tuple(range(count)), (1.0,) * count
     changes = [SensorChange(order, ones) for order in itertools.permutations(given)]
-    for factor in (-1.0, math.nan):
-        for k in given:
-            changes.append(SensorChange(given, (*ones[:k], factor, *ones[k + 1 :])))
-    return changes
+    for k in given:
+        changes.append(SensorChange(given, (*ones[:k], -1.0, *ones[k + 1 :])))
+    return changes + [SensorChange(given, ones, scale) for scale in CHECKED_SCALES]
 
 
 def _opposite_sign_error(name: str, device: str) -> InputError:

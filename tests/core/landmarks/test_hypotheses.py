@@ -344,7 +344,7 @@ def test_sensor_is_left_out_only_if_that_explains_the_visits(
         return [fit_of(without_rear if is_without_rear else as_given)]
 
     monkeypatch.setattr(hypotheses, "fit_landmarks", fits)
-    visit = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), residual_sigma=as_given)
+    visit = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), as_given, "not_explained")
     visits = [DetectedVisit(segment_of(), visit)]
     assert find_faulty_sensor(visits, recording_of(), GEOMETRY, ModelPriors()) == faulty
 
@@ -359,9 +359,9 @@ def test_sensors_are_checked_only_if_many_visits_are_unexplained(
     )
     visits = [
         DetectedVisit(
-            segment_of(), VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), residual_sigma=sigma)
+            segment_of(), VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), refused=refused)
         )
-        for sigma in [20.0] + [1.0] * explained
+        for refused in ["not_explained"] + [""] * explained
     ]
     assert find_faulty_sensor(visits, recording_of(), GEOMETRY, ModelPriors()) is None
     assert bool(calls) == (explained == 2)
