@@ -199,7 +199,8 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
             hint="Record it together with the hall sensors: fields alone do not determine a path",
         )
     time_ns = samples.time_ns
-    is_valid = np.isfinite(np.hstack([odometry.position[:, :2], odometry.quaternion])).all(axis=1)
+    is_finite = np.isfinite(np.hstack([odometry.position[:, :2], odometry.quaternion]))
+    is_valid = np.asarray(is_finite.all(axis=1))
     if is_valid.sum() < 2:
         raise InputError(
             f"no valid odometry of {samples.device}", hint="Its poses are not finite numbers"

@@ -321,7 +321,7 @@ def _strongest_fields(geometry: Geometry) -> tuple[Array, Array]:
     distance_m = TABLE_STEP_M * np.arange(count + 1)
     angle = np.linspace(0, HALF_PI_RAD, 46)  # A quarter turn exchanges the bars.
     points = distance_m[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return distance_m, np.abs(basis(geometry, points)).sum(axis=-1).max(axis=1)
+    return distance_m, np.asarray(np.abs(basis(geometry, points)).sum(axis=-1).max(axis=1))
 
 
 @functools.lru_cache(maxsize=4)
