@@ -318,7 +318,7 @@ def _separate_minima(
 def _strongest_fields(geometry: Geometry) -> tuple[Array, Array]:
     """Return distances (n,) from the centre, and the strongest field of any landmark at each."""
     count = round(TABLE_HALF_WIDTH_RADII * geometry.radius_m / TABLE_STEP_M)
-    distance_m = TABLE_STEP_M * np.arange(count + 1)
+    distance_m = np.asarray(TABLE_STEP_M * np.arange(count + 1), np.float64)
     angle = np.linspace(0, HALF_PI_RAD, 46)  # A quarter turn exchanges the bars.
     points = distance_m[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     return distance_m, np.asarray(np.abs(basis(geometry, points)).sum(axis=-1).max(axis=1))
