@@ -50,6 +50,10 @@ MIN_SPREAD_FRACTION = 1e-3
 MAX_UNCOVERED_FRACTION = 0.02
 """Fraction of the samples before and after the odometry that is left out without a warning."""
 
+MAX_INTERPOLATED_MOTION_M = 0.01
+"""Motion of the outermost sensor between two poses beyond which it is not interpolated if poses in
+between were invalid: a fifth of the size of a bar's field, over which a path is nearly straight."""
+
 MAX_OFFSET_T = 5e-4
 """Largest field that is attributed to offsets and noise alone."""
 
@@ -118,6 +122,8 @@ class HallRecording:
     noise_t : float
         Standard deviation of a sample.
     warnings : tuple of SolverWarning
+    odometry : Trajectory or None
+        The valid poses, from which :attr:`pose` is interpolated.
     """
 
     samples: HallSamples
@@ -125,6 +131,7 @@ class HallRecording:
     offset_t: Array
     noise_t: float
     warnings: tuple[SolverWarning, ...] = ()
+    odometry: Trajectory | None = None
 
     def without_sensor(self, sensor: int) -> HallRecording:
         """Return the recording without one sensor, with a warning."""
@@ -135,6 +142,21 @@ class HallRecording:
         warning = SolverWarning("sensor_left_out", message).about(self.samples.device)
         samples = replace(self.samples, field_t=field)
         return replace(self, samples=samples, warnings=(*self.warnings, warning))
+
+    def rescaled(self, scale: float) -> HallRecording:
+        """Return the recording with readings divided by a factor, with a warning."""
+        message = (
+            f"fields are {scale:.2g} times those of the bars of the map; corrected. Check the unit "
+            "and the gain of the readings, the height of the sensors, and the bars of the map"
+        )
+        warning = SolverWarning("sensor_scale", message).about(self.samples.device)
+        return replace(
+            self,
+            samples=replace(self.samples, field_t=self.samples.field_t / scale),
+            offset_t=self.offset_t / scale,
+            noise_t=max(self.noise_t / scale, MIN_NOISE_T),
+            warnings=(*self.warnings, warning),
+        )
 
 
 @dataclass(frozen=True)
@@ -164,7 +186,7 @@ class VisitSegment:
 
 
 def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecording:
-    """Remove invalid readings, and interpolate the odometry at the times of the samples.
+    """Remove invalid readings and poses, and interpolate the odometry at the times of the samples.
 
     Raises
     ------
@@ -177,13 +199,24 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
             hint="Record it together with the hall sensors: fields alone do not determine a path",
         )
     time_ns = samples.time_ns
+    is_finite = np.isfinite(np.hstack([odometry.position[:, :2], odometry.quaternion]))
+    is_valid = np.asarray(is_finite.all(axis=1))
+    if is_valid.sum() < 2:
+        raise InputError(
+            f"no valid odometry of {samples.device}", hint="Its poses are not finite numbers"
+        )
+    warnings = []
+    if not is_valid.all():
+        message = f"{(~is_valid).sum()} poses of the odometry are not finite numbers; left out"
+        warnings.append(SolverWarning("odometry_invalid", message).about(samples.device))
+    invalid_ns, odometry = odometry.time_ns[~is_valid], odometry.select(is_valid)
     is_covered = (time_ns >= odometry.time_ns[0]) & (time_ns <= odometry.time_ns[-1])
+    is_covered &= ~_is_in_gap(samples, odometry, invalid_ns)
     if is_covered.sum() < 2:
         raise InputError(
             f"the odometry of {samples.device} covers none of its samples",
             hint="Check that both clocks are the same",
         )
-    warnings = []
     uncovered = int((~is_covered).sum())
     if uncovered > MAX_UNCOVERED_FRACTION * len(time_ns):
         message = f"{uncovered} samples without odometry left out"
@@ -196,7 +229,20 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
         offset_t=_estimate_offsets(field),
         noise_t=_sample_noise(samples, field),
         warnings=(*warnings, *reading_warnings),
+        odometry=odometry,
     )
+
+
+def _is_in_gap(
+    samples: HallSamples, odometry: Trajectory, invalid_ns: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return which samples (n,) are at invalid poses between valid ones that are far apart."""
+    step = np.diff(planar_poses(odometry), axis=0)
+    radius_m = float(np.hypot(*samples.sensors.position_m.T).max())
+    motion_m = np.hypot(step[:, 0], step[:, 1]) + radius_m * np.abs(step[:, 2])
+    has_invalid = np.diff(np.searchsorted(invalid_ns, odometry.time_ns)) > 0
+    is_gap = np.pad(has_invalid & (motion_m > MAX_INTERPOLATED_MOTION_M), 1)
+    return np.asarray(is_gap[np.searchsorted(odometry.time_ns, samples.time_ns)])
 
 
 def planar_poses(odometry: Trajectory) -> Array:

@@ -212,11 +212,12 @@ def identify_recording(
     drift = known_drift(options.priors.drift, options.odometry_noise, options.odometry_lag_s)
     priors = replace(options.priors, noise_t=recording.noise_t, drift=drift)
     recording, detected = detect_landmarks(recording, geometry, priors, pitch_m)
+    priors = replace(priors, noise_t=recording.noise_t)
     visits, map_probability = identify_visits(
         detected, floor, misread=options.misread, drift=priors.drift
     )
-    assert odometry is not None  # preprocess() requires it
-    return IdentifiedRecording(recording, odometry, priors, visits, map_probability)
+    assert recording.odometry is not None  # preprocess() sets it
+    return IdentifiedRecording(recording, recording.odometry, priors, visits, map_probability)
 
 
 @dataclass(frozen=True)

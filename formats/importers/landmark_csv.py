@@ -27,7 +27,7 @@ from locatk.formats.tables.quantities import (
     find_columns,
     units_by_quantity,
 )
-from locatk.formats.tables.timestamps import UNDATED_START_NS, parse_decimal_time
+from locatk.formats.tables.timestamps import parse_decimal_time
 
 Array = NDArray[np.float64]
 
@@ -140,8 +140,8 @@ def read_landmarks(
     downward : bool
         Readings are positive if the field points down.
     start_ns : int, optional
-        Time of the first row since the epoch. [default: times from the year 2000 on are kept,
-        others start at :data:`~locatk.formats.tables.timestamps.UNDATED_START_NS`]
+        Time of the first row since the epoch. [default: times are kept; if the first one is
+        negative, it becomes 0]
 
     Raises
     ------
@@ -167,7 +167,7 @@ def read_landmarks(
     }
     by_key = find_columns(table, quantities, columns or {}, given_units)
     time_ns, clock = _times(by_key[TIME_KEY], start_ns)
-    odometry, repeated_poses = _odometry(table, by_key, time_ns)
+    odometry, repeated_poses, odometry_losses = _odometry(table, by_key, time_ns)
     readings = [by_key[name] for name in sensors.names]
     field_t = _fields(readings, volts)
     # Rows with a pose and no reading are not samples.
@@ -203,7 +203,7 @@ def read_landmarks(
     )
     if excluded == field_t.size:
         raise InputError("no usable reading", file=path, hint=warnings[0].split(": ", 1)[1])
-    warnings += _odometry_warnings(odometry)
+    warnings += odometry_losses + _odometry_warnings(odometry)
     return ImportedHalls(samples, odometry, facts, warnings, excluded)
 
 
@@ -220,9 +220,12 @@ def _times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str
         time_ns = np.array([parse_decimal_time(cell, unit) for cell in cells], np.int64)
         if time_ns[0] >= MIN_EPOCH_NS:
             clock = f"{unit} since 1970"
+        elif time_ns[0] >= 0:
+            clock = "unknown: times as in the file"
         else:
-            time_ns = time_ns - time_ns[0] + UNDATED_START_NS
-            clock = "unknown: the first row is at 1 s"
+            # Sessions store no negative times.
+            time_ns = time_ns - time_ns[0]
+            clock = "unknown: the first row is at 0 s, which is negative in the file"
     if start_ns is not None:
         time_ns, clock = time_ns - time_ns[0] + start_ns, "the first row is at the given time"
     steps_ns = np.diff(time_ns)
@@ -291,26 +294,26 @@ def _per_sensor(name: str, values: tuple[float, ...], sensors: int) -> Array:
 
 def _odometry(
     table: Table, columns: Mapping[str, Column], time_ns: NDArray[np.int64]
-) -> tuple[Trajectory, int]:
+) -> tuple[Trajectory, int, list[str]]:
     """Return the poses of odometry, which may be slower than the sensors.
 
     Returns
     -------
-    (Trajectory, int)
-        The poses, and the number of rows that repeat the pose of an earlier row.
+    (Trajectory, int, list of str)
+        The poses, the number of rows that repeat the pose of an earlier row, and warnings.
     """
     values = np.column_stack([columns[key].in_si() for key in POSE_KEYS])
     is_empty = np.isnan(values)
     is_partial = is_empty.any(axis=1) & ~is_empty.all(axis=1)
+    warnings = []
     if is_partial.any():
         row = int(np.argmax(is_partial))
         key = POSE_KEYS[int(np.argmax(is_empty[row]))]
-        table.fail(
-            row,
-            f"{key} ({columns[key].name!r}) is empty, but the rest of the pose is not",
-            "Write all of x, y and heading, or leave all three empty",
+        warnings.append(
+            f"{int(is_partial.sum())} poses of odometry are incomplete and left out, the first in "
+            f"line {table.lines[row]} without {key} ({columns[key].name!r})"
         )
-    rows = np.flatnonzero(~is_empty.all(axis=1))
+    rows = np.flatnonzero(~is_empty.any(axis=1))
     if len(rows) < 2:
         raise InputError(
             "no odometry: the columns x, y and heading are empty",
@@ -327,7 +330,7 @@ def _odometry(
         quaternion_from_heading(heading),
         np.full((len(x), 6, 6), np.nan),
     )
-    return odometry, len(rows) - len(updates)
+    return odometry, len(rows) - len(updates), warnings
 
 
 def _find_updates(poses: Array) -> NDArray[np.int64]:

@@ -8,8 +8,8 @@ The sensor's X points right, Y back and Z down, and sensor 1 is the rightmost: i
 array, B = (-Y, -X, -Z).
 
 The time of a sample is its row divided by the rate, which the user states: the stamps published
-with the paper are not times, but rows divided by 100. If stamps are dates and times, the first
-one is the start of the recording.
+with the paper are not times, but rows divided by 100. If stamps are dates and times, or seconds at
+the stated rate, the first one is the start of the recording, otherwise row 0 is at 0 s.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from locatk.formats.importers.field_readings import (
     find_absent_readings,
 )
 from locatk.formats.tables.delimited import Table, read_table
-from locatk.formats.tables.timestamps import UNDATED_START_NS, is_iso_time
+from locatk.formats.tables.timestamps import is_iso_time, parse_decimal_time
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,9 @@ PUBLISHED_TAGS = Tags(
 
 MAX_RATE_DIFFERENCE_FRACTION = 0.05
 """Largest relative difference of the rate by the stamps from the stated one without a warning."""
+
+MAX_STAMP_S = 2**62 * 1e-9
+"""Largest start of a recording; differences of two times in nanoseconds fit into int64."""
 
 SATURATION_QUANTA = 1.5
 """Readings within this distance of the end of the scale may be saturated."""
@@ -202,7 +205,7 @@ def _parse_vectors(cells: list[str]) -> Array | None:
 
 def _times(table: Table, rate_hz: float, warnings: list[str]) -> NDArray[np.int64]:
     """Return the times of the rows, in nanoseconds since the epoch."""
-    n, start_ns = len(table), UNDATED_START_NS
+    n, start_ns = len(table), 0
     if TIME_COLUMN in table.columns:
         if is_iso_time(table.columns[TIME_COLUMN][0]):
             stamps_ns = table.iso_times_ns(TIME_COLUMN)
@@ -218,7 +221,14 @@ def _times(table: Table, rate_hz: float, warnings: list[str]) -> NDArray[np.int6
                 )
             steps: Array = np.diff(stamps_ns).astype(float)
         else:
-            steps = np.diff(table.floats(TIME_COLUMN))
+            stamps_s = table.floats(TIME_COLUMN)
+            steps = np.diff(stamps_s)
+            ratio = (stamps_s[-1] - stamps_s[0]) * rate_hz / max(n - 1, 1)
+            is_time = 0 <= stamps_s[0] < MAX_STAMP_S and (
+                abs(ratio - 1) <= MAX_RATE_DIFFERENCE_FRACTION
+            )
+            if is_time:
+                start_ns = parse_decimal_time(str(table.columns[TIME_COLUMN][0]))
         if (steps < 0).any():
             row = int(np.argmax(steps < 0)) + 1
             table.fail(row, "the time stamp goes backwards", "Sort the rows by time")

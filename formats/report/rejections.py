@@ -268,7 +268,7 @@ def _landmarks_reasons() -> dict[str, Reason]:
         "not_explained": "The residuals of every landmark are "
         f"{hypotheses.MAX_RESIDUAL_SIGMAS:g} standard deviations or more: iron, a tool, broken "
         "bars, or other bars than those of the map.",
-        "too_weak": "A field was detected, but it is too weak for a position.",
+        "too_weak": "A field was detected, but it is too weak to determine a pose.",
         "too_short": f"There are samples at fewer than {hypotheses.MIN_BINS} positions of the "
         "visit.",
         "no_spin": "The robot only passed the landmark, and the published method requires it to "

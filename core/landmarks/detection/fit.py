@@ -1,15 +1,17 @@
 """Fit of the field model to the trace of one visit, for many hypotheses in one batch.
 
 The field at a sensor is that of four bars (:mod:`locatk.core.landmarks.field`), each with a
-strength and a position of its own. The unknowns of a hypothesis are the pose of the landmark in
-the frame of the trace and everything that deviates from its nominal value, each with a Gaussian
-prior (:class:`ModelPriors`). :func:`locatk.core.least_squares.minimize` fits all hypotheses of a
-batch together. The evidence of a hypothesis follows from cost and information by Laplace's
-approximation (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapter 27).
+strength and a position of its own, and that of the unknown bars of the four nearest landmarks
+(:func:`neighbour_fields`). The unknowns of a hypothesis are the pose of the landmark in the frame
+of the trace and everything that deviates from its nominal value, each with a Gaussian prior
+(:class:`ModelPriors`). :func:`locatk.core.least_squares.minimize` fits all hypotheses of a batch
+together. The evidence of a hypothesis follows from cost and information by Laplace's approximation
+(MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapter 27).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -17,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.landmarks.detection.trace import OdometryDrift, Trace
-from locatk.core.landmarks.field import basis_gradient
+from locatk.core.landmarks.field import basis, basis_gradient
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.least_squares import DenseEquations, Indices, minimize
 
@@ -37,6 +39,10 @@ uniform prior. They keep the information regular if the trace does not determine
 
 BAR_COUNT = 4
 """Number of bars."""
+
+MIN_NEIGHBOUR_POWER = 1.0
+"""Sum of squares of the fields of a neighbour's bars, in standard deviations of the readings, from
+which on they are unknowns. Below, all readings together determine them no better than the prior."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,9 @@ class ModelPriors:
     model_error_t, relative_model_error : float
         Residual of the model itself, absolute and relative to the field.
     drift : OdometryDrift
+    pitch_m : float
+        Distance of neighbouring landmarks, whose bars may be of any strength; ``inf`` for a single
+        landmark.
     """
 
     gain: float = 0.03
@@ -74,6 +83,7 @@ class ModelPriors:
     model_error_t: float = 1.5e-4
     relative_model_error: float = 0.005
     drift: OdometryDrift = field(default_factory=OdometryDrift)
+    pitch_m: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -94,6 +104,8 @@ class ParameterLayout:
     height : slice
     correction : slice
         Errors of the odometry, see :class:`.Trace`.
+    neighbour : slice
+        Strengths of the bars of neighbouring landmarks.
     size : int
         Number of parameters.
     """
@@ -105,22 +117,33 @@ class ParameterLayout:
     bar_position: slice
     height: slice
     correction: slice
+    neighbour: slice
     size: int
 
     @classmethod
-    def of(cls, sensors: int, corrections: int) -> ParameterLayout:
-        """Return the layout for a number of sensors and of errors of the odometry."""
-        counts = (3, sensors, sensors, BAR_COUNT, 2 * BAR_COUNT, 1, corrections)
+    def of(cls, sensors: int, corrections: int, neighbours: int = 0) -> ParameterLayout:
+        """Return the layout for numbers of sensors, errors of the odometry and further bars."""
+        counts = (3, sensors, sensors, BAR_COUNT, 2 * BAR_COUNT, 1, corrections, neighbours)
         edges = [0, *np.cumsum(counts).tolist()]
-        pose, gain, offset, strength, bar_position, height, correction = (
+        pose, gain, offset, strength, bar_position, height, correction, neighbour = (
             slice(start, stop) for start, stop in pairwise(edges)
         )
-        return cls(pose, gain, offset, strength, bar_position, height, correction, size=edges[-1])
+        return cls(
+            pose,
+            gain,
+            offset,
+            strength,
+            bar_position,
+            height,
+            correction,
+            neighbour,
+            size=edges[-1],
+        )
 
     @classmethod
-    def of_trace(cls, trace: Trace) -> ParameterLayout:
-        """Return the layout for a trace."""
-        return cls.of(len(trace.sensor_position_m), trace.correction.shape[2])
+    def of_trace(cls, trace: Trace, neighbours: int = 0) -> ParameterLayout:
+        """Return the layout for a trace and a number of bars of neighbouring landmarks."""
+        return cls.of(len(trace.sensor_position_m), trace.correction.shape[2], neighbours)
 
 
 @dataclass(frozen=True)
@@ -149,6 +172,8 @@ class VisitFitProblem:
     priors : ModelPriors
     strength, strength_sigma : (K, 4) ndarray
         Signed strengths of the bars by hypothesis, expected values and standard deviations.
+    neighbour_field_t : (K, n, N, b) ndarray
+        Fields of bars of neighbouring landmarks at each reading.
     """
 
     trace: Trace
@@ -156,11 +181,12 @@ class VisitFitProblem:
     priors: ModelPriors
     strength: Array
     strength_sigma: Array
+    neighbour_field_t: Array
 
     @property
     def layout(self) -> ParameterLayout:
         """Columns of the parameters."""
-        return ParameterLayout.of_trace(self.trace)
+        return ParameterLayout.of_trace(self.trace, self.neighbour_field_t.shape[-1])
 
     def initial_parameters(self, pose: Array) -> Array:
         """Return parameters (K, size) at landmark poses (K, 3), all others being nominal."""
@@ -175,6 +201,7 @@ class VisitFitProblem:
             self,
             strength=self.strength[hypotheses],
             strength_sigma=self.strength_sigma[hypotheses],
+            neighbour_field_t=self.neighbour_field_t[hypotheses],
         )
 
     def linearize(self, state: ParameterSets, hypotheses: Indices) -> DenseEquations:
@@ -251,7 +278,11 @@ class VisitFitProblem:
         variance = variance + (priors.relative_model_error * measured) ** 2
         root = np.where(is_measured, np.sqrt(trace.thinning / variance), 0.0)
         offset = priors.offset_t * parameters[:, None, layout.offset]
-        residual = (root * (gain * total + offset - measured)).reshape(len(parameters), rows)
+        neighbours = np.einsum(
+            "knsb,kb->kns", self.neighbour_field_t, parameters[:, layout.neighbour]
+        )
+        predicted = gain * total + neighbours + offset
+        residual = (root * (predicted - measured)).reshape(len(parameters), rows)
         if not jacobian:
             return residual, np.empty(0)
 
@@ -277,8 +308,45 @@ class VisitFitProblem:
         by_parameters[..., layout.correction] = np.einsum(
             "knsi,nim->knsm", by_pose, trace.correction
         )
+        by_parameters[..., layout.neighbour] = self.neighbour_field_t
         by_parameters *= root[..., None]
         return residual, by_parameters.reshape(len(parameters), rows, layout.size)
+
+
+def neighbour_fields(
+    trace: Trace, geometry: Geometry, priors: ModelPriors, landmark: Array
+) -> Array:
+    """Return the fields of the bars of the landmarks next to each hypothesis.
+
+    Over a pass at the edge, such a field is as strong as that of the bars on the far side, and it
+    changes so slowly that many readings are no evidence against it.
+
+    Parameters
+    ----------
+    landmark : (K, 3) ndarray
+        Poses of the landmark, near to those of the fits.
+
+    Returns
+    -------
+    (K, n, N, b) ndarray
+        The bars of as many neighbours as can be noticed for any hypothesis; the order differs.
+    """
+    count, (samples, sensors) = len(landmark), trace.field_t.shape
+    if not math.isfinite(priors.pitch_m) or not count:
+        return np.zeros((count, samples, sensors, 0))
+    offset = trace.sensor_positions() - landmark[:, None, None, :2]
+    c, s = np.cos(landmark[:, 2, None, None]), np.sin(landmark[:, 2, None, None])
+    x, y = offset[..., 0], offset[..., 1]
+    local = np.stack([c * x + s * y, c * y - s * x], -1)
+    steps = priors.pitch_m * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    fields = np.stack([basis(geometry, local - step) for step in steps], axis=1)
+    variance = priors.noise_t**2 / trace.weight[:, None] + priors.model_error_t**2
+    weight = np.where(np.isnan(trace.field_t), 0.0, trace.thinning / variance)
+    power = np.einsum("kansb,ns->ka", fields**2, weight)
+    kept = int((power > MIN_NEIGHBOUR_POWER).sum(axis=1).max())
+    strongest = np.argsort(-power, axis=1)[:, :kept]
+    fields = np.take_along_axis(fields, strongest[:, :, None, None, None], axis=1)
+    return np.moveaxis(fields, 1, 3).reshape(count, samples, sensors, kept * BAR_COUNT)
 
 
 @dataclass(frozen=True)

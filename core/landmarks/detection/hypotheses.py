@@ -31,6 +31,7 @@ from locatk.core.landmarks.detection.fit import (
     VisitFitProblem,
     VisitFits,
     fit_visit,
+    neighbour_fields,
 )
 from locatk.core.landmarks.detection.scan import (
     COARSE_GRID,
@@ -39,6 +40,8 @@ from locatk.core.landmarks.detection.scan import (
     ONE_MISSING_STRENGTHS,
     ScanGrid,
     find_candidates,
+    has_strong_field,
+    source_region,
 )
 from locatk.core.landmarks.detection.trace import Trace, planar_rotation
 from locatk.core.landmarks.landmark import (
@@ -89,14 +92,21 @@ FAULTY_STRENGTH_SIGMA = 0.5
 MAX_STRENGTH_SIGMAS = 2.5
 """Deviation of a bar's strength from the nominal one at which faulty bars are considered."""
 
-MAX_INTACT_RESIDUAL_SIGMAS = 1.6
-"""Rms residual of the best intact landmark above which the fine grid and faulty bars are tried."""
+MAX_INTACT_RESIDUAL_SIGMAS = 1.2
+"""Rms residual of the best intact landmark above which the fine grid and faulty bars are tried. It
+is at most 1 if the model holds, plus three times the scatter of a hundred readings (0.07)."""
 
 MIN_PROBABILITY = 1e-9
 """Probability below which a hypothesis is not reported."""
 
 MIN_BINS = 4
 """Bins of the path below which a visit is too short."""
+
+MAX_POSE_SIGMA_M = 6e-3
+MAX_POSE_SIGMA_RAD = math.radians(8)
+"""Standard deviations of the best pose above which a visit is too weak: half the distance at which
+two initial guesses converge to different minima. Beyond, the field is not linear within the
+covariance, and minima that were not tried may be as probable."""
 
 MAX_RESIDUAL_SIGMAS = 6.0
 """Rms residual above which no landmark explains a visit."""
@@ -105,24 +115,44 @@ SAME_LANDMARK_PITCH_FRACTION = 0.2
 """Distance of landmarks, relative to the pitch, below which two successive visits are one."""
 
 MIN_UNEXPLAINED_FRACTION = 0.25
-"""Fraction of unexplained visits above which the sensors are checked."""
+"""Fraction of unexplained visits above which single sensors are checked."""
+
+MIN_DOUBTFUL_FRACTION = 0.1
+"""Fraction of doubtful visits above which order, signs and scale of the sensors are checked."""
+
+MAX_MEAN_SQUARED_DEVIATION = 3.1
+"""Mean square of gains, strengths and height, in standard deviations of their priors, above which
+a visit is doubtful: the 99.9 % quantile of chi-square with nine degrees of freedom, by each."""
+
+CHECKED_SCALES = tuple(2 ** (k / 2) for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
+"""Common scales of the readings that are tried; the steps are smaller than :data:`.GAIN_RANGE`."""
+
+MIN_CHANGE_LOG_ODDS = 20.0
+"""Log evidence of all checked visits in favour of a change from which on it is believed: one in a
+million for the prior probability of a fault, and the same again for errors of the model."""
+
+MAX_CHANGE_LOG_LOSS = 7.0
+"""Log evidence of a single visit against a change from which on it is not believed (1 : 1000)."""
+
+MAX_LOG_EVIDENCE = 1e9
+"""Log evidence against a change with which no landmark can be fitted."""
 
 MAX_CHECKED_VISITS = 3
-"""Unexplained visits that are used for this check; it fits each of them many times."""
+"""Doubtful visits, and others, that are used for these checks, which fit each of them many
+times."""
 
 MAX_PERMUTED_SENSORS = 4
-"""Number of sensors up to which order, signs and faulty sensors are checked on
-unexplained visits."""
+"""Number of sensors up to which order, signs and faulty sensors are checked."""
 
 MAX_REFINED_CHANGES = 3
-"""Most likely changes of the sensors that are tried on all these visits."""
+"""Most likely changes of the sensors by the longest visit, which are tried on all of them."""
 
 MAX_GAIN_SIGMAS = 4.0
 """Deviation of a sensor's gain, in standard deviations of its prior, above which a warning is
 given."""
 
 MIN_RESIDUAL_RATIO = 3.0
-"""Factor by which a change of the sensors must reduce the residual in order to be believed."""
+"""Factor by which the residual must decrease without a sensor so that it is left out."""
 
 
 @dataclass(frozen=True)
@@ -214,8 +244,8 @@ class VisitHypotheses:
     odometry : (3,) ndarray
         Robot at ``time_ns`` by its own odometry: x, y, heading.
     hypotheses : tuple of Hypothesis
-        The most probable first; empty if the visit is too short or too weak, but kept if it is
-        ``"not_explained"``.
+        The most probable first; empty if the visit is too short or too weak. They are kept if it is
+        ``"not_explained"``, unless there is none within the range of its fields.
     residual_sigma : float
         Rms residual of the best hypothesis in standard deviations of the noise; ``nan`` if the
         method has no model of the samples.
@@ -292,7 +322,17 @@ def detect_landmarks(
     InputError
         The sensors are in the wrong order, or one has the opposite sign.
     """
+    priors = replace(priors, pitch_m=pitch_m)
     visits = detect_visits(recording, geometry, priors, pitch_m)
+    scale = check_wiring(visits, recording, geometry, priors)
+    if scale != 1:
+        recording = recording.rescaled(scale)
+        priors = replace(priors, noise_t=recording.noise_t)
+        visits = detect_visits(recording, geometry, priors, pitch_m)
+    faulty_sensor = find_faulty_sensor(visits, recording, geometry, priors)
+    if faulty_sensor is not None:
+        recording = recording.without_sensor(faulty_sensor)
+        visits = detect_visits(recording, geometry, priors, pitch_m)
     best = [
         visit.hypotheses.best.fit
         for visit in visits
@@ -300,10 +340,6 @@ def detect_landmarks(
     ]
     gain_warnings = check_gains(best, recording, priors)
     recording = replace(recording, warnings=(*recording.warnings, *gain_warnings))
-    faulty_sensor = find_faulty_sensor(visits, recording, geometry, priors)
-    if faulty_sensor is not None:
-        recording = recording.without_sensor(faulty_sensor)
-        visits = detect_visits(recording, geometry, priors, pitch_m)
     return recording, visits
 
 
@@ -349,7 +385,10 @@ def detect_landmark(
         hypotheses=(),
     )
     if not fits:
-        return replace(unread, refused="too_short" if is_too_short else "too_weak")
+        if is_too_short:
+            return replace(unread, refused="too_short")
+        is_strong = has_strong_field(trace, geometry)
+        return replace(unread, refused="not_explained" if is_strong else "too_weak")
     hypotheses = []
     for fit in fits:
         pose, covariance = robot_pose(trace, fit, trace.reference)
@@ -366,6 +405,11 @@ def detect_landmark(
             )
         )
     residual = fits[0].residual_sigma
+    sigma = np.sqrt(np.diag(hypotheses[0].covariance))
+    if residual <= MAX_RESIDUAL_SIGMAS and (
+        sigma[:2].max() > MAX_POSE_SIGMA_M or sigma[2] > MAX_POSE_SIGMA_RAD
+    ):
+        return replace(unread, refused="too_weak")
     return replace(
         unread,
         hypotheses=tuple(hypotheses),
@@ -393,15 +437,18 @@ def fit_landmarks(
     Returns
     -------
     list of LandmarkFit
-        The most probable first. Their probabilities sum to 1. Empty if no field is strong.
+        The most probable first. Their probabilities sum to 1. Empty if no field is strong, or if
+        no landmark within the range of the fields can be fitted.
     """
-    fits = _fit_intact(trace, geometry, priors, COARSE_GRID)
-    if not fits:
+    if not has_strong_field(trace, geometry):
         return []
+    fits = _fit_intact(trace, geometry, priors, COARSE_GRID)
     if not thorough:
         return _with_probabilities(fits)
-    if _best(fits).residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
-        fits = _fit_intact(trace, geometry, priors, FINE_GRID)
+    if not fits or _best(fits).residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
+        fits = _fit_intact(trace, geometry, priors, FINE_GRID) or fits
+    if not fits:
+        return []
     best = _best(fits)
     deviation = np.abs(best.strength - signs(best.code)) / priors.strength
     if deviation.max() > MAX_STRENGTH_SIGMAS or best.residual_sigma > MAX_INTACT_RESIDUAL_SIGMAS:
@@ -453,10 +500,12 @@ def estimate_pose_at_known_landmark(
         Robot in the landmark's frame at the reference of the trace.
     covariance : (3, 3) ndarray
     """
-    problem = _fit_problem(trace, geometry, priors, np.asarray(strength, float)[None])
     cos, sin = math.cos(start[2]), math.sin(start[2])
     landmark = [-cos * start[0] - sin * start[1], sin * start[0] - cos * start[1], -start[2]]
-    fits = fit_visit(problem, problem.initial_parameters(np.array([landmark])))
+    problem, initial = _fit_problem(
+        trace, geometry, priors, np.asarray(strength, float)[None], np.array([landmark])
+    )
+    fits = fit_visit(problem, initial)
     return robot_pose(trace, _landmark_fits(problem, fits)[0], trace.reference)
 
 
@@ -508,27 +557,34 @@ def _fit_strengths(
     pose, which = find_candidates(coarse, geometry, strengths, max_candidates, grid)
     if not len(pose):
         return []
-    problem = _fit_problem(coarse, geometry, priors, strengths[which])
-    problem, fits = _fit_and_select(problem, problem.initial_parameters(pose))
+    problem, start = _fit_problem(coarse, geometry, priors, strengths[which], pose)
+    problem, fits = _fit_and_select(problem, start)
     evidence = fits.log_evidence()
     # Bars at the far side are weakly observed: try all other strengths at the best pose.
     best = int(np.argmax(evidence))
     others = strengths[(strengths != problem.strength[best]).any(axis=1)]
-    other_problem = _fit_problem(coarse, geometry, priors, others)
-    start = other_problem.initial_parameters(
-        np.repeat(fits.parameters[[best], :3], len(others), axis=0)
-    )
+    at_best = np.repeat(fits.parameters[[best], :3], len(others), axis=0)
+    other_problem, start = _fit_problem(coarse, geometry, priors, others, at_best)
     other_problem, other_fits = _fit_and_select(other_problem, start, evidence.max())
     evidence = np.concatenate([evidence, other_fits.log_evidence()])
     strength = np.concatenate([problem.strength, other_problem.strength])
-    parameters = np.concatenate([fits.parameters, other_fits.parameters])
+    own = slice(problem.layout.neighbour.start)  # Neighbours differ in number and order.
+    parameters = np.concatenate([fits.parameters[:, own], other_fits.parameters[:, own]])
     if heading_rad is None:
         heading_rad = math.remainder(float(parameters[np.argmax(evidence), 2]), HALF_PI_RAD)
     kept = np.flatnonzero(evidence > evidence.max() - MAX_LOG_ODDS)
-    strength, start = _rotate_frames(strength[kept], parameters[kept], heading_rad)
-    strength, start = _select_distinct(strength, start, evidence[kept])
-    problem = _fit_problem(trace.thinned(MAX_FIT_SAMPLES), geometry, priors, strength)
-    return _landmark_fits(problem, fit_visit(problem, start))
+    strength, parameters = _rotate_frames(strength[kept], parameters[kept], heading_rad)
+    distinct = _select_distinct(strength, parameters, evidence[kept])[:MAX_HYPOTHESES]
+    problem, start = _fit_problem(
+        trace.thinned(MAX_FIT_SAMPLES), geometry, priors, strength[distinct], parameters[distinct]
+    )
+    fits = fit_visit(problem, start)
+    # Different initial guesses may have converged to one minimum, which counts once.
+    distinct = _select_distinct(problem.strength, fits.parameters, fits.log_evidence())
+    middle, radius_m = source_region(trace, geometry)
+    distance_m = np.hypot(*(fits.parameters[distinct, :2] - middle).T)
+    distinct = distinct[distance_m <= radius_m]
+    return _landmark_fits(problem.take(distinct), fits.take(distinct))
 
 
 def _fit_and_select(
@@ -550,11 +606,18 @@ def _fit_and_select(
 
 
 def _fit_problem(
-    trace: Trace, geometry: Geometry, priors: ModelPriors, strength: Array
-) -> VisitFitProblem:
-    """Return the problem for strengths (K, 4), of which 0 stands for a faulty bar."""
+    trace: Trace, geometry: Geometry, priors: ModelPriors, strength: Array, start: Array
+) -> tuple[VisitFitProblem, Array]:
+    """Return the problem for strengths (K, 4), of which 0 stands for a faulty bar.
+
+    Returns its initial parameters as well, of which the leading ones are those of ``start`` (K, m).
+    """
     sigma = np.where(strength == 0, FAULTY_STRENGTH_SIGMA, priors.strength)
-    return VisitFitProblem(trace, geometry, priors, strength, sigma)
+    neighbours = neighbour_fields(trace, geometry, priors, start[:, :3])
+    problem = VisitFitProblem(trace, geometry, priors, strength, sigma, neighbours)
+    parameters = problem.initial_parameters(start[:, :3])
+    parameters[:, : start.shape[1]] = start
+    return problem, parameters
 
 
 def _rotate_frames(strength: Array, parameters: Array, heading_rad: float) -> tuple[Array, Array]:
@@ -566,20 +629,22 @@ def _rotate_frames(strength: Array, parameters: Array, heading_rad: float) -> tu
     return np.take_along_axis(strength, bars, axis=1), rotated_parameters
 
 
-def _select_distinct(strength: Array, parameters: Array, evidence: Array) -> tuple[Array, Array]:
-    """Return the best of each group of equal hypotheses, at most :data:`MAX_HYPOTHESES`."""
+def _select_distinct(strength: Array, parameters: Array, evidence: Array) -> NDArray[np.intp]:
+    """Return the best of each group of equal hypotheses, the best group first."""
     kept: list[int] = []
     for i in np.argsort(-evidence):
         difference = np.abs(parameters[kept, :3] - parameters[i, :3]).max(axis=1)
         has_same_bars = (strength[kept] == strength[i]).all(axis=1)
         is_duplicate = np.any(has_same_bars & (difference < MERGE_DIFFERENCE))
-        if not is_duplicate and len(kept) < MAX_HYPOTHESES:
+        if not is_duplicate:
             kept.append(int(i))
-    return strength[kept], parameters[kept]
+    return np.array(kept, np.intp)
 
 
 def _with_probabilities(fits: list[LandmarkFit]) -> list[LandmarkFit]:
     """Set the probabilities of all fits to a trace; the most probable first."""
+    if not fits:
+        return []
     log_odds = np.array([fit.log_odds for fit in fits])
     probability = np.exp(log_odds - log_odds.max())
     probability /= probability.sum()
@@ -663,12 +728,95 @@ class SensorChange:
     ----------
     order : tuple of int
         Column of each sensor.
-    factor : tuple of float
-        Of each sensor: -1 for the opposite sign, ``nan`` for a sensor that is left out.
+    sign : tuple of float
+        Of each sensor: -1 if it is the opposite one.
+    scale : float
+        Readings relative to those expected, common to all sensors.
     """
 
     order: tuple[int, ...]
-    factor: tuple[float, ...]
+    sign: tuple[float, ...]
+    scale: float = 1.0
+
+
+def check_wiring(
+    visits: Sequence[DetectedVisit],
+    recording: HallRecording,
+    geometry: Geometry,
+    priors: ModelPriors,
+) -> float:
+    """Check order, signs and common scale of the sensors if visits fit badly.
+
+    A change is believed if it makes these visits more probable, and none of the others less.
+
+    Returns
+    -------
+    float
+        Readings relative to those expected, common to all sensors; 1 if they agree.
+
+    Raises
+    ------
+    InputError
+        The sensors are in the wrong order, or one has the opposite sign; the message names them.
+    """
+    names, device = recording.samples.sensors.names, recording.samples.device
+    longest_first = sorted(visits, key=lambda visit: -len(visit.segment.trace))
+    doubtful = [visit.segment.trace for visit in longest_first if _is_doubtful(visit)]
+    if len(doubtful) <= MIN_DOUBTFUL_FRACTION * len(visits) or len(names) > MAX_PERMUTED_SENSORS:
+        return 1.0
+    others = [
+        visit.segment.trace
+        for visit in longest_first
+        if not (_is_doubtful(visit) or visit.hypotheses.refused)
+    ]
+    traces = [*doubtful[:MAX_CHECKED_VISITS], *others[:MAX_CHECKED_VISITS]]
+
+    @functools.cache
+    def best_fit(change: SensorChange, index: int) -> LandmarkFit | None:
+        trace = traces[index]
+        field = trace.field_t[:, list(change.order)] * change.sign
+        scaled = replace(geometry, remanence_t=change.scale * geometry.remanence_t)
+        fits = fit_landmarks(replace(trace, field_t=field), scaled, priors, thorough=False)
+        return _best(fits) if fits else None
+
+    def evidence(change: SensorChange, index: int) -> float:
+        fit = best_fit(change, index)
+        return fit.log_odds if fit is not None else -MAX_LOG_EVIDENCE
+
+    as_given, *changes = _sensor_changes(len(names))
+    likely = sorted(changes, key=lambda change: -evidence(change, 0))[:MAX_REFINED_CHANGES]
+    indices = range(len(traces))
+    best = max(likely, key=lambda change: sum(evidence(change, index) for index in indices))
+    gains = [evidence(best, index) - evidence(as_given, index) for index in indices]
+    if sum(gains) < MIN_CHANGE_LOG_ODDS or min(gains) < -MAX_CHANGE_LOG_LOSS:
+        return 1.0
+    if best.order != as_given.order:
+        actual = ", ".join(names[best.order.index(k)] for k in as_given.order)
+        raise InputError(
+            f"the hall sensors of {device} are in the wrong order: {', '.join(names)} are {actual}",
+            hint="Name the columns in that order, or correct halls.toml",
+        )
+    if best.sign != as_given.sign:
+        raise _opposite_sign_error(names[best.sign.index(-1)], device)
+    fits = [fit for index in indices if (fit := best_fit(best, index)) is not None]
+    gain = ParameterLayout.of(len(names), 0).gain
+    remaining = [
+        np.mean(1 + priors.gain * fit.parameters[gain]) * np.mean(np.abs(fit.strength))
+        for fit in fits
+    ]
+    return best.scale * float(np.median(remaining))
+
+
+def _is_doubtful(visit: DetectedVisit) -> bool:
+    """Return whether a visit is not explained, or only by improbable bars, gains and heights."""
+    if visit.hypotheses.refused:
+        return visit.hypotheses.refused == "not_explained"
+    fit = visit.hypotheses.best.fit
+    if fit is None:
+        return False
+    layout = ParameterLayout.of_trace(visit.segment.trace)
+    columns = np.r_[layout.gain, layout.strength, layout.height]
+    return float((fit.parameters[columns] ** 2).mean()) > MAX_MEAN_SQUARED_DEVIATION
 
 
 def find_faulty_sensor(
@@ -677,67 +825,41 @@ def find_faulty_sensor(
     geometry: Geometry,
     priors: ModelPriors,
 ) -> int | None:
-    """Find a wrong order, an opposite sign or a faulty sensor if many visits are unexplained.
-
-    Returns
-    -------
-    int or None
-        A sensor without which the visits are explained.
-
-    Raises
-    ------
-    InputError
-        The sensors are in the wrong order, or one has the opposite sign; the message names them.
-    """
+    """Find a sensor without which the visits are explained, if many of them are not."""
     unexplained = [
-        visit.segment.trace
-        for visit in visits
-        if visit.hypotheses.residual_sigma > MAX_RESIDUAL_SIGMAS
+        visit.segment.trace for visit in visits if visit.hypotheses.refused == "not_explained"
     ]
-    names, device = recording.samples.sensors.names, recording.samples.device
+    count = len(recording.samples.sensors)
     if (
         len(unexplained) <= MIN_UNEXPLAINED_FRACTION * len(visits)
-        or len(names) > MAX_PERMUTED_SENSORS
+        or not 1 < count <= MAX_PERMUTED_SENSORS
     ):
         return None
     unexplained = sorted(unexplained, key=len, reverse=True)[:MAX_CHECKED_VISITS]
 
-    @functools.cache
-    def residual(change: SensorChange, index: int) -> float:
-        trace = unexplained[index]
-        field = trace.field_t[:, list(change.order)] * change.factor
-        fits = fit_landmarks(replace(trace, field_t=field), geometry, priors, thorough=False)
-        return fits[0].residual_sigma if fits else math.inf
+    def median_residual(left_out: int | None) -> float:
+        residuals = []
+        for trace in unexplained:
+            field = trace.field_t.copy()
+            if left_out is not None:
+                field[:, left_out] = np.nan
+            fits = fit_landmarks(replace(trace, field_t=field), geometry, priors, thorough=False)
+            residuals.append(fits[0].residual_sigma if fits else math.inf)
+        return float(np.median(residuals))
 
-    def median_residual(change: SensorChange) -> float:
-        return float(np.median([residual(change, index) for index in range(len(unexplained))]))
-
-    as_given, *others = _sensor_changes(len(names))
-    likely = sorted(others, key=lambda change: residual(change, 0))
-    best = min(likely[:MAX_REFINED_CHANGES], key=median_residual)
-    limit = min(MAX_RESIDUAL_SIGMAS, median_residual(as_given) / MIN_RESIDUAL_RATIO)
-    if median_residual(best) > limit:
-        return None
-    if best.order != as_given.order:
-        actual = ", ".join(names[best.order.index(k)] for k in as_given.order)
-        raise InputError(
-            f"the hall sensors of {device} are in the wrong order: {', '.join(names)} are {actual}",
-            hint="Name the columns in that order, or correct halls.toml",
-        )
-    changed = int(np.flatnonzero(np.asarray(best.factor) != 1)[0])
-    if best.factor[changed] == -1:
-        raise _opposite_sign_error(names[changed], device)
-    return changed
+    residual = [median_residual(sensor) for sensor in range(count)]
+    best = int(np.argmin(residual))
+    limit = min(MAX_RESIDUAL_SIGMAS, median_residual(None) / MIN_RESIDUAL_RATIO)
+    return best if residual[best] <= limit else None
 
 
 def _sensor_changes(count: int) -> list[SensorChange]:
     """Return all hypothetical wirings of the sensors, the given one first."""
     given, ones = tuple(range(count)), (1.0,) * count
     changes = [SensorChange(order, ones) for order in itertools.permutations(given)]
-    for factor in (-1.0, math.nan):
-        for k in given:
-            changes.append(SensorChange(given, (*ones[:k], factor, *ones[k + 1 :])))
-    return changes
+    for k in given:
+        changes.append(SensorChange(given, (*ones[:k], -1.0, *ones[k + 1 :])))
+    return changes + [SensorChange(given, ones, scale) for scale in CHECKED_SCALES]
 
 
 def _opposite_sign_error(name: str, device: str) -> InputError:

@@ -48,18 +48,21 @@ COARSE_GRID = ScanGrid()
 FINE_GRID = ScanGrid(4e-3, 15)
 """Grid of a second search, if no result of the first explains the trace."""
 
-TABLE_HALF_WIDTH_M = 0.11
-"""Distance from the centre up to which a landmark's field is tabulated."""
+TABLE_HALF_WIDTH_RADII = 4.4
+"""Distance from the centre up to which a landmark's field is tabulated, in radii of its bars: the
+field there is below 0.01 of the strongest one."""
 
 TABLE_STEP_M = 1e-3
 """Step of that table; fields are interpolated linearly."""
 
-MAX_CENTRE_DISTANCE_M = 0.062
-"""Largest distance from a position of strong field to the landmark's centre. The territory of the
-default geometry ends at 54 mm (radius r2 of the paper, section 3.1)."""
+MAX_FIELD_FACTOR = 2.0
+"""Field relative to that of the nominal bars up to which a landmark may be the source of a reading:
+it allows for sensors that are lower, for gains, and for bars that are stronger."""
 
-MAX_STRONG_FIELD_EXTENT_M = 0.5
-"""Extent of positions of strong field above which they cannot be of one landmark."""
+MAX_STRONG_FIELD_EXTENT = 3.0
+"""Extent of positions of strong field above which they cannot be of one landmark, relative to the
+diameter of its own. Several passes by odometry with errors are within it; odometry in wrong units
+is not, and neither is a long source of another kind."""
 
 MIN_STRONG_FIELD_THRESHOLDS = 0.45
 """Field of a position near a landmark, in thresholds of the territory."""
@@ -121,17 +124,18 @@ def find_candidates(
     -------
     pose : (K, 3) ndarray
         x, y, heading in the frame of the trace; the best first, without neighbours of one code.
-        Empty if no field is strong, or if strong fields extend too far for one landmark.
+        Empty if strong fields extend too far for one landmark.
     which : (K,) ndarray
         Row of ``strengths``.
     """
     position = trace.sensor_positions()
     is_measured = ~np.isnan(trace.field_t)
-    magnitude = np.abs(np.where(is_measured, trace.field_t, 0))
-    is_strong = is_measured & (magnitude > MIN_STRONG_FIELD_THRESHOLDS * geometry.threshold_t)
-    if not is_strong.any() or np.ptp(position[is_strong], axis=0).max() > MAX_STRONG_FIELD_EXTENT_M:
+    strong = position[_is_strong(trace, geometry)]
+    limit_t = MIN_STRONG_FIELD_THRESHOLDS * geometry.threshold_t
+    max_extent_m = MAX_STRONG_FIELD_EXTENT * 2 * field_range(geometry, limit_t / MAX_FIELD_FACTOR)
+    if len(strong) and np.ptp(strong, axis=0).max() > max_extent_m:
         return np.empty((0, 3)), np.empty(0, np.intp)
-    centres = _grid_centres(position[is_strong], grid.step_m)
+    centres = _grid_centres(*source_region(trace, geometry), grid.step_m)
     sigma = _field_errors(trace)
     headings = grid.headings()
     cost = scan_costs(
@@ -144,6 +148,33 @@ def find_candidates(
         strengths,
     )
     return _separate_minima(cost, centres, headings, max_candidates)
+
+
+def has_strong_field(trace: Trace, geometry: Geometry) -> bool:
+    """Return whether a field of the trace is strong enough to locate a landmark."""
+    return bool(_is_strong(trace, geometry).any())
+
+
+def source_region(trace: Trace, geometry: Geometry) -> tuple[Array, float]:
+    """Return the disc in which the landmark's centre can be: its middle (2,), and its radius.
+
+    The strongest reading can only be of a landmark within the range of a field of that strength.
+    """
+    magnitude = np.abs(np.nan_to_num(trace.field_t))
+    strongest = np.unravel_index(np.argmax(magnitude), magnitude.shape)
+    radius_m = field_range(geometry, float(magnitude[strongest]) / MAX_FIELD_FACTOR)
+    return trace.sensor_positions()[strongest], radius_m
+
+
+def field_range(geometry: Geometry, field_t: float) -> float:
+    """Return the distance from its centre up to which any landmark has a field of this strength.
+
+    It is at least that of the ends of the bars, and at most half the width of the tabulated field.
+    """
+    distance_m, strongest_t = _strongest_fields(geometry)
+    is_reached = strongest_t >= field_t
+    over_bars_m = math.hypot(geometry.radius_m, geometry.bar_length_m / 2)
+    return max(over_bars_m, float(distance_m[is_reached].max(initial=0.0)))
 
 
 def scan_costs(
@@ -249,14 +280,17 @@ def _field_errors(trace: Trace) -> Array:
     )
 
 
-def _grid_centres(strong: Array, step_m: float) -> Array:
-    """Return the nodes (m, 2) near enough to a position (p, 2) of strong field."""
-    low = strong.min(axis=0) - MAX_CENTRE_DISTANCE_M
-    high = strong.max(axis=0) + MAX_CENTRE_DISTANCE_M
-    x, y = (np.arange(a, b + step_m, step_m) for a, b in zip(low, high, strict=True))
-    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    squared_distance = ((nodes[:, None] - strong) ** 2).sum(axis=-1).min(axis=1)
-    return nodes[squared_distance < MAX_CENTRE_DISTANCE_M**2]
+def _is_strong(trace: Trace, geometry: Geometry) -> NDArray[np.bool_]:
+    """Return which readings (n, N) are near a landmark."""
+    limit_t = MIN_STRONG_FIELD_THRESHOLDS * geometry.threshold_t
+    return np.asarray(np.abs(np.nan_to_num(trace.field_t)) > limit_t)
+
+
+def _grid_centres(middle: Array, radius_m: float, step_m: float) -> Array:
+    """Return the nodes (m, 2) of a grid within a disc."""
+    line = np.arange(-radius_m, radius_m + step_m, step_m)
+    nodes = np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
+    return np.asarray(middle + nodes[np.hypot(*nodes.T) <= radius_m])
 
 
 def _separate_minima(
@@ -281,9 +315,19 @@ def _separate_minima(
 
 
 @functools.lru_cache(maxsize=4)
+def _strongest_fields(geometry: Geometry) -> tuple[Array, Array]:
+    """Return distances (n,) from the centre, and the strongest field of any landmark at each."""
+    count = round(TABLE_HALF_WIDTH_RADII * geometry.radius_m / TABLE_STEP_M)
+    distance_m = np.asarray(TABLE_STEP_M * np.arange(count + 1), np.float64)
+    angle = np.linspace(0, HALF_PI_RAD, 46)  # A quarter turn exchanges the bars.
+    points = distance_m[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return distance_m, np.asarray(np.abs(basis(geometry, points)).sum(axis=-1).max(axis=1))
+
+
+@functools.lru_cache(maxsize=4)
 def _field_table(geometry: Geometry) -> NDArray[np.float32]:
     """Tabulate the fields of the bars, [x, y, bar], over the plane of the sensors."""
-    count = round(TABLE_HALF_WIDTH_M / TABLE_STEP_M)
+    count = round(TABLE_HALF_WIDTH_RADII * geometry.radius_m / TABLE_STEP_M)
     line = np.arange(-count, count + 1) * TABLE_STEP_M
     plane = np.stack(np.meshgrid(line, line, indexing="ij"), -1)
     return np.ascontiguousarray(basis(geometry, plane), np.float32)

@@ -617,6 +617,7 @@ class SmoothingSystem:
             self.priors,
             prior.strength[None],
             prior.strength_sigma[None],
+            np.zeros((1, *visit.trace.field_t.shape, 0)),
         )
         layout = problem.layout
         local, by_robot, by_landmark = relative_pose_with_gradient(

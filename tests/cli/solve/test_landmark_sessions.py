@@ -6,12 +6,14 @@ import json
 import math
 import sys
 import types
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import Result
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
@@ -19,6 +21,7 @@ from locatk.core.landmarks.halls import NAMES, HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import code_of
 from locatk.core.landmarks.map.floor import AsBuiltLandmark, FloorMap
 from locatk.core.landmarks.results import LandmarkDetection, LandmarkFacts, RobotFacts
+from locatk.core.landmarks.simulation.session import SimulationOptions, simulate
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import maps
@@ -549,3 +552,35 @@ def test_from_a_log_to_poses(locatk, tmp_path: Path) -> None:
     assert entry["facts"]["robots"]["robot"]["localised"]
     score = json.loads(locatk("eval", out, "--truth", run, "--json").stdout)
     assert score["mae_m"] < 0.002
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start_ns", [0, 3_210_000_000, 1_700_000_000_123_456_000])
+def test_exported_times_are_those_of_the_table(
+    tmp_path: Path, locatk: Callable[..., Result], start_ns: int
+) -> None:
+    floor = FloorMap(np.random.default_rng(11).integers(0, 16, (4, 4)))
+    cells = ((0, 0), (0, 3), (3, 3))
+    options = SimulationOptions(strategy="path", cells=cells, rate_hz=50.0, seed=2)
+    session = simulate(floor, options)
+    (samples,), (path,) = session.samples, session.odometry
+    heading = heading_from_quaternion(path.quaternion)
+    lines = ["t_s,x_m,y_m,heading_rad,front_t,left_t,rear_t,right_t"]
+    for k, elapsed_ns in enumerate((samples.time_ns - samples.time_ns[0]).tolist()):
+        seconds, rest = divmod(start_ns + elapsed_ns, 1_000_000_000)
+        values = (*path.position[k, :2], heading[k], *samples.field_t[k])
+        lines.append(",".join([f"{seconds}.{rest:09d}", *(f"{value:.9g}" for value in values)]))
+    table = tmp_path / "run.csv"
+    table.write_text("\n".join(lines) + "\n")
+    recorded, solved = tmp_path / "run.mcap", tmp_path / "solved.mcap"
+    exported = tmp_path / "poses.csv"
+    map_file = write_map(tmp_path / "map.toml", floor)
+    for args in (
+        ("import", "landmark-csv", table, "--map", map_file, "-o", recorded),
+        ("solve", recorded, "-o", solved),
+        ("export", solved, "--format", "csv", "-o", exported),
+    ):
+        assert locatk(*args).exit_code in (0, 3)
+    times = [line.split(",")[0] for line in exported.read_text().splitlines()[1:]]
+    assert len(times) > 100
+    assert set(times) <= {line.split(",")[0] for line in lines}

@@ -95,8 +95,9 @@ def trace() -> Trace:
 
 def problem_of(trace: Trace, *strengths: Array) -> VisitFitProblem:
     installed = np.array(strengths)
+    neighbours = np.random.default_rng(2).normal(0, 1e-4, (len(strengths), *trace.field_t.shape, 2))
     return VisitFitProblem(
-        trace, GEOMETRY, ModelPriors(), installed, np.full(installed.shape, 0.04)
+        trace, GEOMETRY, ModelPriors(), installed, np.full(installed.shape, 0.04), neighbours
     )
 
 

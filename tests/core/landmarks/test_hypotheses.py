@@ -270,13 +270,22 @@ def fit_of(
     parameters = np.zeros(layout.size)
     parameters[layout.gain] = gain_sigmas
     return LandmarkFit(
-        5, 0.0, parameters, np.eye(layout.size), signs(5), np.ones(4), residual_sigma, -1, 1.0
+        5,
+        0.0,
+        parameters,
+        1e-6 * np.eye(layout.size),
+        signs(5),
+        np.ones(4),
+        residual_sigma,
+        -1,
+        1.0,
     )
 
 
-def segment_of(first: int = 0, bins: int = 5) -> VisitSegment:
+def segment_of(first: int = 0, bins: int = 5, field_t: float = 5e-3) -> VisitSegment:
     time_ns = np.arange(first, first + bins, dtype=np.int64)
-    return VisitSegment(first, first + bins, time_ns, line_trace(bins), np.zeros(3))
+    trace = replace(line_trace(bins), field_t=np.full((bins, 4), field_t))
+    return VisitSegment(first, first + bins, time_ns, trace, np.zeros(3))
 
 
 def recording_of() -> HallRecording:
@@ -299,21 +308,27 @@ def test_negative_gain_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bins", "fits", "refused"),
+    ("bins", "field_t", "fits", "refused"),
     [
-        (4, [fit_of(5.9)], ""),
-        (4, [fit_of(6.1)], "not_explained"),
-        (4, [], "too_weak"),
-        (3, [fit_of(1.0)], "too_short"),
+        (4, 5e-3, [fit_of(5.9)], ""),
+        (4, 5e-3, [fit_of(6.1)], "not_explained"),
+        (4, 5e-3, [], "not_explained"),
+        (4, 1e-3, [], "too_weak"),
+        (3, 5e-3, [fit_of(1.0)], "too_short"),
     ],
 )
 def test_visits_are_refused_with_a_reason(
-    bins: int, fits: list[LandmarkFit], refused: str, monkeypatch: pytest.MonkeyPatch
+    bins: int,
+    field_t: float,
+    fits: list[LandmarkFit],
+    refused: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(hypotheses, "fit_landmarks", lambda *_: fits)
-    visit = detect_landmark(segment_of(bins=bins), recording_of(), GEOMETRY, ModelPriors())
+    segment = segment_of(bins=bins, field_t=field_t)
+    visit = detect_landmark(segment, recording_of(), GEOMETRY, ModelPriors())
     assert visit.refused == refused
-    assert bool(visit.hypotheses) == (refused in ("", "not_explained"))
+    assert bool(visit.hypotheses) == (bool(fits) and refused in ("", "not_explained"))
 
 
 @pytest.mark.parametrize(
@@ -329,7 +344,7 @@ def test_sensor_is_left_out_only_if_that_explains_the_visits(
         return [fit_of(without_rear if is_without_rear else as_given)]
 
     monkeypatch.setattr(hypotheses, "fit_landmarks", fits)
-    visit = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), residual_sigma=as_given)
+    visit = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), as_given, "not_explained")
     visits = [DetectedVisit(segment_of(), visit)]
     assert find_faulty_sensor(visits, recording_of(), GEOMETRY, ModelPriors()) == faulty
 
@@ -344,9 +359,9 @@ def test_sensors_are_checked_only_if_many_visits_are_unexplained(
     )
     visits = [
         DetectedVisit(
-            segment_of(), VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), residual_sigma=sigma)
+            segment_of(), VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), refused=refused)
         )
-        for sigma in [20.0] + [1.0] * explained
+        for refused in ["not_explained"] + [""] * explained
     ]
     assert find_faulty_sensor(visits, recording_of(), GEOMETRY, ModelPriors()) is None
     assert bool(calls) == (explained == 2)

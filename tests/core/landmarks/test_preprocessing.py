@@ -303,3 +303,37 @@ def test_noise_of_alternating_sensors_is_assumed() -> None:
     sensors = replace(samples.sensors, noise_t=np.nan)
     turns = replace(samples, field_t=field, sensors=sensors)
     assert np.isfinite(preprocess(turns, session.odometry[0]).noise_t)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_invalid_poses_are_left_out_and_reported(value: float) -> None:
+    run = session()
+    odometry = run.odometry[0]
+    position = odometry.position.copy()
+    invalid = [3, len(position) // 2]
+    position[invalid, [0, 1]] = value
+    recording = preprocess(run.samples[0], replace(odometry, position=position))
+    assert recording.warnings[0].code == "odometry_invalid"
+    assert "2 poses" in recording.warnings[0].message
+    assert recording.odometry is not None
+    assert len(recording.odometry) == len(odometry) - 2
+    whole = preprocess(run.samples[0], odometry)
+    assert len(recording.pose) == len(whole.pose)
+    np.testing.assert_allclose(recording.pose, whole.pose, atol=2e-4)
+    with pytest.raises(InputError, match="no valid odometry"):
+        preprocess(run.samples[0], replace(odometry, position=np.full_like(position, value)))
+
+
+def test_samples_at_a_long_gap_of_invalid_poses_are_left_out() -> None:
+    run = session()
+    odometry = run.odometry[0]
+    steps = np.diff(odometry.position[:, :2], axis=0)
+    moved = np.r_[0.0, np.cumsum(np.hypot(*steps.T))]
+    is_invalid = (moved > moved[-1] / 2) & (moved < moved[-1] / 2 + 0.1)
+    quaternion = np.where(is_invalid[:, None], np.nan, odometry.quaternion)
+    recording = preprocess(run.samples[0], replace(odometry, quaternion=quaternion))
+    is_kept = np.isin(run.samples[0].time_ns, recording.samples.time_ns)
+    is_between = np.interp(run.samples[0].time_ns, odometry.time_ns, 1.0 * is_invalid) == 1
+    assert is_between.sum() > 10
+    assert not is_kept[is_between].any()
+    assert is_kept.sum() >= (~is_between).sum() - 4

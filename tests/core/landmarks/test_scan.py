@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from locatk.core.landmarks.detection.trace import (
     odometry_corrections,
     relative,
 )
+from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import Geometry, signs
 from locatk.core.landmarks.simulation.options import NONE
 from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
@@ -80,17 +83,35 @@ def test_candidates_of_one_code_are_not_neighbours() -> None:
         assert not (same & (which[:k] == which[k])).any()
 
 
-def test_weak_fields_give_no_candidate() -> None:
+def test_weak_fields_cannot_locate_a_landmark() -> None:
     trace = trace_of(simulate_passes(1, 7, errors=NONE, seed=1)[0])
-    quiet = Trace(
-        trace.pose,
-        trace.correction,
-        trace.field_t * 1e-3,
-        trace.sensor_position_m,
-        trace.weight,
-        trace.reference,
-    )
-    assert not len(scan.find_candidates(quiet, GEOMETRY, INTACT, 10, scan.COARSE_GRID)[0])
+    assert scan.has_strong_field(trace, GEOMETRY)
+    assert not scan.has_strong_field(replace(trace, field_t=trace.field_t * 1e-2), GEOMETRY)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
+def test_a_landmark_is_only_searched_where_its_field_can_come_from(scale: float) -> None:
+    """Also for bars and circles of other sizes; the truth is always within the region."""
+    nominal = Geometry()
+    lengths = ("bar_length_m", "bar_width_m", "bar_height_m", "radius_m", "sensor_height_m")
+    geometry = replace(nominal, **{key: scale * getattr(nominal, key) for key in lengths})
+    random = np.random.default_rng(3)
+    for code in range(16):
+        lateral = scale * random.uniform(0.0, 0.065)
+        points = np.column_stack([scale * np.linspace(-0.1, 0.1, 61), np.full(61, lateral)])
+        field = landmark_field(geometry, code, points)
+        # One sensor on the robot's origin.
+        pose = np.column_stack([points, np.zeros(61)])
+        trace = Trace(pose, np.zeros((61, 3, 0)), field[:, None], np.zeros((1, 2)), np.ones(61), 0)
+        middle, radius_m = scan.source_region(trace, geometry)
+        assert np.hypot(*middle) <= radius_m
+        assert radius_m < 4.4 * geometry.radius_m
+        # The field of a landmark outside of the region is weaker than the one measured.
+        beyond = middle + 1.1 * radius_m * np.stack(
+            [np.cos(np.arange(60)), np.sin(np.arange(60))], 1
+        )
+        outside = [np.abs(landmark_field(geometry, c, middle - beyond)).max() for c in range(16)]
+        assert max(outside) < np.abs(field).max()
 
 
 def test_fields_over_a_large_extent_give_no_candidate() -> None:

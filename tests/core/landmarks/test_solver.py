@@ -368,3 +368,52 @@ def test_residuals_of_the_fields_limit_the_poses(
     assert bool(robot.trajectories) == poses
     assert robot.facts.localised == poses
     assert robot.facts.misfit_sigma == residual_sigma
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_invalid_poses_of_odometry_do_not_stop_the_solver(value: float) -> None:
+    def invalidate(position: Array) -> Array:
+        position[[7, len(position) // 3, -1], [0, 1, 0]] = value
+        return position
+
+    solution = solved(session(), place=invalidate)
+    assert "odometry_invalid" in warning_codes(solution)
+    assert [each.cell for each in solution.detections] == CELLS
+    assert np.isfinite(solution.trajectories[0].position).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.25, 0.5, 0.7, 2.0])
+def test_a_common_scale_of_the_readings_is_corrected_and_named(scale: float) -> None:
+    solution = solved(session(), field=lambda field: scale * field)
+    (warning,) = (each for each in solution.warnings if each.code == "sensor_scale")
+    estimate = float(warning.message.split("fields are ")[1].split()[0])
+    # Bars and sensors of the drive deviate by some percent themselves.
+    assert estimate == pytest.approx(scale, rel=0.05)
+    assert [each.cell for each in solution.detections] == CELLS
+    assert farthest(session(), solution) < 5e-3
+
+
+@pytest.mark.slow
+def test_a_nominal_drive_has_no_doubt_about_its_sensors() -> None:
+    assert not {"sensor_scale", "sensor_gain"} & set(warning_codes(solved(session())))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 3)])
+def test_two_exchanged_sensors_are_named(pair: tuple[int, int]) -> None:
+    order = [0, 1, 2, 3]
+    order[pair[0]], order[pair[1]] = pair[1], pair[0]
+    names = [("front", "left", "rear", "right")[k] for k in order]
+    with pytest.raises(InputError, match=f"front, left, rear, right are {', '.join(names)}$"):
+        solved(session(), field=lambda field: field[:, order])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", range(4))
+def test_a_sensor_of_the_opposite_sign_is_named(sensor: int) -> None:
+    name = ("front", "left", "rear", "right")[sensor]
+    sign = np.where(np.arange(4) == sensor, -1.0, 1.0)
+    with pytest.raises(InputError, match=f"the {name} sensor of robot has the opposite sign"):
+        solved(session(), field=lambda field: sign * field)

@@ -16,7 +16,6 @@ from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.halls import NAMES, HallSensors
 from locatk.formats.importers.landmark_csv import ImportedHalls, Volts, read_landmarks
 from locatk.formats.tables.quantities import UNITS
-from locatk.formats.tables.timestamps import UNDATED_START_NS
 
 HEADER = ("t_s", "x_mm", "y_mm", "heading_deg", *(f"{name}_mt" for name in NAMES))
 KEYS = ("t", "x", "y", "heading", *NAMES)
@@ -73,7 +72,7 @@ def test_units_in_the_names_are_enough(tmp_path: Path) -> None:
     found = read(write(tmp_path / "run.csv"))
     check(found, drive())
     assert found.samples.device == found.odometry.device == "robot"
-    assert found.samples.time_ns[0] == found.odometry.time_ns[0] == UNDATED_START_NS
+    assert found.samples.time_ns[0] == found.odometry.time_ns[0] == 0
     assert found.facts["columns"].startswith("t=t_s [s], x=x_mm [mm]")
     assert found.lost is None
 
@@ -132,13 +131,12 @@ def test_every_unit_in_every_order(
         ("1700000000.123456789", "s", 1_700_000_000_123_456_789),
         ("1700000000123.5", "ms", 1_700_000_000_123_500_000),
         ("946684800", "s", 946_684_800_000_000_000),
-        ("946684799", "s", UNDATED_START_NS),
-        ("-3", "s", UNDATED_START_NS),
+        ("946684799", "s", 946_684_799_000_000_000),
+        ("12.3456789", "s", 12_345_678_900),
+        ("-3", "s", 0),
     ],
 )
-def test_a_clock_that_counts_from_1970_is_kept(
-    tmp_path: Path, first: str, unit: str, start_ns: int
-) -> None:
+def test_times_of_the_file_are_kept(tmp_path: Path, first: str, unit: str, start_ns: int) -> None:
     later = str(int(float(first)) + 5000)
     rows = drive(2)
     header = (f"time_{unit}", *HEADER[1:])
@@ -193,9 +191,14 @@ def test_odometry_may_be_slower_than_the_sensors(tmp_path: Path) -> None:
     assert len(found.samples) == 39
     assert found.odometry.time_ns[2] not in found.samples.time_ns
     gone[(5, 2)] = "3"
-    path = write(tmp_path / "run.csv", rows, cells=gone)
-    with pytest.raises(InputError, match=r"run\.csv:7: x \('x_mm'\) is empty, but the rest"):
-        read(path)
+    gone[(9, 3)] = "nan"
+    gone[(12, 1)] = "NaN"
+    found = read(write(tmp_path / "run.csv", rows, cells=gone))
+    (warning,) = found.warnings
+    assert "2 poses of odometry are incomplete" in warning
+    assert "line 7 without x ('x_mm')" in warning
+    assert len(found.odometry) == 9
+    assert np.isfinite(found.odometry.position).all()
 
 
 def test_odometry_that_is_held_is_no_staircase(tmp_path: Path) -> None:
@@ -205,7 +208,7 @@ def test_odometry_that_is_held_is_no_staircase(tmp_path: Path) -> None:
     held = rows.copy()
     held[:, 1:4] = rows[np.arange(120) // 4 * 4, 1:4]
     found = read(write(tmp_path / "run.csv", held))
-    at = np.round((found.odometry.time_ns - UNDATED_START_NS) * 1e-7).astype(int)
+    at = np.round(found.odometry.time_ns * 1e-7).astype(int)
     assert at.tolist() == [*range(0, 41, 4), 79, *range(80, 117, 4), 119]
     np.testing.assert_allclose(found.odometry.position[:, 0], held[at, 1])
     assert len(found.samples) == 120

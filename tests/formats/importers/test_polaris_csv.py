@@ -17,7 +17,6 @@ from locatk.formats.importers.polaris_csv import (
     ImportedSamples,
     read_polaris,
 )
-from locatk.formats.tables.timestamps import UNDATED_START_NS
 
 NOISE = np.random.default_rng(5)
 
@@ -76,9 +75,7 @@ def test_what_a_bar_is_taken_to_be(tmp_path: Path) -> None:
     # Sensor 1 is the rightmost, y is to the left.
     np.testing.assert_allclose(array.position_m, [[0, -0.02, 0], [0, 0, 0], [0, 0.02, 0]])
     np.testing.assert_allclose(array.noise_t, [0.89e-6, 0.86e-6, 1.24e-6])
-    assert imported.samples.time_ns.tolist() == [
-        UNDATED_START_NS + k * 25_000_000 for k in range(5)
-    ]
+    assert imported.samples.time_ns.tolist() == [k * 25_000_000 for k in range(5)]
     assert capacity(PUBLISHED_TAGS) == 1 << 18
 
 
@@ -113,6 +110,23 @@ def test_dates_tell_when_it_began(tmp_path: Path) -> None:
     assert other.warnings == [
         "the stamps show 40 samples per second, not 50: the stated rate is used"
     ]
+
+
+@pytest.mark.parametrize(
+    ("start", "rate_hz", "start_ns"),
+    [
+        ("12.5", 100.0, 12_500_000_000),
+        ("1700000000.25", 100.0, 1_700_000_000_250_000_000),
+        ("12.5", 40.0, 0),  # The published stamps, which are not times.
+        ("-3", 100.0, 0),
+    ],
+)
+def test_stamps_in_seconds_begin_at_their_first_time(
+    tmp_path: Path, start: str, rate_hz: float, start_ns: int
+) -> None:
+    stamps = [f"{float(start) + k / 100:.2f}" for k in range(60)]
+    imported = read(write(tmp_path / "run.csv", noise(60), stamps=stamps), rate_hz)
+    assert imported.samples.time_ns[0] == start_ns
 
 
 def test_stamps_that_go_backwards_are_refused(tmp_path: Path) -> None:
