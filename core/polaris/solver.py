@@ -229,7 +229,7 @@ def _identify_passes(
     Returns
     -------
     passes : list of IdentifiedPass
-    counts : Counter
+    rejected : Counter
         Changes of the field without a detection: ``no_magnets`` explain them, or ``no_pass`` over a
         tag caused them.
     """
@@ -254,7 +254,7 @@ def _identify_passes(
         return identify_pass(hypotheses, preprocessed.samples, designs)
 
     passes: list[IdentifiedPass] = []
-    counts: Counter[str] = Counter(no_magnets=0)
+    rejected: Counter[str] = Counter(no_magnets=0)
     samples, noise_t = preprocessed.samples, preprocessed.noise_t
     fields_t = [
         least_magnet_field(samples, tags.magnet.moment, tags.clearance_m) for tags in designs
@@ -266,10 +266,10 @@ def _identify_passes(
             (current is not None and _is_at_rest(current))
             or is_no_pass(samples, part, noise_t, path_m, magnet_field_t)
         ):
-            counts["no_pass"] += 1
+            rejected["no_pass"] += 1
             continue
         if current is None:
-            counts["no_magnets"] += 1
+            rejected["no_magnets"] += 1
             continue
         if passes and any(may_be_one_tag(passes[-1], current, tags) for tags in designs):
             merged = identify(PassRange(passes[-1].magnets.first, current.magnets.stop))
@@ -277,7 +277,7 @@ def _identify_passes(
                 passes[-1] = merged
                 continue
         passes.append(current)
-    return passes, counts
+    return passes, rejected
 
 
 def _is_at_rest(current: IdentifiedPass) -> bool:

@@ -70,7 +70,12 @@ def test_stable_keys_differ_from_clearer_names() -> None:
 
 def test_none_is_left_out_only_of_fields_that_are_none_by_default() -> None:
     robot = RobotFacts(localised=False, landmarks_seen=2)
-    table = {"localised": False, "landmarks_seen": 2, "landmarks_to_localise": None}
+    table = {
+        "localised": False,
+        "provisional": False,
+        "landmarks_seen": 2,
+        "landmarks_to_localise": None,
+    }
     assert to_json(robot) == table
     assert from_json(RobotFacts, table) == robot
     # Files of earlier versions, of the published method.

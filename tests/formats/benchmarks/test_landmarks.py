@@ -354,7 +354,11 @@ def test_a_filter_certain_of_a_wrong_cell_is_detected(
     monkeypatch.setattr(landmarks_global, "START_STRIDE", 500)
 
     def sure(floor: FloorMap, seen: list[Any]) -> Any:
-        return [((-1, -1), 0, 0.5), ((-1, -1), 0, 0.99999)], [((-1, -1), 0, 0.5)] * 2
+        open_, certain = (
+            landmarks_global.LocalizedStop((-1, -1), 0, probability, 1.0)
+            for probability in (0.5, 0.99999)
+        )
+        return [open_, certain], [open_, open_]
 
     def truncated(*args: Any) -> Any:
         walk = walked(*args)
