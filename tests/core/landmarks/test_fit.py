@@ -78,7 +78,7 @@ SENSORS = Four()
 def trace_of(poses: Array, values: Array, reference: int = 30) -> Trace:
     return Trace(
         poses,
-        odometry_corrections(poses, reference, OdometryDrift()),
+        odometry_corrections(poses, reference, OdometryDrift(), np.gradient(poses, 0.01, axis=0)),
         values,
         LEVER,
         np.ones(len(poses)),
