@@ -294,8 +294,9 @@ def warn_of_opposite_polarity(
         for visit in visits
         if not visit.hypotheses.refused
     ]
-    estimates = identify_cells(opposite, floor, misread=misread, drift=drift).estimates
-    if max((one.probability for one in estimates), default=0.0) < PROVISIONAL_PROBABILITY:
+    result = identify_cells(opposite, floor, misread=misread, drift=drift)
+    of_cell = max((one.probability for one in result.estimates), default=0.0)
+    if of_cell * result.map_probability < PROVISIONAL_PROBABILITY:
         return []
     message = (
         "with N and S exchanged it would be localised; are the sensors or all bars mounted upside "

@@ -22,6 +22,7 @@ from locatk.core.solution import Solution
 from locatk.formats.benchmarks import timing
 from locatk.formats.benchmarks.figures import Duration, Figure
 from locatk.formats.benchmarks.landmarks import endurance as landmarks_endurance
+from locatk.formats.benchmarks.landmarks import faults as landmarks_faults
 from locatk.formats.benchmarks.landmarks import global_localization as landmarks_global
 from locatk.formats.benchmarks.landmarks import sessions as landmarks_sessions
 from locatk.formats.benchmarks.landmarks import speed as landmarks_speed
@@ -74,6 +75,9 @@ def quick(
 ) -> Iterator[None]:
     """Use few cases: the code is tested, not the accuracy."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(landmarks_faults, "FAULTY_SESSIONS", 1)
+        first = dict(list(landmarks_faults.FAULTS.items())[:1])
+        patch.setattr(landmarks_faults, "FAULTS", first)
         patch.setattr(landmarks, "SINGLE_PASSES", 6)
         patch.setattr(landmarks, "LONG_VISITS", 3)
         patch.setattr(landmarks, "STOPPED_ROBOTS", 4)
