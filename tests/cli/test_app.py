@@ -32,7 +32,7 @@ def every_command(command: click.Command = app, path: tuple[str, ...] = ()) -> I
     if path:
         yield path, command
     if isinstance(command, click.Group):
-        context = click.Context(command)
+        context = click.Context(command, **app.context_settings)
         for name in command.list_commands(context):
             child = command.get_command(context, name)
             assert child is not None
@@ -58,13 +58,13 @@ def test_every_help_has_valid_examples(
         args = shlex.split(line)[1:]
         if ">" in args:  # The shell redirects the output.
             args = args[: args.index(">")]
-        context = click.Context(app)
+        context = click.Context(app, **app.context_settings)
         command: click.Command = app
         while isinstance(command, click.Group):
             found = command.get_command(context, args.pop(0))
             assert found is not None, line
             command = found
-        command.make_context("example", args, resilient_parsing=False)
+        command.make_context("example", args, parent=context, resilient_parsing=False)
     console.reset()
 
 

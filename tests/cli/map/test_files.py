@@ -198,7 +198,7 @@ def test_options_are_those_of_the_core(locatk) -> None:
 def test_the_group_loads_its_commands() -> None:
     from locatk.cli.map import COMMANDS
 
-    context = click.Context(app)
+    context = click.Context(app, **app.context_settings)
     group = app.get_command(context, "map")
     assert isinstance(group, click.Group)
     for name in ("export", "import"):
