@@ -138,12 +138,15 @@ def describe_visit(
 
 
 def warn_of_cause(cause: Cause, *alternatives: Cause) -> SolverWarning:
-    """Return the warning of a wheel slip or of a displaced landmark, or of either."""
+    """Return the warning of a wheel slip or of a displaced landmark, or of either.
+
+    Of alternatives no sizes are given: together they were estimated from one inconsistency.
+    """
     code = "wheel_slip" if isinstance(cause, WheelSlip) else "landmark_displaced"
+    if not alternatives:
+        return SolverWarning(code, f"{_describe_cause(cause)} by {_describe_size(cause)}")
     message = ", or ".join(_describe_cause(each) for each in (cause, *alternatives))
-    if alternatives:
-        message += "; the recording does not show which"
-    return SolverWarning(code, message)
+    return SolverWarning(code, f"{message}; the recording does not show which")
 
 
 def warn_of_carrying(robot: RobotMeasurements) -> list[SolverWarning]:
@@ -206,13 +209,15 @@ def find_displaced_landmarks(
 
 
 def _describe_cause(cause: Cause) -> str:
-    size = f"{1e3 * cause.distance_m:.2g} mm and {math.degrees(abs(cause.rotation_rad)):.2g} deg"
     if isinstance(cause, WheelSlip):
         return (
-            f"a wheel slipped between {1e-9 * cause.first_ns:.3f} and "
-            f"{1e-9 * cause.last_ns:.3f} s, by {size}"
+            f"a wheel slipped between {1e-9 * cause.first_ns:.3f} and {1e-9 * cause.last_ns:.3f} s"
         )
-    return f"the landmark at {cause.cell[0]},{cause.cell[1]} is displaced by {size}"
+    return f"the landmark at {cause.cell[0]},{cause.cell[1]} is displaced"
+
+
+def _describe_size(cause: Cause) -> str:
+    return f"{1e3 * cause.distance_m:.2g} mm and {math.degrees(abs(cause.rotation_rad)):.2g} deg"
 
 
 def warn_of_lag(lag_s: float) -> SolverWarning:

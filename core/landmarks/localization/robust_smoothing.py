@@ -33,6 +33,11 @@ from locatk.core.landmarks.detection.trace import (
     walk_units,
 )
 from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.localization.cell_steps import (
+    SLIP_PROBABILITY,
+    SLIP_SCALE_M,
+    SLIP_SCALE_RAD,
+)
 from locatk.core.landmarks.localization.smoothing import (
     POSE_SIZE,
     Indices,
@@ -46,17 +51,12 @@ from locatk.core.landmarks.map.floor import Cell
 
 Array = NDArray[np.float64]
 
-SLIP_PROBABILITY = 0.01
-"""Probability that a wheel slips between two visits or during one, as in :mod:`.cell_steps`."""
-
 DISPLACEMENT_PROBABILITY = 0.01
 """Probability that a landmark is displaced."""
 
-SLIP_SCALE_M, SLIP_SCALE_RAD = 0.03, math.radians(10)
-"""Standard deviations of a slip, as in :mod:`.cell_steps` ..."""
-
 SLIP_SCALES = (0.3, 1.0, 3.0, 9.0)
-"""... times any of these factors: slips have long tails."""
+"""Standard deviations of the slips that are considered, in units of
+:data:`.cell_steps.SLIP_SCALE_M` and :data:`.cell_steps.SLIP_SCALE_RAD`: slips have long tails."""
 
 DISPLACED_LANDMARK_SIGMA = np.array([0.02, 0.02, 0.1])
 """Standard deviations (m, m, rad) of a displaced landmark about its pose on the map."""
@@ -82,6 +82,7 @@ WALK_PRIOR_FREEDOM = 4.0
 of about two."""
 
 MAX_WALK_ROUNDS, MAX_RELEASE_ROUNDS = 5, 12
+"""Largest numbers of estimates of the walk, and of changes of priors between them."""
 
 MIN_WALK_CHANGE = 0.05
 """Relative change of the standard deviation of the walk below which it has converged."""

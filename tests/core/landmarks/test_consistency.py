@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.detection.hypotheses import Hypothesis, VisitHypotheses
 from locatk.core.landmarks.localization import consistency
 from locatk.core.landmarks.localization.cell_filter import CellEstimate, IdentifiedVisit
+from locatk.core.landmarks.localization.robust_smoothing import DisplacedLandmark, WheelSlip
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.preprocessing import VisitSegment
 from locatk.core.landmarks.simulation.session import (
@@ -100,3 +102,16 @@ def test_contradictions_are_counted(
     visits = visits_of(misread, unexplained, correct)
     on_map = [visit for visit in visits if visit.estimate is not None]
     assert consistency.is_map_contradicted(visits, on_map, 1.0) == contradicted
+
+
+def test_causes_that_cannot_be_distinguished_are_named_without_sizes() -> None:
+    slip = WheelSlip(1_000_000_000, 2_500_000_000, 0.0093, math.radians(2))
+    displaced = DisplacedLandmark((0, 2), 0.0, 0.0)
+    alone = consistency.warn_of_cause(slip)
+    assert alone.message == "a wheel slipped between 1.000 and 2.500 s by 9.3 mm and 2 deg"
+    both = consistency.warn_of_cause(slip, displaced)
+    assert both.code == alone.code == "wheel_slip"
+    assert both.message == (
+        "a wheel slipped between 1.000 and 2.500 s, or the landmark at 0,2 is displaced; the "
+        "recording does not show which"
+    )
