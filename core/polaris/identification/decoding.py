@@ -39,6 +39,10 @@ MIN_MAGNETS = 3
 MAX_REDUNDANT_COST_STEPS = 1.0
 """Cost of a magnet in the redundant code, in steps: it corrects misreads of any size."""
 
+MAX_REDUNDANT_MISSING = 2
+"""Number of magnets that may be missing from a redundant tag. The code could fill in a third, but
+one tag in P of another design would then be taken for a tag that has lost three magnets."""
+
 
 @dataclass(frozen=True)
 class DecodedTag:
@@ -111,9 +115,10 @@ def decode_tag(
     if nothing remains of d, all observed magnets must agree.
 
     *Codec redundant* accepts the words that :func:`redundant.decode_word` does, if they are in the
-    family. Its code corrects misreads of any size, so that soft distances count at most one step
-    per magnet. The margin is a lower bound: another word differs in at least ``5 - missing``
-    magnets, and the margin is the cost of changing those that change most cheaply.
+    family and at most :data:`MAX_REDUNDANT_MISSING` magnets are missing. Its code corrects misreads
+    of any size, so that soft distances count at most one step per magnet. The margin is a lower
+    bound: another word differs in at least ``5 - missing`` magnets, and the margin is the cost of
+    changing those that change most cheaply.
 
     Parameters
     ----------
@@ -264,6 +269,8 @@ def _decode_redundant(tags: Tags, magnets: _ObservedMagnets) -> DecodedTag:
     if not set(magnets.cells) <= set(cells):
         return _refusal(tags, magnets, "no_such_placement")
     missing = tags.magnets - len(magnets.cells)
+    if missing > MAX_REDUNDANT_MISSING:
+        return _refusal(tags, magnets, "magnets_missing")
     position = [cells.index(cell) for cell in magnets.cells]
     word: list[int | None] = [None] * tags.magnets
     for index, symbol in zip(position, magnets.nearest, strict=True):
