@@ -38,7 +38,14 @@ MIN_PLATEAU_READINGS = 30
 """Number of readings at exactly the same extreme from which on that is taken as the range."""
 
 MIN_SPIKE_T = 2e-3
-"""Smallest difference of a spike from the mean of its two neighbours."""
+"""Smallest difference of a spike from the mean of its two neighbours ..."""
+
+MIN_SPIKE_SIGMAS = 6.0
+"""... and the smallest one in standard deviations by noise: one in a billion readings."""
+
+MAX_SPIKE_MOTION_M = 0.01
+"""Motion of the outermost sensor between two samples beyond which no spikes are sought: the field
+of a bar, which is about 30 mm wide, would look like one."""
 
 MIN_SPIKE_FRACTION = 0.4
 """Further difference that a spike must have, relative to the larger of its neighbours: the field
@@ -221,11 +228,12 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
     if uncovered > MAX_UNCOVERED_FRACTION * len(time_ns):
         message = f"{uncovered} samples without odometry left out"
         warnings.append(SolverWarning("samples_without_odometry", message).about(samples.device))
-    field, reading_warnings = remove_invalid_readings(samples)
+    pose = _interpolate(time_ns, odometry.time_ns, planar_poses(odometry))
+    field, reading_warnings = remove_invalid_readings(samples, _sensor_motion(samples, pose))
     field, time_ns = field[is_covered], time_ns[is_covered]
     return HallRecording(
         samples=HallSamples(samples.device, samples.sensors, time_ns, field),
-        pose=_interpolate(time_ns, odometry.time_ns, planar_poses(odometry)),
+        pose=pose[is_covered],
         offset_t=_estimate_offsets(field),
         noise_t=_sample_noise(samples, field),
         warnings=(*warnings, *reading_warnings),
@@ -237,12 +245,17 @@ def _is_in_gap(
     samples: HallSamples, odometry: Trajectory, invalid_ns: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """Return which samples (n,) are at invalid poses between valid ones that are far apart."""
-    step = np.diff(planar_poses(odometry), axis=0)
-    radius_m = float(np.hypot(*samples.sensors.position_m.T).max())
-    motion_m = np.hypot(step[:, 0], step[:, 1]) + radius_m * np.abs(step[:, 2])
+    motion_m = _sensor_motion(samples, planar_poses(odometry))
     has_invalid = np.diff(np.searchsorted(invalid_ns, odometry.time_ns)) > 0
     is_gap = np.pad(has_invalid & (motion_m > MAX_INTERPOLATED_MOTION_M), 1)
     return np.asarray(is_gap[np.searchsorted(odometry.time_ns, samples.time_ns)])
+
+
+def _sensor_motion(samples: HallSamples, pose: Array) -> Array:
+    """Return the largest motion (n - 1,) of a sensor between successive poses (n, 3)."""
+    step = np.diff(pose, axis=0)
+    radius_m = float(np.hypot(*samples.sensors.position_m.T).max())
+    return np.asarray(np.hypot(step[:, 0], step[:, 1]) + radius_m * np.abs(step[:, 2]))
 
 
 def planar_poses(odometry: Trajectory) -> Array:
@@ -290,8 +303,16 @@ def check_odometry(recording: HallRecording, geometry: Geometry) -> None:
 # ---- invalid readings
 
 
-def remove_invalid_readings(samples: HallSamples) -> tuple[Array, list[SolverWarning]]:
+def remove_invalid_readings(
+    samples: HallSamples, motion_m: Array
+) -> tuple[Array, list[SolverWarning]]:
     """Replace spikes, saturated readings and dead sensors by ``nan``.
+
+    Parameters
+    ----------
+    samples : HallSamples
+    motion_m : (n - 1,) ndarray
+        Largest motion of a sensor between successive samples.
 
     Returns
     -------
@@ -305,7 +326,7 @@ def remove_invalid_readings(samples: HallSamples) -> tuple[Array, list[SolverWar
     """
     field = samples.field_t.copy()
     warnings = []
-    is_spike = _detect_spikes(field)
+    is_spike = _detect_spikes(field, motion_m, _sample_noise(samples, field))
     field[is_spike] = np.nan
     if is_spike.any():
         message = f"{int(is_spike.sum())} single readings jump; left out"
@@ -325,7 +346,7 @@ def remove_invalid_readings(samples: HallSamples) -> tuple[Array, list[SolverWar
     return field, [warning.about(samples.device) for warning in warnings]
 
 
-def _detect_spikes(field: Array) -> NDArray[np.bool_]:
+def _detect_spikes(field: Array, motion_m: Array, noise_t: float) -> NDArray[np.bool_]:
     """Return which readings (n, N) deviate from both neighbours."""
     is_spike = np.zeros(field.shape, bool)
     if len(field) < 3:
@@ -333,10 +354,12 @@ def _detect_spikes(field: Array) -> NDArray[np.bool_]:
     before, reading, after = field[:-2], field[1:-1], field[2:]
     difference = np.abs(reading - (before + after) / 2)
     larger = np.maximum(np.abs(before), np.abs(after))
+    # A difference from the mean of two has the variance 1 + 1/4 + 1/4.
+    least_t = max(MIN_SPIKE_T, MIN_SPIKE_SIGMAS * math.sqrt(1.5) * noise_t)
     with np.errstate(invalid="ignore"):
-        is_spike[1:-1] = (
-            difference > MIN_SPIKE_T + np.abs(after - before) + MIN_SPIKE_FRACTION * larger
-        )
+        is_spike[1:-1] = difference > least_t + np.abs(after - before) + MIN_SPIKE_FRACTION * larger
+    is_slow = np.maximum(motion_m[:-1], motion_m[1:]) <= MAX_SPIKE_MOTION_M
+    is_spike[1:-1] &= is_slow[:, None]
     return is_spike
 
 

@@ -42,6 +42,9 @@ class LandmarkDetection:
         no model of the samples.
     refused : str
         Machine-readable reason for which the visit is not used; ``""`` if it is.
+    cell_probability : float or None
+        Posterior probability of the cell given all visits, and of the map; None if the cell is not
+        known, or if the method does not estimate it.
     """
 
     time_s: float
@@ -59,6 +62,7 @@ class LandmarkDetection:
     strength: tuple[float, ...] | None
     residual_sigma: float
     refused: str
+    cell_probability: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -146,7 +146,12 @@ def solve(
         solve_recording(each, odometry_of.get(each.device), floor, options) for each in samples
     ]
     detections = [
-        describe_visit(visit.hypotheses, visit.estimate, floor)
+        describe_visit(
+            visit.hypotheses,
+            visit.estimate if robot.trajectories else None,
+            floor,
+            robot.identified.map_probability,
+        )
         for robot in robots
         for visit in robot.identified.visits
     ]

@@ -111,6 +111,14 @@ covariance, and minima that were not tried may be as probable."""
 MAX_RESIDUAL_SIGMAS = 6.0
 """Rms residual above which no landmark explains a visit."""
 
+MAX_FITTING_RESIDUAL_SIGMAS = 1.5
+"""Rms residual up to which a fit is evidence of the sensors. It includes the error of the model, so
+that nominal fits have about 0.6."""
+
+CLUSTERS_OF_SENSOR = 4
+"""Parts of a pass in which a residual is taken to be correlated: the fields of three bars and what
+is between them."""
+
 SAME_LANDMARK_PITCH_FRACTION = 0.2
 """Distance of landmarks, relative to the pitch, below which two successive visits are one."""
 
@@ -665,11 +673,14 @@ def _landmark_fits(problem: VisitFitProblem, fits: VisitFits) -> list[LandmarkFi
     may_be_faulty = problem.strength == 0
     faulty_bar = np.where(may_be_faulty.any(axis=1), may_be_faulty.argmax(axis=1), -1)
     code = (strength > 0) @ (1 << np.arange(4))
-    residual = problem.residuals(fits.parameters, jacobian=False)[0]
+    residual, by_parameters = problem.residuals(fits.parameters, jacobian=True)
     measurements = max(int((~np.isnan(problem.trace.field_t)).sum()), 1)
     rms = np.sqrt(
         np.einsum("kr,kr->k", residual, residual) / (measurements * problem.trace.thinning)
     )
+    for i in np.flatnonzero(rms > 1):
+        scores = (by_parameters[i] * residual[i][:, None]).reshape(*problem.trace.field_t.shape, -1)
+        covariance[i] = widened_covariance(covariance[i], scores, rms[i])
     return [
         LandmarkFit(
             code=int(code[i]),
@@ -685,6 +696,32 @@ def _landmark_fits(problem: VisitFitProblem, fits: VisitFits) -> list[LandmarkFi
     ]
 
 
+def widened_covariance(covariance: Array, scores: Array, residual_sigma: float) -> Array:
+    """Widen the covariance of a fit whose residual exceeds noise and error of the model.
+
+    Such a residual is correlated over the whole pass, so that the covariance must grow by more than
+    its square. The standard deviations are at least those of the sandwich estimator with clusters
+    of one sensor in one part of the pass (Liang and Zeger, Biometrika 73 (1986) 13).
+
+    Parameters
+    ----------
+    covariance : (p, p) ndarray
+    scores : (n, N, p) ndarray
+        Derivatives of each sample's share of the cost.
+    residual_sigma : float
+        Rms residual, above 1.
+    """
+    parts = np.array_split(scores, CLUSTERS_OF_SENSOR)
+    clusters = np.concatenate([part.sum(axis=0) for part in parts])
+    count = len(clusters)
+    errors = clusters @ covariance
+    variance = (errors**2).sum(axis=0) * count / (count - 1)
+    nominal = np.diag(covariance)
+    widened = np.maximum(variance, residual_sigma**2 * nominal)
+    factor = np.sqrt(widened / nominal)
+    return np.asarray(factor[:, None] * covariance * factor)
+
+
 # ---- checks of the sensors
 
 
@@ -692,6 +729,8 @@ def check_gains(
     fits: Sequence[LandmarkFit], recording: HallRecording, priors: ModelPriors
 ) -> list[SolverWarning]:
     """Return warnings of sensors whose gain differs from the given one.
+
+    There are none unless most visits fit: gains of other fits make up for other errors.
 
     Parameters
     ----------
@@ -705,11 +744,12 @@ def check_gains(
     InputError
         A sensor has the opposite sign.
     """
-    if not fits:
+    fitting = [fit for fit in fits if fit.residual_sigma <= MAX_FITTING_RESIDUAL_SIGMAS]
+    if not fits or len(fitting) <= len(fits) / 2:
         return []
     names, device = recording.samples.sensors.names, recording.samples.device
     columns = ParameterLayout.of(len(names), 0).gain
-    gains = 1 + priors.gain * np.median([fit.parameters[columns] for fit in fits], axis=0)
+    gains = 1 + priors.gain * np.median([fit.parameters[columns] for fit in fitting], axis=0)
     warnings = []
     for name, gain in zip(names, gains.tolist(), strict=True):
         if gain < 0:
@@ -747,7 +787,8 @@ def check_wiring(
 ) -> float:
     """Check order, signs and common scale of the sensors if visits fit badly.
 
-    A change is believed if it makes these visits more probable, and none of the others less.
+    A change is believed if with it most of these visits fit, and if it makes them more probable and
+    none of the others less.
 
     Returns
     -------
@@ -790,6 +831,9 @@ def check_wiring(
     gains = [evidence(best, index) - evidence(as_given, index) for index in indices]
     if sum(gains) < MIN_CHANGE_LOG_ODDS or min(gains) < -MAX_CHANGE_LOG_LOSS:
         return 1.0
+    fits = [fit for index in indices if (fit := best_fit(best, index)) is not None]
+    if np.median([fit.residual_sigma for fit in fits]) > MAX_FITTING_RESIDUAL_SIGMAS:
+        return 1.0
     if best.order != as_given.order:
         actual = ", ".join(names[best.order.index(k)] for k in as_given.order)
         raise InputError(
@@ -798,7 +842,6 @@ def check_wiring(
         )
     if best.sign != as_given.sign:
         raise _opposite_sign_error(names[best.sign.index(-1)], device)
-    fits = [fit for index in indices if (fit := best_fit(best, index)) is not None]
     gain = ParameterLayout.of(len(names), 0).gain
     remaining = [
         np.mean(1 + priors.gain * fit.parameters[gain]) * np.mean(np.abs(fit.strength))

@@ -64,7 +64,10 @@ NO_MAP_WARNING = SolverWarning("no_map", "no map, so that its landmarks have no 
 
 
 def describe_visit(
-    visit: VisitHypotheses, estimate: CellEstimate | None, floor: FloorMap | None
+    visit: VisitHypotheses,
+    estimate: CellEstimate | None,
+    floor: FloorMap | None,
+    map_probability: float | None = None,
 ) -> LandmarkDetection:
     """Return the detection that reports one visit.
 
@@ -76,6 +79,8 @@ def describe_visit(
         Its cell on the map, if it is known.
     floor : FloorMap or None
         The map; misread landmarks, and cells without one, are recognized by it.
+    map_probability : float, optional
+        Probability that the robot is on this floor, if it was estimated.
     """
     unread = LandmarkDetection(
         time_s=visit.time_ns * 1e-9,
@@ -93,17 +98,21 @@ def describe_visit(
         strength=None,
         residual_sigma=visit.residual_sigma,
         refused=visit.refused,
+        cell_probability=None,
     )
     if not visit.hypotheses:
         return unread
     best, cell, quarters, refused = visit.best, None, 0, visit.refused
+    cell_probability = None
     if estimate is not None and estimate.probability >= MIN_CELL_PROBABILITY:
         best = visit.hypotheses[estimate.hypothesis]
         cell, quarters = estimate.cell, estimate.quarters
+        if map_probability is not None:
+            cell_probability = estimate.probability * map_probability
         if floor is not None:
             code_on_map = as_built_code(floor, estimate.cell)
             if code_on_map == HOLE_CODE:
-                cell = None
+                cell = cell_probability = None
                 refused = "off_map"
             elif estimate.misread_probability >= MIN_MISREAD_PROBABILITY:
                 refused = "misread"
@@ -134,6 +143,7 @@ def describe_visit(
         sigma_heading_rad=float(sigma[2]),
         strength=tuple(float(v) for v in np.roll(best.strength, quarters)),
         refused=refused,
+        cell_probability=cell_probability,
     )
 
 

@@ -301,6 +301,13 @@ def test_deviating_gain_is_reported(gain_sigmas: float, warned: bool) -> None:
     assert all("rear sensor" in each.message for each in warnings)
 
 
+def test_gains_of_fits_that_do_not_fit_are_not_reported() -> None:
+    fit = fit_of(gain_sigmas=(0, 0, 10, 0))
+    poor = replace(fit, residual_sigma=3.0)
+    assert check_gains([fit, fit, poor], recording_of(), ModelPriors())
+    assert not check_gains([fit, poor, poor], recording_of(), ModelPriors())
+
+
 def test_negative_gain_is_an_error() -> None:
     fits = [fit_of(gain_sigmas=(0, -1.1 / ModelPriors().gain, 0, 0))]
     with pytest.raises(InputError, match="left sensor of robot has the opposite sign"):

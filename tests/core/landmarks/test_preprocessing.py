@@ -47,6 +47,10 @@ def recorded(field: Array) -> HallSamples:
     return HallSamples("robot", HallSensors(), time_ns, field)
 
 
+def valid_readings(field: Array, step_m: float = 1e-3) -> tuple[Array, list[SolverWarning]]:
+    return remove_invalid_readings(recorded(field), np.full(len(field) - 1, step_m))
+
+
 def waves() -> Array:
     """Return fields of 25 mT whose peaks are about 14 samples wide, as of fast robots."""
     rng = np.random.default_rng(2)
@@ -59,21 +63,37 @@ def test_spikes_are_removed_and_counted() -> None:
     at = [(50, 0), (51, 2), (200, 3), (333, 0)]
     for row, column in at:
         field[row, column] += 0.06 if field[row, column] > 0 else -0.06
-    kept, warnings = remove_invalid_readings(recorded(field))
+    kept, warnings = valid_readings(field)
     assert [tuple(where) for where in np.argwhere(np.isnan(kept))] == at
     assert warnings == [SolverWarning("spikes", "robot: 4 single readings jump; left out")]
 
 
+def test_noise_has_no_spikes() -> None:
+    rng = np.random.default_rng(5)
+    field = waves() + rng.normal(0, 2e-3, (400, 4))
+    assert not np.isnan(valid_readings(field)[0]).any()
+    field[77, 1] += 0.06
+    assert np.argwhere(np.isnan(valid_readings(field)[0])).tolist() == [[77, 1]]
+
+
+def test_a_bar_that_is_passed_within_a_sample_is_no_spike() -> None:
+    """At 12.5 Hz a robot of 0.2 m/s moves 16 mm from sample to sample."""
+    x = 0.016 * np.arange(-6, 7)
+    field = np.tile(0.025 * np.exp(-0.5 * (x / 0.01) ** 2)[:, None], 4)
+    assert not np.isnan(valid_readings(field, step_m=0.016)[0]).any()
+    assert np.isnan(valid_readings(field, step_m=0.001)[0][6]).all()
+
+
 def test_valid_readings_are_kept() -> None:
     field = waves()
-    kept, warnings = remove_invalid_readings(recorded(field))
+    kept, warnings = valid_readings(field)
     assert (kept == field).all()
     assert warnings == []
 
 
 def test_unknown_range_is_detected() -> None:
     field = np.clip(waves(), -0.02, 0.02)
-    kept, warnings = remove_invalid_readings(recorded(field))
+    kept, warnings = valid_readings(field)
     assert (np.isnan(kept) == (np.abs(field) >= SATURATION_FRACTION * 0.02)).all()
     assert [each.code for each in warnings] == ["range_from_data", "saturated"]
     assert "readings end at 20 mT" in warnings[0].message
@@ -264,9 +284,9 @@ def test_steep_fields_are_no_spikes() -> None:
     """A step between two levels is no deviation from both neighbours; a lone reading is one."""
     field = np.full((9, 4), 1e-3)
     field[4:] = 20e-3
-    assert not np.isnan(remove_invalid_readings(recorded(field))[0]).any()
+    assert not np.isnan(valid_readings(field)[0]).any()
     field[7, 1] = 60e-3
-    assert np.argwhere(np.isnan(remove_invalid_readings(recorded(field))[0])).tolist() == [[7, 1]]
+    assert np.argwhere(np.isnan(valid_readings(field)[0])).tolist() == [[7, 1]]
 
 
 def test_removed_sensor_is_reported() -> None:
