@@ -28,6 +28,7 @@ from locatk.core.landmarks.localization.consistency import (
     warn_of_lag,
     warn_of_missing_pose,
     warn_of_opposite_polarity,
+    without_contradicted_ends,
 )
 from locatk.core.landmarks.localization.odometry_path import without_lag
 from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing, smooth_robustly
@@ -320,6 +321,7 @@ def localize_robot(
         smoothed.slipped_links,
     )
     unused = [visit for visit in visits if not any(visit is used for used in on_map)]
+    trajectory, contradictions = without_contradicted_ends(trajectory, on_map, unused)
     displaced = find_displaced_landmarks(unused, trajectory, floor)
     probability = pose_probability(
         trajectory.time_ns,
@@ -330,6 +332,7 @@ def localize_robot(
     return _with_warnings(
         replace(robot, trajectories=(replace(trajectory, probability=probability),)),
         *(warn_of_cause(each).about(identified.device) for each in displaced),
+        *(warning.about(identified.device) for warning in contradictions),
     )
 
 

@@ -57,9 +57,9 @@ UNMAPPED_LANDMARK_PROBABILITY = 1e-3
 OUTSIDE_LANDMARK_PROBABILITY = 0.01
 """Probability of a landmark in a cell outside of the map."""
 
-CARRIED_PROBABILITY = 1e-6
-"""Probability that a robot was carried to any other cell between two visits, times the density of
-its pose there relative to that of a pose by odometry (about 1e-4)."""
+CARRIED_WEIGHT = 1e-6
+"""Probability that a robot was carried to another cell between two visits (about 1 %), times the
+density of its pose there relative to that of a pose that odometry confirms (about 1e-4)."""
 
 RETURN_PROBABILITY = 1e-2
 """Probability of entering the map between two visits, from outside of it."""
@@ -70,7 +70,7 @@ OTHER_FLOOR_PROBABILITY = 0.5
 MISSED_LANDMARK_PROBABILITY = 0.02
 """Probability of passing a landmark without a visit."""
 
-OUTLIER_PROBABILITY = 1e-5
+OUTLIER_WEIGHT = 1e-5
 """Probability that neither pose nor code of a visit can be used (about 1 %), times the density of
 its pose relative to that of a pose that odometry confirms (about 1e-3)."""
 
@@ -85,9 +85,8 @@ MAX_FOLLOWED_HYPOTHESES = 6
 MIN_SLIP_BELIEF = 1e-3
 """Probability of a state from which on slips are followed: there are 64 steps after each."""
 
-MIN_CARRIED_FRACTION = 0.02
-"""Probability of a state below which it is dropped, relative to that of a robot that was carried
-there: below that of one that was carried, and read nothing wrong since."""
+MIN_STATE_TO_CARRIED_RATIO = 0.02
+"""States are dropped below this fraction of the probability that a carried robot is in one cell."""
 
 MAX_STATES_AT_ONCE = 20_000
 """States for which steps are computed at once, in order to bound the memory."""
@@ -242,7 +241,7 @@ def identify_cells(
     other = OtherFloor(model)
     beliefs: list[Belief] = []
     for k in range(len(visits)):
-        belief, evidence = model.first() if k == 0 else model.advance(beliefs[-1], k)
+        belief, evidence = model.initial_belief() if k == 0 else model.advance(beliefs[-1], k)
         beliefs.append(belief)
         log_map += math.log(evidence)
         log_other += math.log(other.advance(k))
@@ -325,8 +324,12 @@ class CellModel:
         read = np.stack([rotated(np.maximum(codes, 0), -q) for q in range(4)])
         empty = np.where(is_inside, CODE_COUNT, CODE_COUNT + 1)
         self.read_code = np.where(codes == HOLE_CODE, empty, read).reshape(-1)
-        self.miss = miss_likelihood(floor)
-        self.repeated = self._repeated_visits()
+        has_landmark = codes != HOLE_CODE
+        self.landmarks_before = (
+            np.pad(np.cumsum(has_landmark, axis=1), ((0, 0), (1, 0))),
+            np.pad(np.cumsum(has_landmark, axis=0), ((1, 0), (0, 0))),
+        )
+        self.confirming = self._confirming_visits()
         self._steps: dict[tuple[int, int, int, int], CellSteps] = {}
 
     def cells_of(self, states: States) -> tuple[States, States, States]:
@@ -335,7 +338,7 @@ class CellModel:
         row, column = np.divmod(cell, self.shape[1])
         return quarters, row, column
 
-    def first(self) -> tuple[Belief, float]:
+    def initial_belief(self) -> tuple[Belief, float]:
         """Return the belief after the first visit, and the probability of its readings."""
         count = len(self.followed[0])
         updated = [self.likelihood(0, n) / self.state_count for n in range(count)]
@@ -345,9 +348,9 @@ class CellModel:
         """Return the belief after the next visit, and the probability of its readings."""
         followed = self.followed[visit]
         total = sum(float(each.probability.sum()) for each in belief.components)
-        anywhere = CARRIED_PROBABILITY * total + RETURN_PROBABILITY * belief.outside
+        anywhere = CARRIED_WEIGHT * total + RETURN_PROBABILITY * belief.outside
         any_code = self.any_code_likelihood(visit)
-        outside = (1 - RETURN_PROBABILITY) * belief.outside + CARRIED_PROBABILITY * total
+        outside = (1 - RETURN_PROBABILITY) * belief.outside + CARRIED_WEIGHT * total
         updated = []
         for end, (_, hypothesis) in enumerate(followed):
             predicted = np.zeros(self.state_count)
@@ -361,10 +364,10 @@ class CellModel:
                     outside += hypothesis.probability * float(leaving[~is_on_map].sum())
             arrived = (anywhere / self.state_count) * self.map_likelihood(visit, end)
             updated.append(
-                (1 - OUTLIER_PROBABILITY) * (predicted * self.likelihood(visit, end) + arrived)
+                (1 - OUTLIER_WEIGHT) * (predicted * self.likelihood(visit, end) + arrived)
             )
         outliers = [
-            replace(each, probability=each.probability * (OUTLIER_PROBABILITY * any_code))
+            replace(each, probability=each.probability * (OUTLIER_WEIGHT * any_code))
             for each in belief.components
             if visit - each.visit <= MAX_SUCCESSIVE_OUTLIERS
         ]
@@ -377,7 +380,7 @@ class CellModel:
         """Return a belief of the sum 1 without negligible states, and the sum before."""
         total = outside + sum(float(each.sum()) for each in updated)
         total += sum(float(each.probability.sum()) for each in outliers)
-        least = MIN_CARRIED_FRACTION * CARRIED_PROBABILITY / self.state_count * total
+        least = MIN_STATE_TO_CARRIED_RATIO * CARRIED_WEIGHT / self.state_count * total
         components = []
         for number, each in enumerate(updated):
             states = np.flatnonzero(each > least)
@@ -397,11 +400,11 @@ class CellModel:
     def likelihood(self, visit: int, number: int) -> Array:
         """Return the likelihood (states,) of one hypothesis, for a robot that was not carried.
 
-        A repeated visit adds no evidence of the cell: it is the same landmark, whether it agrees
+        A confirming visit adds no evidence of the cell: it is the same landmark, whether it agrees
         with the map or not.
         """
         hypothesis = self.followed[visit][number][1]
-        known_code = self.repeated.get(visit)
+        known_code = self.confirming.get(visit)
         if known_code is None:
             return self.map_likelihood(visit, number)
         other = self.misread / (CODE_COUNT - 1)
@@ -424,7 +427,7 @@ class CellModel:
 
     def any_code_likelihood(self, visit: int) -> float:
         """Return the likelihood of a visit if its code says nothing of the cell."""
-        if visit in self.repeated:
+        if visit in self.confirming:
             count = len(self.followed[visit])
             return float(sum(self.likelihood(visit, n)[0] for n in range(count)))
         return sum(one.probability for _, one in self.followed[visit]) / CODE_COUNT
@@ -488,25 +491,28 @@ class CellModel:
         height, width = self.shape
         is_on_map = (new_row >= 0) & (new_row < height) & (new_column >= 0) & (new_column < width)
         arrival = ((quarters + steps.quarters) % 4 * height + new_row) * width + new_column
-        weight = steps.likelihood * self._pass_likelihood(row, column, rows, columns)
+        weight = steps.likelihood * self._missed_landmarks_likelihood(row, column, rows, columns)
         return weight, np.where(is_on_map, arrival, -1)
 
-    def _pass_likelihood(self, row: States, column: States, rows: States, columns: States) -> Array:
+    def _missed_landmarks_likelihood(
+        self, row: States, column: States, rows: States, columns: States
+    ) -> Array:
         """Return the likelihood (n, steps) of no visit between both ends of a straight path."""
         likelihood = np.ones(rows.shape)
-        length = np.maximum(np.abs(rows), np.abs(columns))
-        is_straight = (rows == 0) | (columns == 0)
+        # A straight step is straight from each state.
+        is_straight = (rows[0] == 0) | (columns[0] == 0)
+        rows, columns = rows[:, is_straight], columns[:, is_straight]
         height, width = self.shape
-        for k in range(1, int(length[is_straight].max(initial=0))):
-            between_row = row + np.sign(rows) * k
-            between_column = column + np.sign(columns) * k
-            is_between = is_straight & (k < length)
-            is_between &= (between_row >= 0) & (between_row < height)
-            is_between &= (between_column >= 0) & (between_column < width)
-            likelihood[is_between] *= self.miss[between_row[is_between], between_column[is_between]]
+        along_row = self.landmarks_before[0]
+        first, last = _between(column, column + columns, width)
+        missed = along_row[row, last] - along_row[row, first]
+        along_column = self.landmarks_before[1]
+        first, last = _between(row, row + rows, height)
+        missed += along_column[last, column] - along_column[first, column]
+        likelihood[:, is_straight] = MISSED_LANDMARK_PROBABILITY**missed
         return likelihood
 
-    def _repeated_visits(self) -> dict[int, int]:
+    def _confirming_visits(self) -> dict[int, int]:
         """Find visits that repeat what an earlier or later visit to the same landmark read.
 
         The visits to one landmark follow from the most likely steps.
@@ -540,7 +546,7 @@ class CellModel:
         visits_of: dict[tuple[int, tuple[int, int]], list[int]] = {}
         for number, (chain, cell, _) in enumerate(path):
             visits_of.setdefault((chain, cell), []).append(number)
-        repeated: dict[int, int] = {}
+        confirming: dict[int, int] = {}
         for numbers in visits_of.values():
             best = max(numbers, key=lambda n: self.followed[n][0][1].probability)
             code = int(rotated(self.followed[best][0][1].code, path[best][2]))
@@ -548,8 +554,8 @@ class CellModel:
                 code_here = int(rotated(code, -path[n][2]))
                 # A different reading is evidence: the path may be wrong, after a slip.
                 if n != best and self.followed[n][0][1].code == code_here:
-                    repeated[n] = code_here
-        return repeated
+                    confirming[n] = code_here
+        return confirming
 
     # ---- backward pass
 
@@ -577,7 +583,7 @@ class CellModel:
         for component, value in zip(following.components, backward, strict=True):
             if component.visit == visit:
                 states, number = component.states, component.hypothesis
-                value = value * (1 - OUTLIER_PROBABILITY)
+                value = value * (1 - OUTLIER_WEIGHT)
                 later[number][states] = value * self.likelihood(visit, number)[states]
                 anywhere += float(value @ self.map_likelihood(visit, number)[states])
             else:
@@ -586,7 +592,7 @@ class CellModel:
         outside *= self.outside_likelihood(visit)
         values = []
         for component in belief.components:
-            value = np.full(len(component.states), CARRIED_PROBABILITY * (anywhere + outside))
+            value = np.full(len(component.states), CARRIED_WEIGHT * (anywhere + outside))
             for end in range(len(followed)):
                 for rows, weight, arrival in self._transitions(component, visit, end):
                     off_map = followed[end][1].probability * outside
@@ -596,7 +602,7 @@ class CellModel:
             if staying is not None:
                 states, stay = staying
                 rows = np.searchsorted(component.states, states)
-                value[rows] += OUTLIER_PROBABILITY * any_code * stay
+                value[rows] += OUTLIER_WEIGHT * any_code * stay
             values.append(value)
         before_outside = (1 - RETURN_PROBABILITY) * outside + RETURN_PROBABILITY * anywhere
         scale = max(
@@ -622,14 +628,14 @@ class CellModel:
         good = float(by_state.sum())
         state = int(np.argmax(by_state))
         quarters, row, column = (int(each) for each in self.cells_of(np.array(state)))
-        # The map contributes to the choice of the hypothesis of a repeated visit as well.
+        # The map contributes to the choice of the hypothesis of a confirming visit as well.
         weights = np.zeros(len(self.followed[visit]))
         filtered = 0.0
         for component, posterior in own:
             index = int(np.searchsorted(component.states, state))
             if index < len(component.states) and component.states[index] == state:
                 weights[component.hypothesis] = posterior[index]
-                if visit in self.repeated:
+                if visit in self.confirming:
                     weights[component.hypothesis] *= self.map_likelihood(
                         visit, component.hypothesis
                     )[state]
@@ -665,6 +671,10 @@ class OtherFloor:
         ).astype(float)
         self.frequency += 1.0  # Codes that this floor lacks may occur on another one.
         self.frequency /= self.frequency.sum(axis=1, keepdims=True)
+        empty = (model.read_code >= CODE_COUNT)[: model.cell_count]
+        outside = (model.read_code > CODE_COUNT)[: model.cell_count]
+        hole_fraction = float((empty & ~outside).sum() / max((~outside).sum(), 1))
+        self.mean_miss = hole_fraction + (1 - hole_fraction) * MISSED_LANDMARK_PROBABILITY
         self.heading_of: dict[int, Array] = {}  # By the last visit that is no outlier.
 
     def advance(self, visit: int) -> float:
@@ -672,15 +682,14 @@ class OtherFloor:
         model = self.model
         any_code = model.any_code_likelihood(visit)
         if visit:
-            arriving = CARRIED_PROBABILITY * sum(self.heading_of.values()) / 4
+            arriving = CARRIED_WEIGHT * sum(self.heading_of.values()) / 4
             for before, heading in self.heading_of.items():
                 steps = model.steps(before, 0, visit, 0)
-                if len(steps):
-                    turned = np.roll(heading, int(steps.quarters[0]))
-                    arriving = arriving + float(steps.likelihood[0]) * turned
+                for turn, likelihood in enumerate(self._turn_likelihood(steps)):
+                    arriving = arriving + likelihood * np.roll(heading, turn)
         else:
             arriving = np.full(4, 0.25)
-        if visit in model.repeated:
+        if visit in model.confirming:
             likelihood = np.full(4, any_code)
         else:
             followed = model.followed[visit]
@@ -688,14 +697,21 @@ class OtherFloor:
             for _, one in followed:
                 likelihood += one.probability * self.frequency[:, one.code]
         belief = {
-            before: OUTLIER_PROBABILITY * any_code * heading
+            before: OUTLIER_WEIGHT * any_code * heading
             for before, heading in self.heading_of.items()
             if visit - before <= MAX_SUCCESSIVE_OUTLIERS
         }
-        belief[visit] = (1 - OUTLIER_PROBABILITY) * likelihood * arriving
+        belief[visit] = (1 - OUTLIER_WEIGHT) * likelihood * arriving
         total = float(sum(each.sum() for each in belief.values()))
         self.heading_of = {before: each / total for before, each in belief.items()}
         return total
+
+    def _turn_likelihood(self, steps: CellSteps) -> Array:
+        """Return the likelihood (4,) of all steps that turn the robot by so many quarters."""
+        columns, rows = np.abs(steps.cells.T)
+        missed = np.where((columns == 0) | (rows == 0), np.maximum(columns + rows - 1, 0), 0)
+        weight = steps.likelihood * self.mean_miss**missed
+        return np.bincount(steps.quarters % 4, weight, minlength=4)
 
 
 def _followed_hypotheses(visit: VisitHypotheses) -> list[NumberedHypothesis]:
@@ -705,7 +721,8 @@ def _followed_hypotheses(visit: VisitHypotheses) -> list[NumberedHypothesis]:
     return kept[:MAX_FOLLOWED_HYPOTHESES]
 
 
-def miss_likelihood(floor: FloorMap) -> Array:
-    """Return the likelihood (rows, columns) of passing a cell without a visit, with pad."""
-    padded = np.pad(floor.codes, PAD_CELLS, constant_values=HOLE_CODE)
-    return np.where(padded == HOLE_CODE, 1.0, MISSED_LANDMARK_PROBABILITY)
+def _between(start: States, end: States, size: int) -> tuple[States, States]:
+    """Return the range of indices strictly between two ones, as far as they are below a size."""
+    first = np.clip(np.minimum(start, end) + 1, 0, size)
+    last = np.clip(np.maximum(start, end), 0, size)
+    return first, np.maximum(first, last)

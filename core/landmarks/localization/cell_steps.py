@@ -3,8 +3,9 @@
 Odometry is right up to its drift, or a wheel slipped. A step therefore has the likelihood of a
 mixture: a normal distribution of the difference from the odometry, and a Cauchy distribution of
 distance and angle, whose long tails are those of a slip (Lange, Little and Taylor, J. Am. Stat.
-Assoc. 84 (1989) 881). Likelihoods are relative to the peak of the normal distribution, as long as
-odometry determines the cell.
+Assoc. 84 (1989) 881). Likelihoods are relative to the peak of the normal distribution as long as
+odometry determines the cell. If it leaves several open, the peak is lower, so that their sum is
+about 1.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ SLIP_SCALE_M, SLIP_SCALE_RAD = 0.03, math.radians(10)
 """Scales of the Cauchy distributions of a slip: half of all slips are smaller."""
 
 MIN_RANGE_CELLS, MAX_RANGE_CELLS = 1, 4
-"""Range of cells that are considered beyond the nearest ones on each side: at least those that a
-slip leads to, and at most those of odometry over several metres."""
+"""Number of cells that are considered on each side beyond the two nearest ones, in x and in y: at
+least those that a slip leads to, and at most those of odometry over several metres."""
 
 RANGE_SIGMAS = 2.0
 """The same in standard deviations of the odometry."""
@@ -63,7 +64,7 @@ class CellSteps:
     likelihood : (n,) ndarray
         Relative to a step that odometry confirms exactly; in descending order.
     odometry_likelihood : (n,) ndarray
-        The part of it for which no wheel slipped.
+        Normal distribution of the difference from the odometry, relative to its peak.
     """
 
     cells: NDArray[np.int64]
@@ -75,13 +76,13 @@ class CellSteps:
         return len(self.quarters)
 
     def that_odometry_confirms(self) -> CellSteps:
-        """Return the steps that need no slip."""
-        count = int((self.likelihood >= MIN_ODOMETRY_LIKELIHOOD).sum())
+        """Return the steps that agree with the odometry."""
+        agrees = self.odometry_likelihood >= MIN_ODOMETRY_LIKELIHOOD
         return CellSteps(
-            self.cells[:count],
-            self.quarters[:count],
-            self.likelihood[:count],
-            self.odometry_likelihood[:count],
+            self.cells[agrees],
+            self.quarters[agrees],
+            self.likelihood[agrees],
+            self.odometry_likelihood[agrees],
         )
 
 
@@ -136,11 +137,11 @@ def steps_between(
     # Odometry over a long distance leaves many cells and headings open, and none is likely.
     peak = min(1.0, pitch_m**2 / (math.tau * position_sigma_m**2))
     peak *= min(1.0, HALF_PI_RAD / (math.sqrt(math.tau) * frame_sigma))
-    by_odometry = peak * np.exp(
+    by_odometry = np.exp(
         -((distance_m / position_sigma_m) ** 2 + (angle[:, None] / frame_sigma) ** 2) / 2
     )
     slip = _slip_likelihood(distance_m, angle[:, None], position_sigma_m, frame_sigma)
-    likelihood = (by_odometry + slip).ravel()
+    likelihood = (peak * by_odometry + slip).ravel()
     order = np.argsort(-likelihood, kind="stable")
     order = order[likelihood[order] > MIN_STEP_LIKELIHOOD]
     return CellSteps(

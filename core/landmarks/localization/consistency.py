@@ -218,6 +218,48 @@ def find_displaced_landmarks(
     return list(displaced.values())
 
 
+def without_contradicted_ends(
+    trajectory: Trajectory, used: Sequence[IdentifiedVisit], unused: Sequence[IdentifiedVisit]
+) -> tuple[Trajectory, list[SolverWarning]]:
+    """Return a trajectory without dead reckoning to visits that contradict it, and warnings.
+
+    Before the first and after the last visit that is used, poses are dead reckoning. If a landmark
+    was visited there whose field or cell does not agree with it, a wheel slipped or the robot was
+    carried at some moment, and no other visit confirms any of these poses.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    used, unused : sequence of IdentifiedVisit
+        Visits from which the trajectory was estimated, and the others.
+    """
+    first_ns = used[0].segment.time_ns[0]
+    last_ns = used[-1].segment.time_ns[-1]
+    times_ns = [one.segment.time_ns for one in unused if _is_contradiction(one)]
+    is_kept = np.ones(len(trajectory), bool)
+    removed = []
+    if any(time_ns[0] < first_ns for time_ns in times_ns):
+        is_kept &= trajectory.time_ns >= first_ns
+        removed.append(f"before {1e-9 * first_ns:.3f} s")
+    if any(time_ns[-1] > last_ns for time_ns in times_ns):
+        is_kept &= trajectory.time_ns <= last_ns
+        removed.append(f"after {1e-9 * last_ns:.3f} s")
+    reason = "landmarks contradict the odometry: did a wheel slip, or was the robot carried?"
+    warnings = [
+        SolverWarning("odometry_contradicted", f"no poses {part}, where {reason}")
+        for part in removed
+    ]
+    return trajectory.select(is_kept), warnings
+
+
+def _is_contradiction(visit: IdentifiedVisit) -> bool:
+    """Return whether a visit that is not used contradicts the odometry from others to it."""
+    if visit.hypotheses.refused:
+        return visit.hypotheses.refused == "not_explained"
+    # Others are outside of the map.
+    return visit.estimate is not None and visit.estimate.probability < MIN_CELL_PROBABILITY
+
+
 def _describe_cause(cause: Cause) -> str:
     if isinstance(cause, WheelSlip):
         return (

@@ -320,12 +320,15 @@ class _Snooping:
         """Release the priors that do not hold, and take others back; return if any changed.
 
         Of neighbouring candidates the best is released, because it may explain the others.
+        Alternatives stay released together: each explains alone what the others would.
         """
         odds = np.array([one.log_posterior_odds() for one in self.candidates])
         limit = math.log(MIN_RELEASE_ODDS)
         has_changed = False
+        groups = [[one, *one.alternatives] for one in self.candidates if one.alternatives]
+        grouped = {id(one) for group in groups for one in group}
         for one, own in zip(self.candidates, odds, strict=True):
-            if one.is_released and not one.alternatives and own < limit:
+            if one.is_released and id(one) not in grouped and own < limit:
                 self._set_released(one, False)
                 has_changed = True
         if has_changed:

@@ -252,7 +252,7 @@ def localize_stops(
     beliefs: list[Belief] = []
     current: list[LocalizedStop] = []
     for number in range(len(observations)):
-        belief, evidence = model.advance(beliefs[-1], number) if number else model.first()
+        belief, evidence = model.advance(beliefs[-1], number) if number else model.initial_belief()
         log_ratio += math.log(evidence / other.advance(number))
         beliefs.append(belief)
         current += _stops(model.estimates([belief]), log_ratio)

@@ -235,6 +235,25 @@ def test_a_heading_is_no_evidence_of_a_compass_floor() -> None:
         assert identify(visits, floor).map_probability < 0.99
 
 
+def test_long_steps_are_no_evidence_of_this_floor() -> None:
+    """Odometry over many pitches leaves many cells open, here and on any other floor."""
+    hops = [((2 + 7 * (k % 2), 3 + 7 * k), 0) for k in range(5)]
+    mixed = [((2, 1 + k), 0) for k in range(4)] + [((9 + k, 13), 1) for k in range(4)]
+    for seed in range(4):
+        random, floor = np.random.default_rng(seed), random_floor(9, 40)
+        other = random_floor(seed, 40)
+        assert identify(visits_along(other, hops, random), floor).map_probability < 0.3
+        assert identify(visits_along(other, mixed, random), floor).map_probability < 0.3
+        assert identify(visits_along(floor, mixed, random), floor).map_probability > 0.999
+
+
+def test_missed_landmarks_are_no_evidence_of_another_floor() -> None:
+    """On a straight path with a landmark unread between every two."""
+    random, floor = np.random.default_rng(5), random_floor(5)
+    path = [((4, 3 + 2 * k), 0) for k in range(7)]
+    assert identify(visits_along(floor, path, random), floor).map_probability > 0.999
+
+
 def test_a_slip_is_no_evidence_of_another_floor() -> None:
     random, floor = np.random.default_rng(2), random_floor(2)
     path = [((4, 3 + k), 0) for k in range(8)]
@@ -274,7 +293,7 @@ class ClampedModel(CellModel):
 
 
 def log_evidence(model: CellModel) -> float:
-    belief, evidence = model.first()
+    belief, evidence = model.initial_belief()
     total = math.log(evidence)
     for number in range(1, len(model.visits)):
         belief, evidence = model.advance(belief, number)
@@ -284,10 +303,10 @@ def log_evidence(model: CellModel) -> float:
 
 def test_probabilities_are_ratios_of_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
     """That of a state is the evidence with the state given, relative to that of all states."""
-    monkeypatch.setattr(cell_filter, "MIN_CARRIED_FRACTION", 0.0)
+    monkeypatch.setattr(cell_filter, "MIN_STATE_TO_CARRIED_RATIO", 0.0)
     monkeypatch.setattr(cell_filter, "MIN_SLIP_BELIEF", 0.0)
-    monkeypatch.setattr(cell_filter, "CARRIED_PROBABILITY", 1e-2)
-    monkeypatch.setattr(cell_filter, "OUTLIER_PROBABILITY", 0.1)
+    monkeypatch.setattr(cell_filter, "CARRIED_WEIGHT", 1e-2)
+    monkeypatch.setattr(cell_filter, "OUTLIER_WEIGHT", 0.1)
     random, floor = np.random.default_rng(8), random_floor(8, 5)
     path = [((2, 1), 0), ((2, 2), 0), ((2, 3), 0), ((3, 3), 1), ((2, 3), 3)]
     visits = with_slip(visits_along(floor, path, random), 2, (0.05, 0.02), 0.2)
@@ -295,7 +314,7 @@ def test_probabilities_are_ratios_of_evidence(monkeypatch: pytest.MonkeyPatch) -
     first = replace(visits[1].best, probability=0.7)
     visits[1] = replace(visits[1], hypotheses=(first, second))
     model = ClampedModel(visits, floor, misread=MISREAD, drift=OdometryDrift())
-    assert model.repeated  # The last visit repeats the third one.
+    assert model.confirming  # The last visit repeats the third one.
     total = log_evidence(model)
     estimates = identify_cells(visits, floor, misread=MISREAD, drift=OdometryDrift()).estimates
     for number, one in enumerate(estimates):
@@ -346,7 +365,7 @@ def test_steps_that_odometry_confirms_come_first() -> None:
     assert steps.likelihood[0] > 0.1
     assert np.all(np.diff(steps.likelihood) <= 0)
     assert len(steps.that_odometry_confirms()) == 1
-    assert np.all(steps.odometry_likelihood <= steps.likelihood)
+    assert steps.odometry_likelihood[0] > 0.1
     # All cells nearby under all headings are within the reach of a slip.
     assert {int(q) % 4 for q in steps.quarters} == {0, 1, 2, 3}
     assert steps.likelihood[-1] < cell_steps.SLIP_PROBABILITY
@@ -359,4 +378,7 @@ def test_odometry_over_a_long_distance_leaves_many_cells_open() -> None:
         first, second, first.best, second.best, pitch_m=floor.pitch_m, drift=OdometryDrift()
     )
     assert len(steps) > 50
-    assert steps.odometry_likelihood.sum() < 1.1
+    assert steps.likelihood.sum() < 1.1
+    agreeing = steps.that_odometry_confirms()
+    assert 20 < len(agreeing) < len(steps)
+    assert agreeing.odometry_likelihood.min() >= cell_steps.MIN_ODOMETRY_LIKELIHOOD

@@ -23,6 +23,7 @@ from locatk.core.landmarks.simulation.session import (
 )
 from locatk.core.landmarks.solver import solve
 from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
 
 CODES = np.random.default_rng(11).integers(0, 16, (12, 12))
 
@@ -102,6 +103,37 @@ def test_contradictions_are_counted(
     visits = visits_of(misread, unexplained, correct)
     on_map = [visit for visit in visits if visit.estimate is not None]
     assert consistency.is_map_contradicted(visits, on_map, 1.0) == contradicted
+
+
+def used_visit(start_s: int, refused: str = "", probability: float = 1.0) -> IdentifiedVisit:
+    """Return a visit of one second, with a cell of the given probability if it is not refused."""
+    time_ns = np.array([start_s, start_s + 1], np.int64) * 10**9
+    segment = VisitSegment(0, 2, time_ns, None, np.zeros(3))  # type: ignore[arg-type]
+    hypotheses = VisitHypotheses("robot", 0, 0, 5, np.zeros(3), (), refused=refused)
+    estimate = CellEstimate((2, 2), 0, 0, probability, probability)
+    return IdentifiedVisit(segment, hypotheses, None if refused else estimate)
+
+
+@pytest.mark.parametrize(
+    ("unused", "first_s", "last_s"),
+    [
+        ([], 0, 20),
+        ([used_visit(1, "not_explained")], 5, 20),
+        ([used_visit(15, probability=0.3)], 0, 11),
+        ([used_visit(1, "not_explained"), used_visit(15, probability=0.3)], 5, 11),
+        ([used_visit(1, "too_weak"), used_visit(7, "not_explained")], 0, 20),
+    ],
+)
+def test_dead_reckoning_ends_where_landmarks_contradict_it(
+    unused: list[IdentifiedVisit], first_s: int, last_s: int
+) -> None:
+    time_ns = np.arange(21, dtype=np.int64) * 10**9
+    path = Trajectory.from_positions("robot", "map", time_ns, np.zeros((21, 3)))
+    used = [used_visit(5), used_visit(10)]
+    kept, warnings = consistency.without_contradicted_ends(path, used, unused)
+    assert (kept.time_ns[[0, -1]] == np.array([first_s, last_s]) * 10**9).all()
+    assert len(warnings) == (first_s > 0) + (last_s < 20)
+    assert all(each.code == "odometry_contradicted" for each in warnings)
 
 
 def test_causes_that_cannot_be_distinguished_are_named_without_sizes() -> None:

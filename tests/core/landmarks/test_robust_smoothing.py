@@ -171,6 +171,20 @@ def test_slip_is_named_and_released(slip: tuple[float, float, float], fraction: 
 
 
 @pytest.mark.slow
+def test_covariance_contains_both_explanations() -> None:
+    """A slip after the first landmark: that landmark may as well be displaced."""
+    one = drive()
+    robot = solved(one, slipped(odometry_of(one, 7), 0.05, np.array([0.025, 0.0, 0.0])))
+    (warning,) = robot.warnings
+    assert "displaced, or a wheel slipped" in warning.message
+    (path,) = robot.trajectories
+    squares = errors_of(one, robot)[1]
+    assert squares[0].max() < 9
+    assert path.sigma[0, 0] > 0.015
+    assert path.sigma[-1, 0] < 0.002
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("displaced_m", "rotated_deg"), [(0.012, 0), (0.03, 0), (0, 5), (0, 8)])
 def test_displaced_or_rotated_landmark_is_named(displaced_m: float, rotated_deg: float) -> None:
     one = drive(displaced_m, rotated_deg)
