@@ -153,7 +153,7 @@ class HallRecording:
     def rescaled(self, scale: float) -> HallRecording:
         """Return the recording with readings divided by a factor, with a warning."""
         message = (
-            f"fields are {scale:.2g} times those of the bars of the map; corrected. Check the unit "
+            f"fields are {scale:.2g} times those expected of the bars; corrected. Check the unit "
             "and the gain of the readings, the height of the sensors, and the bars of the map"
         )
         warning = SolverWarning("sensor_scale", message).about(self.samples.device)
@@ -206,15 +206,18 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
             hint="Record it together with the hall sensors: fields alone do not determine a path",
         )
     time_ns = samples.time_ns
-    is_finite = np.isfinite(np.hstack([odometry.position[:, :2], odometry.quaternion]))
-    is_valid = np.asarray(is_finite.all(axis=1))
+    is_valid = valid_poses(odometry)
     if is_valid.sum() < 2:
         raise InputError(
-            f"no valid odometry of {samples.device}", hint="Its poses are not finite numbers"
+            f"no valid odometry of {samples.device}",
+            hint="Its poses are not finite numbers, or their times do not increase",
         )
     warnings = []
     if not is_valid.all():
-        message = f"{(~is_valid).sum()} poses of the odometry are not finite numbers; left out"
+        message = (
+            f"{(~is_valid).sum()} poses of the odometry are not finite numbers, or not later than "
+            "the pose before; left out"
+        )
         warnings.append(SolverWarning("odometry_invalid", message).about(samples.device))
     invalid_ns, odometry = odometry.time_ns[~is_valid], odometry.select(is_valid)
     is_covered = (time_ns >= odometry.time_ns[0]) & (time_ns <= odometry.time_ns[-1])
@@ -239,6 +242,17 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
         warnings=(*warnings, *reading_warnings),
         odometry=odometry,
     )
+
+
+def valid_poses(odometry: Trajectory) -> NDArray[np.bool_]:
+    """Return which poses (n,) are finite and later than all finite ones before."""
+    is_finite = np.isfinite(np.hstack([odometry.position[:, :2], odometry.quaternion]))
+    is_valid = np.asarray(is_finite.all(axis=1))
+    time_ns = odometry.time_ns[is_valid]
+    is_later = np.ones(len(time_ns), bool)
+    is_later[1:] = time_ns[1:] > np.maximum.accumulate(time_ns)[:-1]
+    is_valid[is_valid] = is_later
+    return is_valid
 
 
 def _is_in_gap(

@@ -103,6 +103,20 @@ class SolveOptions:
             raise InputError(
                 f"unknown method {self.method!r}", hint=f"choose one of {', '.join(METHODS)}"
             )
+        given = (self.odometry_noise, self.odometry_lag_s)
+        if self.method == "paper" and given != (None, None):
+            raise InputError(
+                "noise and lag of the odometry do not apply to method 'paper'",
+                hint="Leave them out, or use method 'field'",
+            )
+        if not all(value is None or math.isfinite(value) for value in given) or not (
+            self.odometry_noise is None or self.odometry_noise > 0
+        ):
+            raise InputError(
+                f"odometry with a noise of {self.odometry_noise} rad and a lag of "
+                f"{self.odometry_lag_s} s",
+                hint="Both are finite numbers, and the noise is positive",
+            )
         if not 0 < self.misread < 0.5:
             raise InputError(
                 f"a rate of misread landmarks of {self.misread!r}", hint="Give 0.001 to 0.2"
@@ -262,15 +276,16 @@ def solve_recording(
         See :func:`solve`.
     """
     lag_s = options.odometry_lag_s or 0.0
-    for _ in range(MAX_LAG_ROUNDS):
+    for rounds_left in reversed(range(MAX_LAG_ROUNDS)):
         shifted = odometry if odometry is None or not lag_s else without_lag(odometry, lag_s)
         identified = identify_recording(samples, shifted, floor, options)
         robot = localize_robot(identified, floor, options)
-        if options.odometry_lag_s is not None or not robot.lag_s:
+        if options.odometry_lag_s is not None or not robot.lag_s or not rounds_left:
             break
         lag_s += robot.lag_s
     if options.odometry_lag_s is None and abs(lag_s) > MIN_REPORTED_LAG_S:
-        robot = _with_warnings(robot, warn_of_lag(lag_s).about(identified.device))
+        warning = warn_of_lag(lag_s, remaining_s=robot.lag_s)
+        robot = _with_warnings(robot, warning.about(identified.device))
     return robot
 
 
@@ -291,7 +306,7 @@ def localize_robot(
         )
         obstacle = SolverWarning("map_contradicted", message).about(identified.device)
     elif not on_map:
-        obstacle = warn_of_missing_pose(recording, visits, facts.probability or 0.0)
+        obstacle = warn_of_missing_pose(recording, visits)
     else:
         obstacle = None
     if obstacle is not None:
@@ -312,7 +327,7 @@ def localize_robot(
     lag_s = significant_lag(smoothed, identified.priors.drift)
     robot = _with_warnings(replace(unlocalized, facts=facts, lag_s=lag_s), *warnings)
     if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
-        return replace(robot, facts=replace(facts, localised=False))
+        return replace(robot, facts=replace(facts, localised=False, provisional=False))
     trajectory = estimate_trajectory(
         identified.device,
         smoothed.measurements,
@@ -320,7 +335,8 @@ def localize_robot(
         identified.odometry,
         smoothed.slipped_links,
     )
-    unused = [visit for visit in visits if not any(visit is used for used in on_map)]
+    used = set(map(id, on_map))
+    unused = [visit for visit in visits if id(visit) not in used]
     trajectory, contradictions = without_contradicted_ends(trajectory, on_map, unused)
     displaced = find_displaced_landmarks(unused, trajectory, floor)
     probability = pose_probability(
@@ -367,6 +383,8 @@ def smooth_robot(
             f"fields deviate from the model by {residual_sigma:.2g} standard deviations; "
             "check clocks and scale of the odometry, the sensors and the landmarks' geometry"
         )
+        if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
+            message += "; there are no poses"
         warnings.append(SolverWarning("field_misfit", message))
     return smoothed, [warning.about(identified.device) for warning in warnings]
 

@@ -5,6 +5,7 @@ A report lists as *losses* the devices and observations that the solution leaves
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from locatk.core.landmarks.results import LandmarkDetection, RobotFacts
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.polaris.results import TagDetection
 from locatk.core.solution import Solution, SolverWarning
-from locatk.core.trajectory import Trajectory
+from locatk.core.trajectory import PROVISIONAL_PROBABILITY, Trajectory
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,7 @@ def _unlocalized_robots(solution: Solution) -> list[SolverWarning]:
             reason = ": no map of the floor"
         elif not facts.landmarks_seen:
             reason = ": no landmark was detected"
-        elif facts.probability is not None:
+        elif facts.probability is not None and facts.probability < PROVISIONAL_PROBABILITY:
             reason = f": the likeliest position has a probability of {facts.probability:.2g}"
         else:
             reason = ""
@@ -231,7 +232,11 @@ def _unlocalized_robots(solution: Solution) -> list[SolverWarning]:
 def _provisional_poses(device: str, facts: RobotFacts) -> SolverWarning:
     """Return the loss of a robot that may be on another floor or in another cell."""
     text = f"the poses of {device} are provisional: they are right with a probability of "
-    text += f"{facts.probability:.5g}" if facts.probability is not None else "unknown"
+    text += (
+        f"{math.floor(1e5 * facts.probability) / 1e5:.5g}"
+        if facts.probability is not None
+        else "unknown"
+    )
     return SolverWarning("provisional", f"{text}; visit more landmarks")
 
 

@@ -129,21 +129,6 @@ class MapProof:
         """True if the map is unique and detects as many misread landmarks as it states."""
         return self.is_unique and self.detects >= self.promised
 
-    @property
-    def landmarks_mean(self) -> float | None:
-        """Mean number of landmarks to visit, over the starts that can be distinguished."""
-        return self.localization.mean if self.localization else None
-
-    @property
-    def landmarks_p99(self) -> float | None:
-        """99th percentile of that number, interpolated."""
-        return self.localization.p99 if self.localization else None
-
-    @property
-    def landmarks_worst(self) -> int | None:
-        """Number of landmarks for the worst start that can be distinguished."""
-        return self.localization.worst if self.localization else None
-
 
 def prove_map(floor: FloorMap, *, steps: bool = True) -> MapProof:
     """Prove or refute the uniqueness of a map, and evaluate single faults.

@@ -45,7 +45,6 @@ from locatk.core.landmarks.detection.scan import (
 )
 from locatk.core.landmarks.detection.trace import Trace, planar_rotation
 from locatk.core.landmarks.landmark import (
-    CODE_COUNT,
     HALF_PI_RAD,
     Geometry,
     signs,
@@ -285,13 +284,6 @@ class VisitHypotheses:
         rotation = float(self.odometry[2] - heading)
         cos, sin = math.cos(rotation), math.sin(rotation)
         return np.asarray(self.odometry[:2] - [cos * x - sin * y, sin * x + cos * y])
-
-    def code_probabilities(self) -> Array:
-        """Return the probability (16,) of each code in the frame of the hypotheses."""
-        total = np.zeros(CODE_COUNT)
-        for hypothesis in self.hypotheses:
-            total[hypothesis.code] += hypothesis.probability
-        return total
 
 
 @dataclass(frozen=True)

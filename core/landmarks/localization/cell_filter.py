@@ -711,7 +711,7 @@ class OtherFloor:
         columns, rows = np.abs(steps.cells.T)
         missed = np.where((columns == 0) | (rows == 0), np.maximum(columns + rows - 1, 0), 0)
         weight = steps.likelihood * self.mean_miss**missed
-        return np.bincount(steps.quarters % 4, weight, minlength=4)
+        return np.asarray(np.bincount(steps.quarters % 4, weight, minlength=4), float)
 
 
 def _followed_hypotheses(visit: VisitHypotheses) -> list[NumberedHypothesis]:

@@ -46,6 +46,9 @@ MIN_OUTLIER_PROBABILITY = 0.5
 MIN_DISPLACED_CODE_PROBABILITY = 0.9
 """Probability of a code from which on a visit that was not used is evidence of a landmark."""
 
+MIN_DISPLACEMENT_SIGMAS = 4.0
+"""Displacement or rotation of a landmark in standard deviations from which on it is reported."""
+
 MAX_DISPLACEMENT_PITCHES = 0.5
 """Displacement of a landmark, in pitches, beyond which it would be in another cell."""
 
@@ -195,24 +198,28 @@ def find_displaced_landmarks(
             continue
         best = visit.hypotheses.best
         time_ns = np.array([visit.hypotheses.time_ns])
-        gap_ns = np.abs(trajectory.time_ns - time_ns).min()
+        nearest = int(np.abs(trajectory.time_ns - time_ns).argmin())
+        gap_ns = abs(int(trajectory.time_ns[nearest] - time_ns[0]))
         if best.probability < MIN_DISPLACED_CODE_PROBABILITY or gap_ns > MAX_POSE_GAP_NS:
             continue
         robot = path.pose_at(time_ns)[0]
         landmark = compose(robot, relative(np.zeros((1, 3)), best.pose)[0])
         quarters = round(landmark[2] / HALF_PI_RAD)
-        cell = min(
-            floor.cells(),
-            key=lambda one: math.dist(floor.position(one), landmark[:2]),
-            default=None,
-        )
-        if cell is None or as_built_code(floor, cell) != rotated(best.code, quarters % 4):
+        column, row = np.round((landmark[:2] - floor.origin_m) / floor.pitch_m).astype(int).tolist()
+        cell = (row, column)
+        is_on_map = 0 <= cell[0] < floor.shape[0] and 0 <= cell[1] < floor.shape[1]
+        if not is_on_map or as_built_code(floor, cell) != rotated(best.code, quarters % 4):
             continue
         built, _ = as_built_landmark(floor, cell)
         shift = landmark - built
         rotation = math.remainder(float(shift[2]), HALF_PI_RAD)
         distance = float(np.hypot(*shift[:2]))
         if distance > MAX_DISPLACEMENT_PITCHES * floor.pitch_m:
+            continue
+        variance = trajectory.sigma[nearest, [0, 1, 5]] ** 2 + np.diag(best.covariance)
+        if max(distance**2 / variance[:2].max(), rotation**2 / variance[2]) < (
+            MIN_DISPLACEMENT_SIGMAS**2
+        ):
             continue
         displaced[cell] = DisplacedLandmark(cell, distance, rotation)
     return list(displaced.values())
@@ -272,13 +279,18 @@ def _describe_size(cause: Cause) -> str:
     return f"{1e3 * cause.distance_m:.2g} mm and {math.degrees(abs(cause.rotation_rad)):.2g} deg"
 
 
-def warn_of_lag(lag_s: float) -> SolverWarning:
-    """Return the warning of odometry that is later or earlier than the fields."""
+def warn_of_lag(lag_s: float, remaining_s: float = 0.0) -> SolverWarning:
+    """Return the warning of odometry that is later or earlier than the fields.
+
+    ``remaining_s`` is the lag that is left after the correction.
+    """
     direction = "later" if lag_s > 0 else "earlier"
     message = (
-        f"the odometry is {1e3 * abs(lag_s):.2g} ms {direction} than the fields; its times were "
+        f"the odometry is {1e3 * abs(lag_s):.0f} ms {direction} than the fields; its times were "
         "corrected by that"
     )
+    if remaining_s:
+        message += f", and about {1e3 * remaining_s:.0f} ms are left: give the lag, if it is known"
     return SolverWarning("odometry_lag", message)
 
 
@@ -311,14 +323,15 @@ def is_map_contradicted(
 
 
 def warn_of_missing_pose(
-    recording: HallRecording, visits: Sequence[IdentifiedVisit], probability: float
+    recording: HallRecording, visits: Sequence[IdentifiedVisit]
 ) -> SolverWarning:
-    """Return the warning that explains why a robot is not localized.
-
-    ``probability`` is that of the most certain cell.
-    """
+    """Return the warning that explains why a robot is not localized."""
     device = recording.samples.device
     if any(not visit.hypotheses.refused for visit in visits):
+        probability = max(
+            (visit.estimate.probability for visit in visits if visit.estimate is not None),
+            default=0.0,
+        )
         message = f"not localised; the most likely cell has a probability of {probability:.2g}"
         return SolverWarning("not_localised", message).about(device)
     if visits:
@@ -326,8 +339,11 @@ def warn_of_missing_pose(
             f"{len(visits)} visits, but no landmark explains any of them; check the geometry of "
             "the landmarks, the sensors and the odometry"
         )
+        if all(visit.hypotheses.refused != "not_explained" for visit in visits):
+            message = f"{len(visits)} visits, all of them too short or too weak"
         return SolverWarning("visits_unexplained", message).about(device)
-    strongest_mt = 1e3 * float(np.nanmax(np.abs(recording.samples.field_t)))
+    magnitude_t = np.abs(recording.samples.field_t)
+    strongest_mt = 1e3 * float(np.max(magnitude_t, initial=0.0, where=np.isfinite(magnitude_t)))
     message = f"no landmark was detected; the strongest field is {strongest_mt:.2g} mT"
     return SolverWarning("no_landmark", message).about(device)
 

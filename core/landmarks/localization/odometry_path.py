@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
-from locatk.core.landmarks.preprocessing import planar_poses
+from locatk.core.landmarks.preprocessing import planar_poses, valid_poses
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -55,11 +56,26 @@ class OdometryPath:
 
 
 def without_lag(odometry: Trajectory, lag_s: float) -> Trajectory:
-    """Return the odometry as it would be without a lag, at the times for which it is known."""
-    path = OdometryPath.of(odometry)
-    time_ns = path.time_ns + round(1e9 * lag_s)
-    is_known = (time_ns >= path.time_ns[0]) & (time_ns <= path.time_ns[-1])
+    """Return the odometry as it would be without a lag, at the times for which it is known.
+
+    Poses that are not finite stay so.
+
+    Raises
+    ------
+    InputError
+        The odometry is not longer than the lag.
+    """
+    is_valid = valid_poses(odometry)
+    path = OdometryPath.of(odometry.select(is_valid))
+    time_ns = odometry.time_ns + round(1e9 * lag_s)
+    is_known = (time_ns >= odometry.time_ns[0]) & (time_ns <= odometry.time_ns[-1])
+    if is_known.sum() < 2 or len(path.time_ns) < 2:
+        raise InputError(
+            f"the odometry of {odometry.device} is shorter than its lag of {1e3 * lag_s:.0f} ms",
+            hint="The lag is in milliseconds; leave it out to have it estimated",
+        )
     pose = path.pose_at(time_ns[is_known])
+    pose[~is_valid[is_known]] = np.nan
     position = np.column_stack([pose[:, :2], np.zeros(len(pose))])
     quaternion = quaternion_from_heading(pose[:, 2])
     known = odometry.select(is_known)

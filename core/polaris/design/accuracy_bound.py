@@ -29,8 +29,6 @@ NuisanceModel = Literal["magnets", "strength", "speed", "steps"]
 constant speed. "steps": those of "strength", and the length of every step, with the nominal length
 and :data:`STEP_SIGMA_M` as a prior."""
 
-NUISANCE_MODELS: tuple[NuisanceModel, ...] = ("magnets", "strength", "speed", "steps")
-
 STEP_SIGMA_M = 1e-3
 """Standard deviation of a step from one sample to the next: 1.05 to 1.15 mm were measured on the
 recordings published with the Polaris paper."""

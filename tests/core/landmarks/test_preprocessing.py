@@ -344,6 +344,20 @@ def test_invalid_poses_are_left_out_and_reported(value: float) -> None:
         preprocess(run.samples[0], replace(odometry, position=np.full_like(position, value)))
 
 
+@pytest.mark.parametrize("later_ns", [0, -1_000_000])
+def test_poses_whose_times_do_not_increase_are_left_out(later_ns: int) -> None:
+    run = session()
+    odometry = run.odometry[0]
+    time_ns = odometry.time_ns.copy()
+    time_ns[20] = time_ns[19] + later_ns
+    recording = preprocess(run.samples[0], replace(odometry, time_ns=time_ns))
+    assert [each.code for each in recording.warnings] == ["odometry_invalid"]
+    assert recording.odometry is not None
+    assert len(recording.odometry) == len(odometry) - 1
+    whole = preprocess(run.samples[0], odometry)
+    np.testing.assert_allclose(recording.pose, whole.pose, atol=2e-4)
+
+
 def test_samples_at_a_long_gap_of_invalid_poses_are_left_out() -> None:
     run = session()
     odometry = run.odometry[0]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.detection.trace import compose, relative
 from locatk.core.landmarks.localization.odometry_path import OdometryPath, without_lag
@@ -148,6 +149,21 @@ def test_odometry_without_lag() -> None:
     result = without_lag(late, 0.04)
     np.testing.assert_allclose(result.position[:, 0], np.sin(result.time_ns * 1e-9), atol=1e-9)
     assert len(result) == 98
+
+
+def test_odometry_with_an_invalid_pose_without_lag() -> None:
+    time_ns = np.arange(100) * 20_000_000
+    position = np.column_stack([time_ns * 1e-9, np.zeros((100, 2))])
+    position[40, 0] = np.nan
+    path = Trajectory.from_positions("robot", "odometry", time_ns, position)
+    result = without_lag(path, 0.02)
+    is_invalid = np.isnan(result.position[:, 0])
+    assert np.flatnonzero(is_invalid).tolist() == [40]
+    np.testing.assert_allclose(
+        result.position[~is_invalid, 0], 1e-9 * result.time_ns[~is_invalid] + 0.02, atol=1e-9
+    )
+    with pytest.raises(InputError, match="shorter than its lag of 5000 ms"):
+        without_lag(path, 5.0)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -368,6 +369,20 @@ def test_residuals_of_the_fields_limit_the_poses(
     assert bool(robot.trajectories) == poses
     assert robot.facts.localised == poses
     assert robot.facts.misfit_sigma == residual_sigma
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"odometry_noise": math.nan},
+        {"odometry_noise": 0.0},
+        {"odometry_lag_s": math.inf},
+        {"odometry_lag_s": 0.1, "method": "paper"},
+    ],
+)
+def test_invalid_options_of_the_odometry_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="odometry"):
+        SolveOptions(**options)
 
 
 @pytest.mark.slow
