@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import get_args
 from dataclasses import replace
 from itertools import pairwise
+from typing import get_args
 
 import magpylib
 import numpy as np
