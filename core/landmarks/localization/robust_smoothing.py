@@ -9,9 +9,9 @@ covariance follows in closed form: with I if the prior holds, with a far wider o
 slipped or a landmark is displaced. If the second is more probable, the prior is widened, and
 everything is estimated again. The same comparison takes a wide prior back.
 
-The variance of the random walk is estimated from the same numbers, as a variance component
-(Foerstner, Zeitschrift fuer Vermessungswesen 104 (1979) 446): the sum of squares of its unknowns
-over their redundancy.
+The variances of the random walk and of the poses of landmarks are estimated from the same numbers,
+as variance components (Foerstner, Zeitschrift fuer Vermessungswesen 104 (1979) 446): the sum of
+squares of their unknowns over their redundancy.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from locatk.core.landmarks.localization.cell_steps import (
     SLIP_SCALE_RAD,
 )
 from locatk.core.landmarks.localization.smoothing import (
+    LANDMARK_SIGMA,
     POSE_SIZE,
     Indices,
     LandmarkPrior,
@@ -78,15 +79,22 @@ MAX_LINEAR_M, MAX_LINEAR_RAD = 0.03, math.radians(10)
 """Differences between odometry and landmarks beyond which the linearization fails; a slip is then
 assumed from the start."""
 
-WALK_PRIOR_FREEDOM = 4.0
-"""Degrees of freedom of the prior of the variance of the random walk: its root is known to a factor
-of about two."""
+VARIANCE_PRIOR_FREEDOM = 4.0
+"""Degrees of freedom of the prior of each variance: its root is known to a factor of about two."""
+
+WALK_COMPONENTS, LANDMARK_COMPONENTS = slice(0, 2), slice(2, 4)
+"""Variance components: of heading and position of the random walk, and of the poses of
+landmarks."""
+
+COMPONENT_COUNT = 4
+FIXED = COMPONENT_COUNT
+"""Component of landmarks as built, whose standard deviations are known from their calibration."""
 
 MAX_LINEARIZATIONS, MAX_PRIOR_ROUNDS = 4, 12
 """Largest numbers of minimizations, and of changes of priors after each."""
 
-MIN_WALK_CHANGE = 0.05
-"""Relative change of the standard deviation of the walk below which it has converged."""
+MIN_SIGMA_CHANGE = 0.05
+"""Relative change of a standard deviation below which it has converged."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +186,8 @@ class _Candidate:
     Attributes
     ----------
     columns : (k,) ndarray
+    component : (k,) ndarray
+        Variance component of each.
     sigma : (k,) ndarray
         Standard deviations of the prior if it holds.
     scales : (s, k) ndarray
@@ -197,6 +207,7 @@ class _Candidate:
     """
 
     columns: Indices
+    component: Indices
     sigma: Array
     scales: Array
     log_odds: float
@@ -221,9 +232,11 @@ class _Candidate:
 
     def log_posterior_odds(self) -> float:
         """Return the log odds that the prior does not hold."""
-        scales = np.maximum(self.scales, self.sigma)
+        # A landmark is not displaced if it is within the tolerance of any floor.
+        sigma = self.sigma if self.cell is None else np.maximum(self.sigma, 1.0)
+        scales = np.maximum(self.scales, sigma)
         wide = np.logaddexp.reduce([self._log_evidence(scale) for scale in scales])
-        return float(self.log_odds + wide - math.log(len(scales)) - self._log_evidence(self.sigma))
+        return float(self.log_odds + wide - math.log(len(scales)) - self._log_evidence(sigma))
 
     def _log_evidence(self, scale: Array) -> float:
         """Return the log evidence of all other measurements with a prior, up to a constant."""
@@ -246,8 +259,8 @@ class _Snooping:
 
     def __init__(self, system: SmoothingSystem, drift: OdometryDrift) -> None:
         self.system, self.drift = system, drift
-        # Standard deviations of the random walk of heading and position, in those of the drift.
-        self.walk_sigma = np.ones(2)
+        # Standard deviations by variance component, in those of the priors.
+        self.sigma = np.ones(COMPONENT_COUNT + 1)
         self.state = system.initial_state()
         self.candidates = [*self._walk_candidates(), *self._landmark_candidates()]
 
@@ -263,12 +276,12 @@ class _Snooping:
         """Change the priors of the linearized measurements until they agree; return if any did."""
         has_changed = False
         for _ in range(MAX_PRIOR_ROUNDS):
-            is_final = not (estimate_walk and self._raise_walk())
-            if is_final:
-                is_final = not self._update_released()
-                if estimate_walk and self._update_walk():
-                    is_final = False
-            if is_final:
+            if not (
+                (estimate_walk and self._raise_sigma(WALK_COMPONENTS))
+                or self._raise_sigma(LANDMARK_COMPONENTS)
+                or self._update_released()
+                or self._update_sigma(estimate_walk)
+            ):
                 break
             has_changed = True
             self._use(self.system.solve(self.solution.equations))
@@ -305,8 +318,12 @@ class _Snooping:
             scale = np.maximum(DISPLACED_LANDMARK_SIGMA / prior.sigma, 1.0)
             columns = self.system.landmark_columns[cell][:POSE_SIZE]
             odds = math.log(DISPLACEMENT_PROBABILITY / (1 - DISPLACEMENT_PROBABILITY))
+            is_designed = np.array_equal(prior.sigma, LANDMARK_SIGMA)
+            component = np.array([3, 3, 2]) if is_designed else np.full(POSE_SIZE, FIXED)
             sigma = np.ones(POSE_SIZE)
-            candidates.append(_Candidate(columns, sigma, scale[None], odds, scale**-2, cell=cell))
+            candidates.append(
+                _Candidate(columns, component, sigma, scale[None], odds, scale**-2, cell=cell)
+            )
         return candidates
 
     # ---- releases
@@ -379,56 +396,69 @@ class _Snooping:
             one.alternatives = []
         self.system.prior_weight[one.columns] = one.prior_weight()
 
-    # ---- random walk
+    # ---- variances
 
-    def _raise_walk(self) -> bool:
-        """Raise the random walk until half of its units agree with it; return if it changed."""
-        tests = [one.chi_square() for one in self.candidates if one.cell is None]
-        ratios = [value / chi2.ppf(0.5, count) for value, count in tests if count]
-        ratios += [1.0] * round(WALK_PRIOR_FREEDOM / POSE_SIZE)
-        factor = math.sqrt(float(np.median(ratios)))
-        if factor < 1 + MIN_WALK_CHANGE:
+    def _raise_sigma(self, components: slice) -> bool:
+        """Raise the standard deviations of the random walk, or of the landmarks.
+
+        They are raised until half of the unknowns agree with them.
+
+        Returns
+        -------
+        bool
+            If they changed.
+        """
+        numbers = np.arange(COMPONENT_COUNT)[components]
+        tests = [one.chi_square() for one in self.candidates if one.component[0] in numbers]
+        statistic, freedom = np.array([test for test in tests if test[1]]).reshape(-1, 2).T
+        prior = np.ones(round(VARIANCE_PRIOR_FREEDOM / POSE_SIZE))
+        ratio = np.concatenate([statistic / chi2.ppf(0.5, freedom), prior])
+        factor = math.sqrt(float(np.median(ratio)))
+        if factor < 1 + MIN_SIGMA_CHANGE:
             return False
-        self._set_walk(self.walk_sigma * factor)
+        sigma = self.sigma.copy()
+        sigma[numbers] *= factor
+        self._set_sigma(sigma)
         return True
 
-    def _update_walk(self) -> bool:
-        """Estimate the variances of the random walk; return if they changed."""
-        squares, redundancy = np.zeros(2), np.zeros(2)
+    def _update_sigma(self, estimate_walk: bool) -> bool:
+        """Estimate the standard deviations by variance component; return if they changed."""
+        squares, redundancy = np.zeros((2, len(self.sigma)))
         for one in self.candidates:
-            if one.cell is not None or one.is_released:
+            if one.is_released:
                 continue
-            is_heading = np.arange(len(one.columns)) < len(one.columns) // 3
             weight = one.prior_weight()
             posterior = np.linalg.inv(one.information + np.diag(weight))
             mean = posterior @ one.mean_information
-            for kind, mask in enumerate((is_heading, ~is_heading)):
-                squares[kind] += float(np.sum(mean[mask] ** 2))
-                redundancy[kind] += float(np.sum(1 - weight[mask] * np.diag(posterior)[mask]))
-        before = self.walk_sigma
-        self._set_walk(np.sqrt((WALK_PRIOR_FREEDOM + squares) / (WALK_PRIOR_FREEDOM + redundancy)))
-        return bool(np.abs(np.log(self.walk_sigma / before)).max() > MIN_WALK_CHANGE)
+            np.add.at(squares, one.component, mean**2)
+            np.add.at(redundancy, one.component, 1 - weight * np.diag(posterior))
+        freedom = VARIANCE_PRIOR_FREEDOM
+        sigma = np.sqrt((freedom + squares) / (freedom + redundancy))
+        sigma[FIXED] = 1.0
+        if not estimate_walk:
+            sigma[WALK_COMPONENTS] = 1.0
+        change = float(np.abs(np.log(sigma / self.sigma)).max())
+        self._set_sigma(sigma)
+        return change > MIN_SIGMA_CHANGE
 
-    def _set_walk(self, sigma: Array) -> None:
-        """Change the standard deviations (2,) of the random walk."""
-        self.walk_sigma = sigma
+    def _set_sigma(self, sigma: Array) -> None:
+        self.sigma = sigma
         for one in self.candidates:
-            if one.cell is None:
-                one.sigma = np.repeat(sigma, [len(one.columns) // 3, len(one.columns) // 3 * 2])
-                self.system.prior_weight[one.columns] = one.prior_weight()
+            one.sigma = sigma[one.component]
+            self.system.prior_weight[one.columns] = one.prior_weight()
 
     # ---- result
 
     def result(self) -> RobustSmoothing:
         """Return the estimates."""
         result = self.system.result(self.solution)
-        heading, position = self.walk_sigma.tolist()
+        heading, position = self.sigma[WALK_COMPONENTS].tolist()
         drift = replace(
             self.drift,
             walk_rad=heading * self.drift.walk_rad,
             walk_m=position * self.drift.walk_m,
         )
-        visits = [_with_walk_unit(pose, self.walk_sigma) for pose in result.visits[0]]
+        visits = [_with_walk_unit(pose, self.sigma[WALK_COMPONENTS]) for pose in result.visits[0]]
         causes, reported = [], set()
         for one in self.candidates:
             if one.is_released and one.alternatives:
@@ -477,7 +507,8 @@ def _slip_candidate(columns: Indices, span: Array, units: int, visit: int, unit:
         scales = np.array(SLIP_SCALES)[:, None] * (slip / span)
     odds = math.log(SLIP_PROBABILITY / (1 - SLIP_PROBABILITY))
     free = np.full(len(columns), FREE_WEIGHT)
-    return _Candidate(columns, np.ones(len(columns)), scales, odds, free, visit, unit)
+    component, sigma = np.repeat([0, 1, 1], units), np.ones(len(columns))
+    return _Candidate(columns, component, sigma, scales, odds, free, visit, unit)
 
 
 def _with_walk_unit(estimate: VisitPose, sigma: Array) -> VisitPose:
