@@ -172,7 +172,11 @@ def relative(pose: Array, origin: Array) -> Array:
 
 
 def odometry_corrections(
-    pose: Array, reference: int, drift: OdometryDrift, velocity: Array | None = None
+    pose: Array,
+    reference: int,
+    drift: OdometryDrift,
+    velocity: Array | None = None,
+    corrected: Array | None = None,
 ) -> Array:
     """Linearize the errors of odometry.
 
@@ -185,6 +189,8 @@ def odometry_corrections(
     drift : OdometryDrift
     velocity : (n, 3) ndarray, optional
         Derivative of the path by time. Without it, a lag is not considered.
+    corrected : (n, 3) ndarray, optional
+        Path about which the errors are linearized, if it is not ``pose``.
 
     Returns
     -------
@@ -210,8 +216,11 @@ def odometry_corrections(
             drift.walk_rad * ramps,
         ]
     )
+    if corrected is not None:
+        step = np.diff(corrected, axis=0, prepend=corrected[:1])
     by_heading = np.moveaxis(_effect_of_heading_errors(heading, step, reference), 2, 1)
-    stretch = np.column_stack([pose[:, :2] - pose[reference, :2], np.zeros(len(pose))])
+    stretch = np.cumsum(step, axis=0) * [1.0, 1.0, 0.0]
+    stretch -= stretch[reference]
     shift = drift.walk_m * ramps
     lag = np.zeros_like(pose) if velocity is None else _effect_of_lag(pose, velocity, reference)
     constant_by_heading, walk_of_heading = np.split(by_heading, [2], axis=2)

@@ -9,9 +9,9 @@ covariance follows in closed form: with I if the prior holds, with a far wider o
 slipped or a landmark is displaced. If the second is more probable, the prior is widened, and
 everything is estimated again. The same comparison takes a wide prior back.
 
-The variance of the random walk is estimated from the same numbers, as a variance component
-(Foerstner, Zeitschrift fuer Vermessungswesen 104 (1979) 446): the sum of squares of its unknowns
-over their redundancy.
+The variances of the random walk and of the poses of landmarks are estimated from the same numbers,
+as variance components (Foerstner, Zeitschrift fuer Vermessungswesen 104 (1979) 446): the sum of
+squares of their unknowns over their redundancy.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.trace import (
     CONSTANT_ERROR_COUNT,
     OdometryDrift,
-    compose,
     relative,
     walk_units,
 )
@@ -39,13 +38,16 @@ from locatk.core.landmarks.localization.cell_steps import (
     SLIP_SCALE_RAD,
 )
 from locatk.core.landmarks.localization.smoothing import (
+    LANDMARK_SIGMA,
     POSE_SIZE,
     Indices,
     LandmarkPrior,
     RobotMeasurements,
     SmoothingResult,
     SmoothingSystem,
-    Solve,
+    SystemSolution,
+    VisitPose,
+    bin_pose_with_gradient,
 )
 from locatk.core.landmarks.map.floor import Cell
 
@@ -77,15 +79,22 @@ MAX_LINEAR_M, MAX_LINEAR_RAD = 0.03, math.radians(10)
 """Differences between odometry and landmarks beyond which the linearization fails; a slip is then
 assumed from the start."""
 
-WALK_PRIOR_FREEDOM = 4.0
-"""Degrees of freedom of the prior of the variance of the random walk: its root is known to a factor
-of about two."""
+VARIANCE_PRIOR_FREEDOM = 4.0
+"""Degrees of freedom of the prior of each variance: its root is known to a factor of about two."""
 
-MAX_WALK_ROUNDS, MAX_RELEASE_ROUNDS = 5, 12
-"""Largest numbers of estimates of the walk, and of changes of priors between them."""
+WALK_COMPONENTS, LANDMARK_COMPONENTS = slice(0, 2), slice(2, 4)
+"""Variance components: of heading and position of the random walk, and of the poses of
+landmarks."""
 
-MIN_WALK_CHANGE = 0.05
-"""Relative change of the standard deviation of the walk below which it has converged."""
+COMPONENT_COUNT = 4
+FIXED = COMPONENT_COUNT
+"""Component of landmarks as built, whose standard deviations are known from their calibration."""
+
+MAX_LINEARIZATIONS, MAX_PRIOR_ROUNDS = 4, 12
+"""Largest numbers of minimizations, and of changes of priors after each."""
+
+MIN_SIGMA_CHANGE = 0.05
+"""Relative change of a standard deviation below which it has converged."""
 
 
 @dataclass(frozen=True)
@@ -162,18 +171,11 @@ def smooth_robustly(
     """
     snooping = _Snooping(SmoothingSystem([robot], landmarks, geometry, priors), priors.drift)
     snooping.release_nonlinear_links()
-    for _ in range(MAX_WALK_ROUNDS if estimate_walk else 0):
-        snooping.minimize()
-        if not snooping.raise_walk():
-            break
-    for _ in range(MAX_RELEASE_ROUNDS):
-        snooping.minimize()
-        has_changed = snooping.update_released()
-        if estimate_walk and snooping.update_walk():
-            has_changed = True
-        if not has_changed:
-            break
     snooping.minimize()
+    for _ in range(MAX_LINEARIZATIONS):
+        if not snooping.update_priors(estimate_walk):
+            break
+        snooping.minimize()
     return snooping.result()
 
 
@@ -184,8 +186,12 @@ class _Candidate:
     Attributes
     ----------
     columns : (k,) ndarray
+    component : (k,) ndarray
+        Variance component of each.
+    sigma : (k,) ndarray
+        Standard deviations of the prior if it holds.
     scales : (s, k) ndarray
-        Standard deviations if it does not, in those of the prior: alternatives.
+        Standard deviations if it does not: alternatives.
     log_odds : float
         That it does not, before any measurement.
     free_weight : (k,) ndarray
@@ -201,6 +207,8 @@ class _Candidate:
     """
 
     columns: Indices
+    component: Indices
+    sigma: Array
     scales: Array
     log_odds: float
     free_weight: Array
@@ -212,21 +220,23 @@ class _Candidate:
     information: Array = field(default_factory=lambda: np.empty(0))
     mean_information: Array = field(default_factory=lambda: np.empty(0))
 
-    def update(self, covariance: Array, mean: Array, weight: Array) -> None:
+    def prior_weight(self) -> Array:
+        """Return the present weights of the prior."""
+        return self.free_weight if self.is_released else self.sigma**-2
+
+    def update(self, solution: SystemSolution) -> None:
         """Compute the information of all other measurements from the posterior."""
-        inverse = np.asarray(np.linalg.inv(covariance), float)
-        self.information = inverse - np.diag(weight)
-        self.mean_information = inverse @ mean
+        inverse = np.asarray(np.linalg.inv(solution.covariance(self.columns)), float)
+        self.information = inverse - np.diag(self.prior_weight())
+        self.mean_information = inverse @ solution.state[self.columns]
 
     def log_posterior_odds(self) -> float:
         """Return the log odds that the prior does not hold."""
-        wide = np.logaddexp.reduce([self._log_evidence(scale) for scale in self.scales])
-        return float(
-            self.log_odds
-            + wide
-            - math.log(len(self.scales))
-            - self._log_evidence(np.ones(len(self.columns)))
-        )
+        # A landmark is not displaced if it is within the tolerance of any floor.
+        sigma = self.sigma if self.cell is None else np.maximum(self.sigma, 1.0)
+        scales = np.maximum(self.scales, sigma)
+        wide = np.logaddexp.reduce([self._log_evidence(scale) for scale in scales])
+        return float(self.log_odds + wide - math.log(len(scales)) - self._log_evidence(sigma))
 
     def _log_evidence(self, scale: Array) -> float:
         """Return the log evidence of all other measurements with a prior, up to a constant."""
@@ -237,10 +247,10 @@ class _Candidate:
 
     def chi_square(self) -> tuple[float, int]:
         """Return the statistic of the test that the prior holds, and its degrees of freedom."""
-        value, vector = np.linalg.eigh(self.information)
+        value, vector = np.linalg.eigh(self.sigma[:, None] * self.information * self.sigma)
         is_tested = value > MIN_REDUNDANCY / (1 - MIN_REDUNDANCY)
         value = value[is_tested]
-        along = vector.T[is_tested] @ self.mean_information
+        along = vector.T[is_tested] @ (self.sigma * self.mean_information)
         return float(np.sum(along**2 / (value * (1 + value)))), int(is_tested.sum())
 
 
@@ -248,10 +258,10 @@ class _Snooping:
     """State of the smoothing of one robot, and the candidates whose priors are tested."""
 
     def __init__(self, system: SmoothingSystem, drift: OdometryDrift) -> None:
-        self.system, self.prior_drift, self.drift = system, drift, drift
+        self.system, self.drift = system, drift
+        # Standard deviations by variance component, in those of the priors.
+        self.sigma = np.ones(COMPONENT_COUNT + 1)
         self.state = system.initial_state()
-        self.solve: Solve = lambda right: right
-        self.residual_sigma = 1.0
         self.candidates = [*self._walk_candidates(), *self._landmark_candidates()]
 
     @property
@@ -260,14 +270,27 @@ class _Snooping:
 
     def minimize(self) -> None:
         """Minimize with the present priors, and update all candidates."""
-        system = self.system
-        self.state, self.solve, self.residual_sigma = system.minimize(self.state)
+        self._use(self.system.minimize(self.state))
+
+    def update_priors(self, estimate_walk: bool) -> bool:
+        """Change the priors of the linearized measurements until they agree; return if any did."""
+        has_changed = False
+        for _ in range(MAX_PRIOR_ROUNDS):
+            if not (
+                (estimate_walk and self._raise_sigma(WALK_COMPONENTS))
+                or self._raise_sigma(LANDMARK_COMPONENTS)
+                or self._update_released()
+                or self._update_sigma(estimate_walk)
+            ):
+                break
+            has_changed = True
+            self._use(self.system.solve(self.solution.equations))
+        return has_changed
+
+    def _use(self, solution: SystemSolution) -> None:
+        self.solution, self.state = solution, solution.state
         for one in self.candidates:
-            one.update(
-                system.covariance(one.columns, self.solve),
-                self.state[one.columns],
-                system.prior_weight[one.columns],
-            )
+            one.update(solution)
 
     # ---- candidates
 
@@ -295,28 +318,37 @@ class _Snooping:
             scale = np.maximum(DISPLACED_LANDMARK_SIGMA / prior.sigma, 1.0)
             columns = self.system.landmark_columns[cell][:POSE_SIZE]
             odds = math.log(DISPLACEMENT_PROBABILITY / (1 - DISPLACEMENT_PROBABILITY))
-            candidates.append(_Candidate(columns, scale[None], odds, scale**-2, cell=cell))
+            is_designed = np.array_equal(prior.sigma, LANDMARK_SIGMA)
+            component = np.array([3, 3, 2]) if is_designed else np.full(POSE_SIZE, FIXED)
+            sigma = np.ones(POSE_SIZE)
+            candidates.append(
+                _Candidate(columns, component, sigma, scale[None], odds, scale**-2, cell=cell)
+            )
         return candidates
 
     # ---- releases
 
     def release_nonlinear_links(self) -> None:
         """Release the links that contradict the landmarks by more than the linearization takes."""
-        visits = self.robot.visits
+        visits, unknowns = self.robot.visits, self.system.visit_columns[0]
         for one in self.candidates:
             link = self.robot.links[one.visit] if one.cell is None and one.unit < 0 else None
             if link is None:
                 continue
-            first, second = visits[one.visit : one.visit + 2]
-            start = compose(first.pose, first.trace.pose[-1])
-            end = compose(second.pose, second.trace.pose[0])
-            difference = relative(end[None], start)[0] - link.pose[-1]
+            start, end = (
+                bin_pose_with_gradient(
+                    visits[k].trace, index, self.state[unknowns[k]], self.robot.errors
+                )[0]
+                for k, index in ((one.visit, -1), (one.visit + 1, 0))
+            )
+            path = link.without_constant_errors(self.robot.errors)
+            difference = relative(end[None], start)[0] - path[-1]
             distance = float(np.hypot(*difference[:2]))
             rotation = abs(math.remainder(difference[2], math.tau))
             if distance > MAX_LINEAR_M or rotation > MAX_LINEAR_RAD:
                 self._set_released(one, True)
 
-    def update_released(self) -> bool:
+    def _update_released(self) -> bool:
         """Release the priors that do not hold, and take others back; return if any changed.
 
         Of neighbouring candidates the best is released, because it may explain the others.
@@ -356,70 +388,80 @@ class _Snooping:
         """Return if two candidates explain the same inconsistency: they are correlated."""
         one, other = self.candidates[first], self.candidates[second]
         columns = np.concatenate([one.columns, other.columns])
-        covariance = self.system.covariance(columns, self.solve)
+        covariance = self.solution.covariance(columns)
         size = len(one.columns)
-        cross = covariance[:size, size:]
+        cross = covariance[:size, size:] / np.outer(one.sigma, other.sigma)
         return bool(np.abs(cross).max() > MIN_REDUNDANCY)
 
     def _set_released(self, one: _Candidate, is_released: bool) -> None:
         one.is_released = is_released
         if not is_released:
             one.alternatives = []
-        self.system.prior_weight[one.columns] = one.free_weight if is_released else 1.0
+        self.system.prior_weight[one.columns] = one.prior_weight()
 
-    # ---- random walk
+    # ---- variances
 
-    def raise_walk(self) -> bool:
-        """Raise the random walk until half of its units agree with it; return if it changed."""
-        tests = [one.chi_square() for one in self.candidates if one.cell is None]
-        ratios = [value / chi2.ppf(0.5, count) for value, count in tests if count]
-        ratios += [1.0] * round(WALK_PRIOR_FREEDOM / POSE_SIZE)
-        factor = math.sqrt(float(np.median(ratios)))
-        if factor < 1 + MIN_WALK_CHANGE:
+    def _raise_sigma(self, components: slice) -> bool:
+        """Raise the standard deviations of the random walk, or of the landmarks.
+
+        They are raised until half of the unknowns agree with them.
+
+        Returns
+        -------
+        bool
+            If they changed.
+        """
+        numbers = np.arange(COMPONENT_COUNT)[components]
+        tests = [one.chi_square() for one in self.candidates if one.component[0] in numbers]
+        statistic, freedom = np.array([test for test in tests if test[1]]).reshape(-1, 2).T
+        prior = np.ones(round(VARIANCE_PRIOR_FREEDOM / POSE_SIZE))
+        ratio = np.concatenate([statistic / chi2.ppf(0.5, freedom), prior])
+        factor = math.sqrt(float(np.median(ratio)))
+        if factor < 1 + MIN_SIGMA_CHANGE:
             return False
-        self._scale_walk(factor, factor)
+        sigma = self.sigma.copy()
+        sigma[numbers] *= factor
+        self._set_sigma(sigma)
         return True
 
-    def update_walk(self) -> bool:
-        """Estimate the variances of the random walk; return if they changed."""
-        squares, redundancy = np.zeros(2), np.zeros(2)
+    def _update_sigma(self, estimate_walk: bool) -> bool:
+        """Estimate the standard deviations by variance component; return if they changed."""
+        squares, redundancy = np.zeros((2, len(self.sigma)))
         for one in self.candidates:
-            if one.cell is not None or one.is_released:
+            if one.is_released:
                 continue
-            is_heading = np.arange(len(one.columns)) < len(one.columns) // 3
-            posterior = np.linalg.inv(one.information + np.eye(len(one.columns)))
+            weight = one.prior_weight()
+            posterior = np.linalg.inv(one.information + np.diag(weight))
             mean = posterior @ one.mean_information
-            for kind, mask in enumerate((is_heading, ~is_heading)):
-                squares[kind] += float(np.sum(mean[mask] ** 2))
-                redundancy[kind] += float(np.sum(1 - np.diag(posterior)[mask]))
-        now, before = self.drift, self.prior_drift
-        scale = np.array([now.walk_rad / before.walk_rad, now.walk_m / before.walk_m])
-        factor = np.sqrt(
-            (WALK_PRIOR_FREEDOM / scale**2 + squares) / (WALK_PRIOR_FREEDOM + redundancy)
-        )
-        self._scale_walk(*factor.tolist())
-        return bool(np.abs(np.log(factor)).max() > MIN_WALK_CHANGE)
+            np.add.at(squares, one.component, mean**2)
+            np.add.at(redundancy, one.component, 1 - weight * np.diag(posterior))
+        freedom = VARIANCE_PRIOR_FREEDOM
+        sigma = np.sqrt((freedom + squares) / (freedom + redundancy))
+        sigma[FIXED] = 1.0
+        if not estimate_walk:
+            sigma[WALK_COMPONENTS] = 1.0
+        change = float(np.abs(np.log(sigma / self.sigma)).max())
+        self._set_sigma(sigma)
+        return change > MIN_SIGMA_CHANGE
 
-    def _scale_walk(self, heading: float, position: float) -> None:
-        """Change the unit of the random walk; the path stays the same."""
-        self.drift = replace(
-            self.drift,
-            walk_rad=heading * self.drift.walk_rad,
-            walk_m=position * self.drift.walk_m,
-        )
+    def _set_sigma(self, sigma: Array) -> None:
+        self.sigma = sigma
         for one in self.candidates:
-            if one.cell is None:
-                factor = np.full(len(one.columns), position)
-                factor[: len(factor) // 3] = heading
-                self.state[one.columns] /= factor
-                one.scales = np.maximum(one.scales / factor, 1.0)
-        self.system.robots = [self.robot.with_drift(self.drift)]
+            one.sigma = sigma[one.component]
+            self.system.prior_weight[one.columns] = one.prior_weight()
 
     # ---- result
 
     def result(self) -> RobustSmoothing:
         """Return the estimates."""
-        result = self.system.result(self.state, self.solve, self.residual_sigma)
+        result = self.system.result(self.solution)
+        heading, position = self.sigma[WALK_COMPONENTS].tolist()
+        drift = replace(
+            self.drift,
+            walk_rad=heading * self.drift.walk_rad,
+            walk_m=position * self.drift.walk_m,
+        )
+        visits = [_with_walk_unit(pose, self.sigma[WALK_COMPONENTS]) for pose in result.visits[0]]
         causes, reported = [], set()
         for one in self.candidates:
             if one.is_released and one.alternatives:
@@ -430,12 +472,12 @@ class _Snooping:
                 causes.append((self._cause(one),))
         slips = [one for one in self.candidates if one.is_released and one.cell is None]
         return RobustSmoothing(
-            self.robot,
-            result,
+            self.robot.with_drift(drift),
+            replace(result, visits=[visits]),
             causes,
             slipped_links=frozenset(one.visit for one in slips if one.unit < 0),
             slipped_visits=frozenset(one.visit for one in slips if one.unit >= 0),
-            drift=self.drift,
+            drift=drift,
         )
 
     def _cause(self, one: _Candidate) -> Cause:
@@ -468,4 +510,14 @@ def _slip_candidate(columns: Indices, span: Array, units: int, visit: int, unit:
         scales = np.array(SLIP_SCALES)[:, None] * (slip / span)
     odds = math.log(SLIP_PROBABILITY / (1 - SLIP_PROBABILITY))
     free = np.full(len(columns), FREE_WEIGHT)
-    return _Candidate(columns, np.maximum(scales, 1.0), odds, free, visit, unit)
+    component, sigma = np.repeat([0, 1, 1], units), np.ones(len(columns))
+    return _Candidate(columns, component, sigma, scales, odds, free, visit, unit)
+
+
+def _with_walk_unit(estimate: VisitPose, sigma: Array) -> VisitPose:
+    """Return an estimate with the standard deviations (2,) of the walk as units of its errors."""
+    count = (len(estimate.corrections) - CONSTANT_ERROR_COUNT) // 3
+    walk = np.repeat(sigma, [count, 2 * count])
+    unit = np.concatenate([np.ones(POSE_SIZE + CONSTANT_ERROR_COUNT), walk])
+    covariance = estimate.covariance / np.outer(unit, unit)
+    return VisitPose(estimate.pose, estimate.corrections / unit[POSE_SIZE:], covariance)

@@ -27,16 +27,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
-from locatk.core.landmarks.detection.fit import ModelPriors, VisitFitProblem
+from locatk.core.landmarks.detection.fit import ModelPriors, ParameterLayout, VisitFitProblem
 from locatk.core.landmarks.detection.hypotheses import FAULTY_STRENGTH_SIGMA
 from locatk.core.landmarks.detection.trace import (
     CONSTANT_ERROR_COUNT,
@@ -70,7 +70,6 @@ from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Solve = Callable[[Array], Array]
 
 MAX_ITERATIONS = 6
 
@@ -100,6 +99,10 @@ geometry), and the noise of a sample is about 150 uT."""
 
 LAG_COLUMN = CONSTANT_ERROR_COUNT - 1
 
+MAX_LINEAR_ERROR = 0.02
+"""Change of a constant error of the odometry, in standard deviations, up to which the paths of the
+visits stay linearized: after two full rotations, 0.15 degrees and less than 1 um of a sensor."""
+
 POSE_SIZE = 3
 BAR_SIZE = 12
 """Unknowns of a pose, and of the bars of a landmark (4 strengths and 4 positions)."""
@@ -123,6 +126,8 @@ class VisitMeasurement:
         Standard deviations that are the unit of the trace's corrections.
     velocity : (n, 3) ndarray, optional
         Derivative of the path of the trace by time.
+    linearized : Trace, optional
+        Trace of the segment whose path is linearized about other constant errors than 0.
     """
 
     segment: VisitSegment
@@ -130,18 +135,28 @@ class VisitMeasurement:
     pose: Array
     drift: OdometryDrift
     velocity: Array | None = None
+    linearized: Trace | None = None
 
     @property
     def trace(self) -> Trace:
-        """Fields and odometry."""
-        return self.segment.trace
+        """Fields, and the path as a linear function of the errors of the odometry."""
+        return self.segment.trace if self.linearized is None else self.linearized
 
-    def with_drift(self, drift: OdometryDrift) -> VisitMeasurement:
-        """Return the measurement with corrections in other standard deviations."""
-        trace = self.trace
-        correction = odometry_corrections(trace.pose, trace.reference, drift, self.velocity)
-        trace = replace(trace, correction=correction)
-        return replace(self, segment=replace(self.segment, trace=trace), drift=drift)
+    def with_drift(self, drift: OdometryDrift, errors: Array) -> VisitMeasurement:
+        """Return the measurement with corrections in other standard deviations.
+
+        The path is linearized about constant errors (4,) of the odometry: over the rotations of a
+        spin they add up to ten degrees, for which a linearization about 0 is 1 mm off.
+        """
+        trace = self.segment.trace
+        path = correct_constant_errors(trace.pose, errors, drift)
+        path = relative(path, path[trace.reference])
+        correction = odometry_corrections(
+            trace.pose, trace.reference, drift, self.velocity, corrected=path
+        )
+        start = path - correction[:, :, :LAG_COLUMN] @ errors[:LAG_COLUMN]
+        linearized = replace(trace, pose=start, correction=correction)
+        return replace(self, drift=drift, linearized=linearized)
 
 
 @dataclass(frozen=True)
@@ -190,17 +205,26 @@ class RobotMeasurements:
     visits : sequence of VisitMeasurement
     links : sequence of OdometryLink or None
         One less than visits; None if the robot was carried.
+    errors : (4,) ndarray
+        Constant errors of the odometry about which the paths of the visits are linearized.
     """
 
     visits: Sequence[VisitMeasurement]
     links: Sequence[OdometryLink | None]
+    errors: Array = field(default_factory=lambda: np.zeros(CONSTANT_ERROR_COUNT))
 
     def with_drift(self, drift: OdometryDrift) -> RobotMeasurements:
         """Return the measurements with corrections in other standard deviations."""
         return RobotMeasurements(
-            [visit.with_drift(drift) for visit in self.visits],
+            [visit.with_drift(drift, self.errors) for visit in self.visits],
             [None if link is None else link.with_drift(drift) for link in self.links],
+            self.errors,
         )
+
+    def linearize(self, errors: Array) -> RobotMeasurements:
+        """Return the measurements with paths linearized about other constant errors (4,)."""
+        visits = [visit.with_drift(visit.drift, errors) for visit in self.visits]
+        return RobotMeasurements(visits, self.links, errors)
 
 
 @dataclass(frozen=True)
@@ -233,12 +257,12 @@ def measure_visits(
     the path between them, on which a wheel may slip, then belongs to the links.
     """
     path = OdometryPath.of(odometry)
+    errors = estimate_constant_errors(visits)
     measurements = []
     for visit in visits:
         landmark = np.array([*floor.position(visit.cell), visit.quarters * HALF_PI_RAD])
         pose, trace = compose(landmark, visit.hypothesis.pose), visit.segment.trace
-        if visit.hypothesis.fit is None:
-            raise ValueError("smoothing needs hypotheses with a fit of the field model")
+        assert visit.hypothesis.fit is not None  # estimate_constant_errors() checks it
         corrections = visit.hypothesis.fit.corrections(trace)
         trace = subtract_neighbours(trace, pose, corrections, visit.cell, floor)
         segment = limit_to_territory(
@@ -246,14 +270,33 @@ def measure_visits(
         )
         velocity = path.velocity(segment.time_ns) @ planar_rotation(segment.origin[2])
         measurement = VisitMeasurement(segment, visit.cell, pose, priors.drift, velocity)
-        measurements.append(measurement.with_drift(priors.drift))
+        measurements.append(measurement.with_drift(priors.drift, errors))
     links = [
         None
         if is_carried(first, second, path, floor.pitch_m)
         else link_visits(first, second, path, priors.drift)
         for first, second in pairwise(measurements)
     ]
-    return RobotMeasurements(measurements, links)
+    return RobotMeasurements(measurements, links, errors)
+
+
+def estimate_constant_errors(visits: Sequence[IdentifiedVisit]) -> Array:
+    """Estimate the constant errors (4,) of the odometry from the fits of single visits.
+
+    The posterior of each fit without its prior is independent evidence.
+    """
+    prior = np.eye(CONSTANT_ERROR_COUNT)
+    information, vector = prior.copy(), np.zeros(CONSTANT_ERROR_COUNT)
+    for visit in visits:
+        fit, trace = visit.hypothesis.fit, visit.segment.trace
+        if fit is None:
+            raise ValueError("smoothing needs hypotheses with a fit of the field model")
+        first = ParameterLayout.of_trace(trace).correction.start
+        own = slice(first, first + CONSTANT_ERROR_COUNT)
+        inverse = np.linalg.inv(fit.covariance[own, own])
+        information += inverse - prior
+        vector += inverse @ fit.parameters[own]
+    return np.asarray(np.linalg.solve(information, vector), float)
 
 
 def limit_to_territory(segment: VisitSegment, threshold_t: float) -> VisitSegment:
@@ -469,18 +512,49 @@ def smooth(
     priors : ModelPriors
     """
     system = SmoothingSystem(robots, landmarks, geometry, priors)
-    state, solve, residual_sigma = system.minimize(system.initial_state())
-    return system.result(state, solve, residual_sigma)
+    return system.result(system.minimize(system.initial_state()))
 
 
-def _factorized(matrix: Any) -> Any:
-    """Factorize a symmetric positive definite matrix; this order of columns keeps it sparse."""
-    return splu(
-        matrix.tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+@dataclass(frozen=True)
+class NormalEquations:
+    """Measurements, linearized at a state, without priors.
+
+    Attributes
+    ----------
+    state : (size,) ndarray
+    matrix : (size, size) sparse array
+    gradient : (size,) ndarray
+    residual_sigma : float
+        Rms residual of the fields.
+    """
+
+    state: Array
+    matrix: Any
+    gradient: Array
+    residual_sigma: float
+
+
+@dataclass(frozen=True)
+class SystemSolution:
+    """Solution of linearized equations with the priors.
+
+    Attributes
+    ----------
+    state : (size,) ndarray
+    inverse : callable
+        Applies the inverse normal matrix.
+    equations : NormalEquations
+    """
+
+    state: Array
+    inverse: Callable[[Array], Array]
+    equations: NormalEquations
+
+    def covariance(self, columns: Indices) -> Array:
+        """Return the covariance of some unknowns, if the residuals are those of the priors."""
+        right = np.zeros((len(self.state), len(columns)))
+        right[columns, np.arange(len(columns))] = 1
+        return np.asarray(self.inverse(right)[columns])
 
 
 class SmoothingSystem:
@@ -502,7 +576,7 @@ class SmoothingSystem:
         geometry: Geometry,
         priors: ModelPriors,
     ) -> None:
-        self.robots, self.geometry, self.priors = robots, geometry, priors
+        self.robots, self.geometry, self.priors = list(robots), geometry, priors
         visited = {visit.cell for robot in robots for visit in robot.visits}
         self.landmarks = {cell: landmarks[cell] for cell in sorted(visited)}
         self.size = 0
@@ -539,38 +613,51 @@ class SmoothingSystem:
         self.size += count
         return np.arange(self.size - count, self.size)
 
-    def minimize(self, state: Array) -> tuple[Array, Solve, float]:
-        """Minimize the cost from a state.
-
-        Returns
-        -------
-        state : (size,) ndarray
-        solve : callable
-            Applies the inverse normal matrix at the minimum.
-        residual_sigma : float
-            Rms residual of the fields.
-        """
+    def minimize(self, state: Array) -> SystemSolution:
+        """Minimize the cost from a state."""
         for _ in range(MAX_ITERATIONS):
-            matrix, gradient, _ = self.normal_equations(state)
-            step = _factorized(matrix).solve(gradient)
-            state = state - step
-            if np.abs(step[self.position_columns]).max() < MIN_STEP_M:
+            self._linearize_paths(state)
+            equations = self.normal_equations(state)
+            solution = self.solve(equations)
+            step = np.abs(solution.state - state)[self.position_columns].max()
+            state = solution.state
+            if step < MIN_STEP_M:
                 break
-        matrix, _, residual_sigma = self.normal_equations(state)
-        return state, _factorized(matrix).solve, residual_sigma
+        return solution
+
+    def solve(self, equations: NormalEquations) -> SystemSolution:
+        """Solve linearized equations with the present weights of the priors."""
+        factorized = splu(
+            (equations.matrix + diags_array(self.prior_weight)).tocsc(),
+            # This order of columns keeps the factors of a symmetric matrix sparse.
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        gradient = equations.gradient + self.prior_weight * equations.state
+        state = equations.state - factorized.solve(gradient)
+        return SystemSolution(state, factorized.solve, equations)
+
+    def _linearize_paths(self, state: Array) -> None:
+        """Linearize the paths of all visits about the constant errors of a state."""
+        for number, robot in enumerate(self.robots):
+            errors = state[self.robot_columns[number][-CONSTANT_ERROR_COUNT:]]
+            if np.abs(errors - robot.errors).max() > MAX_LINEAR_ERROR:
+                self.robots[number] = robot.linearize(errors)
 
     def initial_state(self) -> Array:
-        """Return the state at the initial poses of the visits."""
+        """Return the state at the initial poses of the visits, and errors of the odometry."""
         state = np.zeros(self.size)
-        for robot, columns_of in zip(self.robots, self.visit_columns, strict=True):
-            for visit, columns in zip(robot.visits, columns_of, strict=True):
+        for number, robot in enumerate(self.robots):
+            state[self.robot_columns[number][-CONSTANT_ERROR_COUNT:]] = robot.errors
+            for visit, columns in zip(robot.visits, self.visit_columns[number], strict=True):
                 state[columns[:POSE_SIZE]] = visit.pose
         return state
 
-    def normal_equations(self, state: Array) -> tuple[Any, Array, float]:
-        """Return normal matrix (sparse), gradient, and the rms residual of the fields."""
+    def normal_equations(self, state: Array) -> NormalEquations:
+        """Linearize all measurements at a state."""
         rows, columns, values = [], [], []
-        gradient = self.prior_weight * state
+        gradient = np.zeros(self.size)
         squares, count = 0.0, 0
 
         def add(unknowns: Indices, jacobian: Array, residual: Array) -> None:
@@ -588,15 +675,11 @@ class SmoothingSystem:
             for k, link in enumerate(robot.links):
                 if link is not None:
                     add(*self.link_rows(state, number, k))
-        diagonal = np.arange(self.size)
         matrix = coo_array(
-            (
-                np.concatenate([*values, self.prior_weight]),
-                (np.concatenate([*rows, diagonal]), np.concatenate([*columns, diagonal])),
-            ),
+            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
             shape=(self.size, self.size),
         )
-        return matrix, gradient, math.sqrt(squares / max(count, 1))
+        return NormalEquations(state, matrix.tocsc(), gradient, math.sqrt(squares / max(count, 1)))
 
     def field_rows(self, state: Array, number: int, k: int) -> tuple[Indices, Array, Array]:
         """Linearize the fields of visit ``k`` of a robot.
@@ -673,8 +756,9 @@ class SmoothingSystem:
         unknowns = np.concatenate([first, second, own, constant])
         return unknowns, jacobian / MIN_ODOMETRY_SIGMA[:, None], residual / MIN_ODOMETRY_SIGMA
 
-    def result(self, state: Array, solve: Solve, residual_sigma: float) -> SmoothingResult:
-        """Return the estimates at a state; ``solve`` applies the inverse normal matrix."""
+    def result(self, solution: SystemSolution) -> SmoothingResult:
+        """Return the estimates of a solution."""
+        state, residual_sigma = solution.state, solution.equations.residual_sigma
         inflation = max(1.0, residual_sigma) ** 2
         visits = []
         for number, columns_of in enumerate(self.visit_columns):
@@ -682,7 +766,7 @@ class SmoothingSystem:
             poses = []
             for own in columns_of:
                 columns = np.concatenate([own[:POSE_SIZE], constant, own[POSE_SIZE:]])
-                covariance = self.covariance(columns, solve) * inflation
+                covariance = solution.covariance(columns) * inflation
                 pose, corrections = state[own[:POSE_SIZE]], state[columns[POSE_SIZE:]]
                 poses.append(VisitPose(pose, corrections, covariance))
             visits.append(poses)
@@ -690,7 +774,7 @@ class SmoothingSystem:
         for cell, prior in self.landmarks.items():
             columns = self.landmark_columns[cell][: POSE_SIZE + 4]
             unit = np.concatenate([prior.sigma, prior.strength_sigma])
-            covariance = self.covariance(columns, solve) * inflation
+            covariance = solution.covariance(columns) * inflation
             landmarks[cell] = LandmarkEstimate(
                 self._landmark_pose(state, cell),
                 prior.strength + prior.strength_sigma * state[columns[POSE_SIZE:]],
@@ -701,12 +785,6 @@ class SmoothingSystem:
     def _landmark_pose(self, state: Array, cell: Cell) -> Array:
         prior = self.landmarks[cell]
         return prior.pose + prior.sigma * state[self.landmark_columns[cell][:POSE_SIZE]]
-
-    def covariance(self, columns: Indices, solve: Solve) -> Array:
-        """Return the covariance of some unknowns, if the residuals are those of the priors."""
-        right = np.zeros((self.size, len(columns)))
-        right[columns, np.arange(len(columns))] = 1
-        return np.asarray(solve(right)[columns])
 
 
 def _walk_size(link: OdometryLink) -> int:

@@ -126,7 +126,7 @@ class _Visit:
 
     def bin_pose(self, index: int) -> tuple[Array, Array]:
         """Return pose (3,) and covariance (3, 3) at one bin."""
-        trace = self.segment.trace
+        trace = self.measurement.trace
         pose, covariance = _to_map(self.estimate, trace.pose[[index]], trace.correction[[index]])
         return pose[0], covariance[0]
 
@@ -140,9 +140,13 @@ def _during(visit: _Visit, path: OdometryPath) -> TimedPoses:
     low = np.minimum(index.astype(int), max(len(bin_ns) - 2, 0))
     high = np.minimum(low + 1, len(bin_ns) - 1)
     fraction = (index - low)[:, None, None]
-    by_errors = segment.trace.correction
-    correction = (1 - fraction) * by_errors[low] + fraction * by_errors[high]
-    return time_ns, *_to_map(visit.estimate, relative(pose, segment.origin), correction)
+    trace = visit.measurement.trace
+    by_errors, change = trace.correction, (trace.pose - segment.trace.pose)[:, :, None]
+    correction, change = (
+        (1 - fraction) * each[low] + fraction * each[high] for each in (by_errors, change)
+    )
+    local = relative(pose, segment.origin) + change[:, :, 0]
+    return time_ns, *_to_map(visit.estimate, local, correction)
 
 
 def _between(visit: _Visit, following: _Visit, link: OdometryLink) -> TimedPoses:

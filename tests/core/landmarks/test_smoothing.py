@@ -242,6 +242,39 @@ def test_links_take_large_constant_errors_exactly() -> None:
     assert np.abs(system.link_rows(state, 0, 0)[2]).max() < 1e-6
 
 
+def test_visits_take_large_constant_errors_exactly() -> None:
+    """Odometry of an approach with two full rotations that measures 4 % too little of them."""
+    line = np.linspace(-0.07, 0.0, 36)
+    approach = np.column_stack([line, 0.003 + 0 * line, 0 * line])
+    turn = np.linspace(0.0, 4 * math.pi, 120)[1:]
+    spin = np.column_stack([0 * turn, 0.003 + 0 * turn, turn])
+    true = np.concatenate([approach, spin, approach * [-1, 1, 1] + [0, 0, spin[-1, 2]]])
+    measured = true / [1.0, 1.0, 1.04]
+    # The way out goes along the heading by odometry, which is rotated by 29 degrees.
+    measured[-36:, :2] = compose(measured[-37], relative(true[-36:], true[-37]))[:, :2]
+    observed, middle = relative(measured, measured[40]), 40
+    field = landmark_field(GEOMETRY, 7, sensor_positions(true, SENSORS))
+    trace = Trace(
+        observed,
+        odometry_corrections(observed, middle, PRIORS.drift),
+        field,
+        SENSORS,
+        np.ones(len(true)),
+        middle,
+    )
+    segment = VisitSegment(0, len(true), np.arange(len(true)), trace, measured[middle])
+    visit = VisitMeasurement(segment, (0, 0), true[middle], PRIORS.drift)
+    landmarks = session()[1]
+    system = SmoothingSystem([RobotMeasurements([visit], [])], landmarks, GEOMETRY, PRIORS)
+    solution = system.minimize(system.initial_state())
+    assert solution.equations.residual_sigma < 0.05
+    (visit,), (estimate,) = system.robots[0].visits, system.result(solution).visits[0]
+    assert estimate.corrections[1] == pytest.approx(4, abs=0.2)
+    for k in (0, -1):
+        local = visit.trace.pose[k] + visit.trace.correction[k] @ estimate.corrections
+        assert compose(estimate.pose, local)[:2] == pytest.approx(true[k, :2], abs=2e-4)
+
+
 # ---- priors of landmarks
 
 
