@@ -28,6 +28,7 @@ from locatk.core.landmarks.localization.consistency import (
     warn_of_lag,
     warn_of_missing_pose,
     warn_of_opposite_polarity,
+    warn_of_scale,
     without_contradicted_ends,
 )
 from locatk.core.landmarks.localization.odometry_path import without_lag
@@ -377,6 +378,7 @@ def smooth_robot(
         on_map = [visit for n, visit in enumerate(on_map) if n not in unusable]
     warnings = [warn_of_cause(*cause) for cause in smoothed.causes]
     warnings += warn_of_carrying(smoothed.measurements)
+    warnings += warn_of_scale(smoothed.result, priors.drift)
     residual_sigma = smoothed.result.residual_sigma
     if residual_sigma > MAX_RESIDUAL_SIGMAS:
         message = (

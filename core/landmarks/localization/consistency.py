@@ -24,7 +24,11 @@ from locatk.core.landmarks.localization.robust_smoothing import (
     DisplacedLandmark,
     WheelSlip,
 )
-from locatk.core.landmarks.localization.smoothing import RobotMeasurements
+from locatk.core.landmarks.localization.smoothing import (
+    POSE_SIZE,
+    RobotMeasurements,
+    SmoothingResult,
+)
 from locatk.core.landmarks.map.floor import (
     HOLE_CODE,
     Cell,
@@ -48,6 +52,10 @@ MIN_DISPLACED_CODE_PROBABILITY = 0.9
 
 MIN_DISPLACEMENT_SIGMAS = 4.0
 """Displacement or rotation of a landmark in standard deviations from which on it is reported."""
+
+MIN_REPORTED_SCALE, MIN_SCALE_SIGMAS = 0.0175, 4.0
+"""Relative error of distances by odometry, and its significance, from which on it is reported: few
+calibrated robots have it, and a floor whose landmarks have another pitch looks the same."""
 
 MAX_DISPLACEMENT_PITCHES = 0.5
 """Displacement of a landmark, in pitches, beyond which it would be in another cell."""
@@ -277,6 +285,21 @@ def _describe_cause(cause: Cause) -> str:
 
 def _describe_size(cause: Cause) -> str:
     return f"{1e3 * cause.distance_m:.2g} mm and {math.degrees(abs(cause.rotation_rad)):.2g} deg"
+
+
+def warn_of_scale(result: SmoothingResult, drift: OdometryDrift) -> list[SolverWarning]:
+    """Return a warning if distances by odometry differ much from those of the map."""
+    visit = result.visits[0][0]
+    # The scale is the first of the constant errors.
+    correction = float(visit.corrections[0]) * drift.scale
+    sigma = math.sqrt(visit.covariance[POSE_SIZE, POSE_SIZE]) * drift.scale
+    if abs(correction) < max(MIN_REPORTED_SCALE, MIN_SCALE_SIGMAS * sigma):
+        return []
+    message = (
+        f"distances by odometry are {1 / (1 + correction):.3f} times those of the map; corrected: "
+        "check the wheel diameters, and the pitch of the landmarks on the floor"
+    )
+    return [SolverWarning("odometry_scale", message)]
 
 
 def warn_of_lag(lag_s: float, remaining_s: float = 0.0) -> SolverWarning:

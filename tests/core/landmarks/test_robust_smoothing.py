@@ -151,6 +151,18 @@ def test_odometry_without_lag() -> None:
     assert len(result) == 98
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.96, 1.03])
+def test_scale_of_distances_is_named(scale: float) -> None:
+    one = drive()
+    given = odometry_of(one, 3)
+    robot = solved(one, replace(given, position=given.position * scale / 1.015))
+    (warning,) = robot.warnings
+    assert warning.code == "odometry_scale"
+    assert float(warning.message.split(" are ")[1].split()[0]) == pytest.approx(scale, abs=3e-3)
+    assert np.hypot(*errors_of(one, robot)[0][:, :2].T).mean() < 1.5e-3
+
+
 def test_odometry_with_an_invalid_pose_without_lag() -> None:
     time_ns = np.arange(100) * 20_000_000
     position = np.column_stack([time_ns * 1e-9, np.zeros((100, 2))])
