@@ -77,6 +77,10 @@ NOISE_QUANTILE = 0.25
 """Quantile of the second differences from which noise is estimated: most of the time the field is
 even, which the upper quantiles are not."""
 
+MIN_LEVELS = 8
+"""Number of different readings from which on their smallest difference is taken as the step of the
+sensors."""
+
 NORMAL_QUARTILE_OF_MAGNITUDE = 0.3186
 """25 % quantile of the absolute value of a standard normal variable."""
 
@@ -420,16 +424,22 @@ def _estimate_offsets(field: Array) -> Array:
 
 
 def _sample_noise(samples: HallSamples, field: Array) -> float:
-    """Return the standard deviation of a sample: as given, or from second differences."""
+    """Return the standard deviation of a sample: as given, or from second differences.
+
+    It is at least that of rounding to the steps of the readings.
+    """
+    values = np.unique(field[~np.isnan(field)])
+    step_t = float(np.diff(values).min()) if len(values) >= MIN_LEVELS else 0.0
+    least_t = max(MIN_NOISE_T, step_t / math.sqrt(12))
     given_t = samples.sensors.noise_t
     if math.isfinite(given_t) and given_t > 0:
-        return max(given_t, MIN_NOISE_T)
+        return max(given_t, least_t)
     second = np.abs(field[2:] - 2 * field[1:-1] + field[:-2])
     if np.isnan(second).all():
-        return UNKNOWN_NOISE_T
+        return max(UNKNOWN_NOISE_T, least_t)
     quantile = np.nanquantile(second, NOISE_QUANTILE)
     # A second difference has the variance 1 + 4 + 1.
-    return max(float(quantile / NORMAL_QUARTILE_OF_MAGNITUDE / math.sqrt(6)), MIN_NOISE_T)
+    return max(float(quantile / NORMAL_QUARTILE_OF_MAGNITUDE / math.sqrt(6)), least_t)
 
 
 def _interpolate(time_ns: NDArray[np.int64], known_ns: NDArray[np.int64], values: Array) -> Array:

@@ -76,6 +76,15 @@ def test_noise_has_no_spikes() -> None:
     assert np.argwhere(np.isnan(valid_readings(field)[0])).tolist() == [[77, 1]]
 
 
+def test_rounding_is_noise() -> None:
+    """A reading that is rounded to the next step, and back, is no spike."""
+    step_t = 3e-3
+    field = step_t * np.round(waves() / step_t)
+    field[100, 0] = step_t * round(field[99, 0] / step_t + 1)
+    _, warnings = valid_readings(field)
+    assert "spikes" not in [each.code for each in warnings]
+
+
 def test_a_bar_that_is_passed_within_a_sample_is_no_spike() -> None:
     """At 12.5 Hz a robot of 0.2 m/s moves 16 mm from sample to sample."""
     x = 0.016 * np.arange(-6, 7)
