@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from locatk.core.errors import InputError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import detect_landmarks
-from locatk.core.landmarks.detection.trace import OdometryDrift, known_drift
+from locatk.core.landmarks.detection.trace import known_drift
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization.cell_filter import (
@@ -23,24 +23,15 @@ from locatk.core.landmarks.localization.consistency import (
     describe_visit,
     find_displaced_landmarks,
     is_map_contradicted,
-    warn_of_carrying,
     warn_of_cause,
     warn_of_lag,
     warn_of_missing_pose,
     warn_of_opposite_polarity,
-    warn_of_scale,
     without_contradicted_ends,
 )
+from locatk.core.landmarks.localization.drive_smoothing import smooth_drive
 from locatk.core.landmarks.localization.odometry_path import without_lag
-from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing, smooth_robustly
-from locatk.core.landmarks.localization.smoothing import (
-    LAG_COLUMN,
-    POSE_SIZE,
-    SMOOTHED_MODEL_ERROR_T,
-    landmark_priors,
-    measure_visits,
-)
-from locatk.core.landmarks.localization.trajectory import estimate_trajectory, pose_probability
+from locatk.core.landmarks.localization.trajectory import pose_probability
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.preprocessing import (
     DEFAULT_PITCH_M,
@@ -58,20 +49,8 @@ METHODS = ("field", "paper")
 MAX_LAG_ROUNDS = 3
 """Rounds of a solution, each without the lag of the odometry that the previous one found."""
 
-MIN_LAG_S = 2e-3
-"""Lag of the odometry that is removed: the linearization takes smaller ones ..."""
-
 MIN_REPORTED_LAG_S = 0.01
-"""... and from which on a warning is given."""
-
-MIN_LAG_SIGMAS = 4.0
-"""Significance of a lag."""
-
-MAX_RESIDUAL_SIGMAS = 2.0
-"""Rms residual of all fields after smoothing from which on a warning is given ..."""
-
-MAX_CREDIBLE_RESIDUAL_SIGMAS = 12.0
-"""... and from which on the poses are not reported."""
+"""Lag of the odometry from which on a warning is given."""
 
 
 @dataclass(frozen=True)
@@ -320,22 +299,21 @@ def localize_robot(
         )
         not_localised = replace(facts, localised=False, provisional=False)
         return _with_warnings(replace(unlocalized, facts=not_localised), obstacle, *polarity)
-    smoothed, warnings = smooth_robot(
-        identified, on_map, floor, estimate_walk=options.odometry_noise is None
-    )
-    residual_sigma = smoothed.result.residual_sigma
-    facts = replace(facts, misfit_sigma=residual_sigma)
-    lag_s = significant_lag(smoothed, identified.priors.drift)
-    robot = _with_warnings(replace(unlocalized, facts=facts, lag_s=lag_s), *warnings)
-    if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
-        return replace(robot, facts=replace(facts, localised=False, provisional=False))
-    trajectory = estimate_trajectory(
-        identified.device,
-        smoothed.measurements,
-        smoothed.result.visits[0],
+    smoothed = smooth_drive(
+        on_map,
         identified.odometry,
-        smoothed.slipped_links,
+        floor,
+        identified.priors,
+        estimate_walk=options.odometry_noise is None,
     )
+    facts = replace(facts, misfit_sigma=smoothed.residual_sigma)
+    robot = _with_warnings(
+        replace(unlocalized, facts=facts, lag_s=smoothed.significant_lag()),
+        *(warning.about(identified.device) for warning in smoothed.warnings()),
+    )
+    trajectory = smoothed.trajectory(identified.odometry)
+    if trajectory is None:
+        return replace(robot, facts=replace(facts, localised=False, provisional=False))
     used = set(map(id, on_map))
     unused = [visit for visit in visits if id(visit) not in used]
     trajectory, contradictions = without_contradicted_ends(trajectory, on_map, unused)
@@ -351,53 +329,6 @@ def localize_robot(
         *(warn_of_cause(each).about(identified.device) for each in displaced),
         *(warning.about(identified.device) for warning in contradictions),
     )
-
-
-def smooth_robot(
-    identified: IdentifiedRecording,
-    on_map: Sequence[IdentifiedVisit],
-    floor: FloorMap,
-    *,
-    estimate_walk: bool = True,
-) -> tuple[RobustSmoothing, list[SolverWarning]]:
-    """Smooth the visits of one robot, with warnings of inconsistencies.
-
-    A visit during which a wheel slipped is not used, unless it is the first or the last one: its
-    path is not known.
-    """
-    priors = replace(identified.priors, model_error_t=SMOOTHED_MODEL_ERROR_T)
-    landmarks = landmark_priors(on_map, floor, identified.priors)
-    while True:
-        measurements = measure_visits(on_map, identified.odometry, identified.priors, floor)
-        smoothed = smooth_robustly(
-            measurements, landmarks, floor.geometry, priors, estimate_walk=estimate_walk
-        )
-        unusable = smoothed.slipped_visits & set(range(1, len(on_map) - 1))
-        if not unusable:
-            break
-        on_map = [visit for n, visit in enumerate(on_map) if n not in unusable]
-    warnings = [warn_of_cause(*cause) for cause in smoothed.causes]
-    warnings += warn_of_carrying(smoothed.measurements)
-    warnings += warn_of_scale(smoothed.result, priors.drift)
-    residual_sigma = smoothed.result.residual_sigma
-    if residual_sigma > MAX_RESIDUAL_SIGMAS:
-        message = (
-            f"fields deviate from the model by {residual_sigma:.2g} standard deviations; "
-            "check clocks and scale of the odometry, the sensors and the landmarks' geometry"
-        )
-        if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
-            message += "; there are no poses"
-        warnings.append(SolverWarning("field_misfit", message))
-    return smoothed, [warning.about(identified.device) for warning in warnings]
-
-
-def significant_lag(smoothed: RobustSmoothing, drift: OdometryDrift) -> float:
-    """Return the lag of the odometry in seconds, or 0 if it is not significant."""
-    visit = smoothed.result.visits[0][0]
-    sigma = math.sqrt(visit.covariance[POSE_SIZE + LAG_COLUMN, POSE_SIZE + LAG_COLUMN])
-    lag = float(visit.corrections[LAG_COLUMN])
-    is_significant = abs(lag) > max(MIN_LAG_SIGMAS * sigma, MIN_LAG_S / max(drift.lag_s, 1e-9))
-    return lag * drift.lag_s if is_significant else 0.0
 
 
 def _cell_facts(identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit]) -> RobotFacts:

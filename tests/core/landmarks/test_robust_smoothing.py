@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.detection.trace import compose, relative
+from locatk.core.landmarks.localization import drive_smoothing
 from locatk.core.landmarks.localization.odometry_path import OdometryPath, without_lag
 from locatk.core.landmarks.map.floor import AsBuiltLandmark, FloorMap
 from locatk.core.landmarks.preprocessing import planar_poses
@@ -227,6 +228,22 @@ def test_displaced_or_rotated_landmark_is_named(displaced_m: float, rotated_deg:
     error, squares = errors_of(one, robot)
     assert np.hypot(*error[:, :2].T).max() < 3e-3
     assert squares.mean() < 2.5
+
+
+@pytest.mark.slow
+def test_a_drive_in_parts_has_the_same_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = drive()
+    odometry = slipped(odometry_of(one, 4), 0.52, np.array([0.03, 0.0, 0.0]))
+    whole = solved(one, odometry)
+    for name, count in (("MAX_PART_VISITS", 8), ("PART_VISITS", 7), ("NEIGHBOURING_VISITS", 6)):
+        monkeypatch.setattr(drive_smoothing, name, count)
+    in_parts = solved(one, odometry)
+    assert codes(in_parts) == codes(whole) == ["wheel_slip"]
+    (first,), (second,) = whole.trajectories, in_parts.trajectories
+    assert (first.time_ns == second.time_ns).all()
+    sigma = first.sigma[:, :2]
+    assert np.abs((second.position - first.position)[:, :2] / sigma).max() < 0.5
+    np.testing.assert_allclose(second.sigma[:, :2], sigma, rtol=0.35)
 
 
 @pytest.mark.slow

@@ -13,9 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.landmarks import solver
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import pattern
+from locatk.core.landmarks.localization import drive_smoothing
 from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing
 from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.simulation.session import (
@@ -357,13 +357,13 @@ def identified() -> IdentifiedRecording:
 def test_residuals_of_the_fields_limit_the_poses(
     residual_sigma: float, warned: bool, poses: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    smooth = solver.smooth_robustly
+    smooth = drive_smoothing.smooth_robustly
 
     def with_residual(*given: Any, **options: Any) -> RobustSmoothing:
         smoothed = smooth(*given, **options)
         return replace(smoothed, result=replace(smoothed.result, residual_sigma=residual_sigma))
 
-    monkeypatch.setattr(solver, "smooth_robustly", with_residual)
+    monkeypatch.setattr(drive_smoothing, "smooth_robustly", with_residual)
     robot = localize_robot(identified(), FLOOR, SolveOptions())
     assert ("field_misfit" in [warning.code for warning in robot.warnings]) == warned
     assert bool(robot.trajectories) == poses
