@@ -7,10 +7,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from locatk.core.errors import InputError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import detect_landmarks
-from locatk.core.landmarks.detection.trace import OdometryDrift, known_drift
+from locatk.core.landmarks.detection.trace import (
+    CONSTANT_ERROR_COUNT,
+    OdometryDrift,
+    known_drift,
+)
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization.cell_filter import (
@@ -35,6 +41,7 @@ from locatk.core.landmarks.localization.smoothing import (
     LAG_COLUMN,
     POSE_SIZE,
     SMOOTHED_MODEL_ERROR_T,
+    constant_error_information,
     landmark_priors,
     measure_visits,
 )
@@ -255,14 +262,19 @@ def solve_recording(
     InputError
         See :func:`solve`.
     """
+    is_known = options.odometry_lag_s is not None
     lag_s = options.odometry_lag_s or 0.0
-    for _ in range(MAX_LAG_ROUNDS):
+    for further_rounds in reversed(range(MAX_LAG_ROUNDS)):
         shifted = odometry if odometry is None or not lag_s else without_lag(odometry, lag_s)
         identified = identify_recording(samples, shifted, floor, options)
-        robot = localize_robot(identified, floor, options)
-        if options.odometry_lag_s is not None or not robot.lag_s:
+        # A lag that is evident in single visits need not be smoothed before it is removed.
+        found_s = 0.0 if is_known else lag_of_visits(identified)
+        if not (found_s and further_rounds):
+            robot = localize_robot(identified, floor, options)
+            found_s = robot.lag_s
+        if is_known or not found_s:
             break
-        lag_s += robot.lag_s
+        lag_s += found_s
     if options.odometry_lag_s is None and abs(lag_s) > MIN_REPORTED_LAG_S:
         robot = _with_warnings(robot, warn_of_lag(lag_s).about(identified.device))
     return robot
@@ -303,7 +315,12 @@ def localize_robot(
     )
     residual_sigma = smoothed.result.residual_sigma
     facts = replace(facts, misfit_sigma=residual_sigma)
-    lag_s = significant_lag(smoothed, identified.priors.drift)
+    first = smoothed.result.visits[0][0]
+    lag_s = significant_lag(
+        first.corrections[LAG_COLUMN],
+        first.covariance[POSE_SIZE + LAG_COLUMN, POSE_SIZE + LAG_COLUMN],
+        identified.priors.drift,
+    )
     robot = _with_warnings(replace(unlocalized, facts=facts, lag_s=lag_s), *warnings)
     if residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS:
         return replace(robot, facts=replace(facts, localised=False))
@@ -363,13 +380,37 @@ def smooth_robot(
     return smoothed, [warning.about(identified.device) for warning in warnings]
 
 
-def significant_lag(smoothed: RobustSmoothing, drift: OdometryDrift) -> float:
-    """Return the lag of the odometry in seconds, or 0 if it is not significant."""
-    visit = smoothed.result.visits[0][0]
-    sigma = math.sqrt(visit.covariance[POSE_SIZE + LAG_COLUMN, POSE_SIZE + LAG_COLUMN])
-    lag = float(visit.corrections[LAG_COLUMN])
-    is_significant = abs(lag) > max(MIN_LAG_SIGMAS * sigma, MIN_LAG_S / max(drift.lag_s, 1e-9))
-    return lag * drift.lag_s if is_significant else 0.0
+def lag_of_visits(identified: IdentifiedRecording) -> float:
+    """Return the lag in seconds by the fits of single visits, or 0 if it is not significant.
+
+    It must be significant without any one visit as well, in which a wheel may have slipped.
+    """
+    fits = [
+        (visit.hypotheses.best.fit, visit.segment.trace)
+        for visit in identified.visits
+        if not visit.hypotheses.refused
+    ]
+    information, vector = constant_error_information(
+        [(fit, trace) for fit, trace in fits if fit is not None]
+    )
+    # The sums over all visits, and over all but each one.
+    information = information.sum(axis=0) - np.concatenate([np.zeros((1, 4, 4)), information])
+    vector = vector.sum(axis=0) - np.concatenate([np.zeros((1, 4)), vector])
+    covariance = np.linalg.inv(np.eye(CONSTANT_ERROR_COUNT) + information)
+    lags = [
+        significant_lag(errors[LAG_COLUMN], own[LAG_COLUMN, LAG_COLUMN], identified.priors.drift)
+        for errors, own in zip(np.einsum("kij,kj->ki", covariance, vector), covariance, strict=True)
+    ]
+    return lags[0] if all(lag * lags[0] > 0 for lag in lags) else 0.0
+
+
+def significant_lag(error: float, variance: float, drift: OdometryDrift) -> float:
+    """Return the lag of the odometry in seconds, or 0 if it is not significant.
+
+    ``error`` and its variance are in standard deviations of the drift.
+    """
+    min_error = max(MIN_LAG_SIGMAS * math.sqrt(variance), MIN_LAG_S / max(drift.lag_s, 1e-9))
+    return float(error) * drift.lag_s if abs(error) > min_error else 0.0
 
 
 def _cell_facts(identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit]) -> RobotFacts:
