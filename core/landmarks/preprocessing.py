@@ -21,6 +21,7 @@ from locatk.core.landmarks.detection.trace import (
     Trace,
     compose,
     odometry_corrections,
+    planar_rotation,
     relative,
     sensor_positions,
 )
@@ -112,6 +113,9 @@ BIN_M = 2e-3
 """Path of the sensors over which samples are averaged."""
 
 MAX_BINS = 400
+
+VELOCITY_SPAN_NS = 10_000_000
+"""Time before and after which velocities are the mean of: about the spacing of odometry."""
 
 REFERENCE_DISTANCE_M = 5e-3
 """The reference of a visit is its last bin that is at most this much farther from the landmark than
@@ -556,6 +560,19 @@ def _fields_along_path(
         return starts, power, moment / power[:, None]
 
 
+def _velocity(recording: HallRecording, first: int, stop: int) -> Array:
+    """Return the derivatives of the poses by odometry (stop - first, 3) at samples, per second."""
+    time_ns = recording.samples.time_ns - recording.samples.time_ns[0]
+    ahead, behind = (
+        np.column_stack([np.interp(wanted_ns, time_ns, each) for each in recording.pose.T])
+        for wanted_ns in (
+            time_ns[first:stop] + VELOCITY_SPAN_NS,
+            time_ns[first:stop] - VELOCITY_SPAN_NS,
+        )
+    )
+    return (ahead - behind) / (2e-9 * VELOCITY_SPAN_NS)
+
+
 def _segment(
     recording: HallRecording, first: int, stop: int, centre: Array, drift: OdometryDrift
 ) -> VisitSegment:
@@ -574,9 +591,11 @@ def _segment(
     distance = np.hypot(*(mean_pose[:, :2] - centre).T)
     reference = int(np.flatnonzero(distance < distance.min() + REFERENCE_DISTANCE_M)[-1])
     local = relative(mean_pose, mean_pose[reference])
+    velocity = np.add.reduceat(_velocity(recording, first, stop), starts, axis=0)
+    velocity = velocity / samples[:, None] @ planar_rotation(mean_pose[reference, 2])
     trace = Trace(
         pose=local,
-        correction=odometry_corrections(local, reference, drift),
+        correction=odometry_corrections(local, reference, drift, velocity),
         field_t=mean_field,
         sensor_position_m=recording.samples.sensors.position_m,
         weight=samples.astype(float),

@@ -7,10 +7,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from locatk.core.errors import InputError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import detect_landmarks
-from locatk.core.landmarks.detection.trace import known_drift
+from locatk.core.landmarks.detection.trace import CONSTANT_ERROR_COUNT, known_drift
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization.cell_filter import (
@@ -29,8 +31,9 @@ from locatk.core.landmarks.localization.consistency import (
     warn_of_opposite_polarity,
     without_contradicted_ends,
 )
-from locatk.core.landmarks.localization.drive_smoothing import smooth_drive
+from locatk.core.landmarks.localization.drive_smoothing import significant_lag, smooth_drive
 from locatk.core.landmarks.localization.odometry_path import without_lag
+from locatk.core.landmarks.localization.smoothing import LAG_COLUMN, constant_error_information
 from locatk.core.landmarks.localization.trajectory import pose_probability
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.preprocessing import (
@@ -255,14 +258,19 @@ def solve_recording(
     InputError
         See :func:`solve`.
     """
+    is_known = options.odometry_lag_s is not None
     lag_s = options.odometry_lag_s or 0.0
-    for rounds_left in reversed(range(MAX_LAG_ROUNDS)):
+    for further_rounds in reversed(range(MAX_LAG_ROUNDS)):
         shifted = odometry if odometry is None or not lag_s else without_lag(odometry, lag_s)
         identified = identify_recording(samples, shifted, floor, options)
-        robot = localize_robot(identified, floor, options)
-        if options.odometry_lag_s is not None or not robot.lag_s or not rounds_left:
+        # A lag that is evident in single visits need not be smoothed before it is removed.
+        found_s = 0.0 if is_known else lag_of_visits(identified)
+        if not (found_s and further_rounds):
+            robot = localize_robot(identified, floor, options)
+            found_s = robot.lag_s
+        if is_known or not found_s or not further_rounds:
             break
-        lag_s += robot.lag_s
+        lag_s += found_s
     if options.odometry_lag_s is None and abs(lag_s) > MIN_REPORTED_LAG_S:
         warning = warn_of_lag(lag_s, remaining_s=robot.lag_s)
         robot = _with_warnings(robot, warning.about(identified.device))
@@ -329,6 +337,30 @@ def localize_robot(
         *(warn_of_cause(each).about(identified.device) for each in displaced),
         *(warning.about(identified.device) for warning in contradictions),
     )
+
+
+def lag_of_visits(identified: IdentifiedRecording) -> float:
+    """Return the lag in seconds by the fits of single visits, or 0 if it is not significant.
+
+    It must be significant without any one visit as well, in which a wheel may have slipped.
+    """
+    fits = [
+        (visit.hypotheses.best.fit, visit.segment.trace)
+        for visit in identified.visits
+        if not visit.hypotheses.refused
+    ]
+    information, vector = constant_error_information(
+        [(fit, trace) for fit, trace in fits if fit is not None]
+    )
+    # The sums over all visits, and over all but each one.
+    information = information.sum(axis=0) - np.concatenate([np.zeros((1, 4, 4)), information])
+    vector = vector.sum(axis=0) - np.concatenate([np.zeros((1, 4)), vector])
+    covariance = np.linalg.inv(np.eye(CONSTANT_ERROR_COUNT) + information)
+    lags = [
+        significant_lag(errors[LAG_COLUMN], own[LAG_COLUMN, LAG_COLUMN], identified.priors.drift)
+        for errors, own in zip(np.einsum("kij,kj->ki", covariance, vector), covariance, strict=True)
+    ]
+    return lags[0] if all(lag * lags[0] > 0 for lag in lags) else 0.0
 
 
 def _cell_facts(identified: IdentifiedRecording, on_map: Sequence[IdentifiedVisit]) -> RobotFacts:

@@ -185,7 +185,7 @@ def calibrate(
     known = {cell: one.built for cell, one in rough.items() if not one.refused}
     final = _smooth(used, landmark_priors, replace(design, built=known), priors)
     fine = describe_landmarks(final, landmark_priors, design, components, visits)
-    landmarks = tuple(replace(fine[cell], refused=rough[cell].refused) for cell in sorted(fine))
+    landmarks = tuple(fine[cell] for cell in sorted(fine))
     built = {one.cell: one.built for one in landmarks if not one.refused}
     report = FloorCalibrationReport(
         floor=replace(floor, built={**floor.built, **built}),
@@ -197,7 +197,12 @@ def calibrate(
         left_out=left_out,
         notes=(),
     )
-    return replace(report, notes=tuple(_notes(report, components, floor)))
+    corrected = [
+        f"{drive.name}: {warning.message}"
+        for drive in drives
+        for warning in drive.identified.recording.warnings
+    ]
+    return replace(report, notes=(*corrected, *_notes(report, components, floor)))
 
 
 def _common_priors(used: Sequence[_UsedDrive]) -> ModelPriors:

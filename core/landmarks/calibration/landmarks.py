@@ -46,7 +46,8 @@ MAX_SOUND_DEVIATION = 0.2
 """A bar is constrained to the typical strength if it is within this fraction of it."""
 
 MAX_REPORTED_SIGMA = np.array([1.5e-3, 1.5e-3, math.radians(1.5)])
-"""Standard deviations of a pose above which a landmark is not written to the map ..."""
+"""Standard deviations of a pose by the measurements alone, above which a landmark is not written to
+the map ..."""
 
 MAX_REPORTED_STRENGTH_SIGMA = 0.15
 """... and of a strength."""
@@ -166,7 +167,9 @@ def describe_landmarks(
             x, y, heading = (float(value) for value in deviation[k])
             flags = flag_deviations(signs(design.codes[cell]), deviation[k], strength, sigma)
             built = AsBuiltLandmark(x, y, heading, strength, sigma, count[cell], flags)
-            landmarks[cell] = CalibratedLandmark(cell, built, refusal_reason(sigma))
+            prior = np.concatenate([prior_sigma[k], priors[cell].strength_sigma])
+            refused = refusal_reason(sigma_without_prior(sigma, prior))
+            landmarks[cell] = CalibratedLandmark(cell, built, refused)
     return landmarks
 
 
@@ -209,8 +212,18 @@ def flag_deviations(
     return tuple(flags)
 
 
+def sigma_without_prior(sigma: Array, prior_sigma: Array) -> Array:
+    """Return the standard deviations of unknowns by the measurements alone."""
+    information = 1 / sigma**2 - 1 / prior_sigma**2
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(np.isnan(sigma), np.nan, np.fmax(information, 0.0) ** -0.5))
+
+
 def refusal_reason(sigma: Array) -> str:
-    """Return the reason for which a landmark is not written to the map, or ``""``."""
+    """Return the reason for which a landmark is not written to the map, or ``""``.
+
+    The standard deviations (7,) are those of the measurements alone.
+    """
     if np.any(sigma[:3] > MAX_REPORTED_SIGMA):
         return "its pose is too uncertain"
     uncertain = np.flatnonzero(sigma[3:] > MAX_REPORTED_STRENGTH_SIGMA)

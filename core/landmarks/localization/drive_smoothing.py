@@ -95,11 +95,9 @@ class SmoothedPart:
 
     def significant_lag(self, drift: OdometryDrift) -> float:
         """Return the lag of the odometry in seconds, or 0 if it is not significant."""
-        visit = self.smoothed.result.visits[0][0]
-        sigma = math.sqrt(visit.covariance[POSE_SIZE + LAG_COLUMN, POSE_SIZE + LAG_COLUMN])
-        lag = float(visit.corrections[LAG_COLUMN])
-        least = max(MIN_LAG_SIGMAS * sigma, MIN_LAG_S / max(drift.lag_s, 1e-9))
-        return lag * drift.lag_s if abs(lag) > least else 0.0
+        visit, column = self.smoothed.result.visits[0][0], POSE_SIZE + LAG_COLUMN
+        variance = visit.covariance[column, column]
+        return significant_lag(visit.corrections[LAG_COLUMN], variance, drift)
 
     def causes(self) -> list[tuple[Cause, ...]]:
         """Return the inconsistencies of this part."""
@@ -239,3 +237,12 @@ def _smooth_part(
         if not unusable:
             return smoothed
         visits = [visit for n, visit in enumerate(visits) if n not in unusable]
+
+
+def significant_lag(error: float, variance: float, drift: OdometryDrift) -> float:
+    """Return the lag of the odometry in seconds, or 0 if it is not significant.
+
+    ``error`` and its variance are in standard deviations of the drift.
+    """
+    min_error = max(MIN_LAG_SIGMAS * math.sqrt(variance), MIN_LAG_S / max(drift.lag_s, 1e-9))
+    return float(error) * drift.lag_s if abs(error) > min_error else 0.0

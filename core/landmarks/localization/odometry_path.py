@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
-from locatk.core.landmarks.preprocessing import planar_poses, valid_poses
+from locatk.core.landmarks.preprocessing import VELOCITY_SPAN_NS, planar_poses, valid_poses
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
-VELOCITY_SPAN_NS = 10_000_000
-"""Time before and after which velocities are the mean of: about the spacing of odometry."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
 from locatk.core.landmarks.detection.fit import ModelPriors, ParameterLayout, VisitFitProblem
-from locatk.core.landmarks.detection.hypotheses import FAULTY_STRENGTH_SIGMA
+from locatk.core.landmarks.detection.hypotheses import FAULTY_STRENGTH_SIGMA, LandmarkFit
 from locatk.core.landmarks.detection.trace import (
     CONSTANT_ERROR_COUNT,
     OdometryDrift,
@@ -257,13 +257,19 @@ def measure_visits(
     the path between them, on which a wheel may slip, then belongs to the links.
     """
     path = OdometryPath.of(odometry)
-    errors = estimate_constant_errors(visits)
+    fits = [visit.hypothesis.fit for visit in visits]
+    known_fits = [fit for fit in fits if fit is not None]
+    if len(known_fits) < len(fits):
+        raise ValueError("smoothing needs hypotheses with a fit of the field model")
+    traces = [visit.segment.trace for visit in visits]
+    information, vector = constant_error_information(list(zip(known_fits, traces, strict=True)))
+    prior = np.eye(CONSTANT_ERROR_COUNT)
+    errors = np.linalg.solve(prior + information.sum(axis=0), vector.sum(axis=0))
     measurements = []
-    for visit in visits:
+    for visit, fit in zip(visits, known_fits, strict=True):
         landmark = np.array([*floor.position(visit.cell), visit.quarters * HALF_PI_RAD])
         pose, trace = compose(landmark, visit.hypothesis.pose), visit.segment.trace
-        assert visit.hypothesis.fit is not None  # estimate_constant_errors() checks it
-        corrections = visit.hypothesis.fit.corrections(trace)
+        corrections = fit.corrections(trace)
         trace = subtract_neighbours(trace, pose, corrections, visit.cell, floor)
         segment = limit_to_territory(
             replace(visit.segment, trace=trace), floor.geometry.threshold_t
@@ -280,23 +286,28 @@ def measure_visits(
     return RobotMeasurements(measurements, links, errors)
 
 
-def estimate_constant_errors(visits: Sequence[IdentifiedVisit]) -> Array:
-    """Estimate the constant errors (4,) of the odometry from the fits of single visits.
+def constant_error_information(
+    fits: Sequence[tuple[LandmarkFit, Trace]],
+) -> tuple[Array, Array]:
+    """Return what the fits of single visits say of the constant errors of the odometry.
 
-    The posterior of each fit without its prior is independent evidence.
+    The posterior of each fit without its prior N(0, I) is independent evidence.
+
+    Returns
+    -------
+    information : (n, 4, 4) ndarray
+    vector : (n, 4) ndarray
+        Information times errors.
     """
-    prior = np.eye(CONSTANT_ERROR_COUNT)
-    information, vector = prior.copy(), np.zeros(CONSTANT_ERROR_COUNT)
-    for visit in visits:
-        fit, trace = visit.hypothesis.fit, visit.segment.trace
-        if fit is None:
-            raise ValueError("smoothing needs hypotheses with a fit of the field model")
+    information = np.zeros((len(fits), CONSTANT_ERROR_COUNT, CONSTANT_ERROR_COUNT))
+    vector = np.zeros((len(fits), CONSTANT_ERROR_COUNT))
+    for k, (fit, trace) in enumerate(fits):
         first = ParameterLayout.of_trace(trace).correction.start
         own = slice(first, first + CONSTANT_ERROR_COUNT)
         inverse = np.linalg.inv(fit.covariance[own, own])
-        information += inverse - prior
-        vector += inverse @ fit.parameters[own]
-    return np.asarray(np.linalg.solve(information, vector), float)
+        information[k] = inverse - np.eye(CONSTANT_ERROR_COUNT)
+        vector[k] = inverse @ fit.parameters[own]
+    return information, vector
 
 
 def limit_to_territory(segment: VisitSegment, threshold_t: float) -> VisitSegment:

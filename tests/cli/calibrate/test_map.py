@@ -163,8 +163,7 @@ def test_recordings_that_cannot_be_used_are_named(
     for path in left_out:
         assert path in result.stderr
     assert "Incomplete: 3 recordings or visits were not used." in result.stderr
-    # The first and the last landmark of a single drive may be too uncertain.
-    assert len(maps.read_map(out).built) >= 4
+    assert len(maps.read_map(out).built) == 6
 
 
 @pytest.mark.slow

@@ -22,28 +22,38 @@ from locatk.core.landmarks.localization import drive_smoothing
 from locatk.core.landmarks.localization.odometry_path import OdometryPath, without_lag
 from locatk.core.landmarks.map.floor import AsBuiltLandmark, FloorMap
 from locatk.core.landmarks.preprocessing import planar_poses
-from locatk.core.landmarks.simulation.options import SimulationOptions
+from locatk.core.landmarks.simulation.options import Errors, SimulationOptions
 from locatk.core.landmarks.simulation.robot import RobotLimits
 from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
-from locatk.core.landmarks.solver import LocalizedRobot, SolveOptions, solve_recording
+from locatk.core.landmarks.solver import (
+    LocalizedRobot,
+    SolveOptions,
+    identify_recording,
+    lag_of_visits,
+    solve_recording,
+)
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 FLOOR = FloorMap(np.random.default_rng(21).integers(0, 16, (9, 9)))
 
-CORNERS = ((1, 1), (1, 6), (4, 6), (4, 2), (7, 2), (7, 7))
+CORNERS = ((1, 1), (1, 5), (4, 5), (4, 1))
 
 
 @functools.cache
-def drive(displaced_m: float = 0.0, rotated_deg: float = 0.0) -> SimulatedSession:
-    """Drive 4 m; the landmark at 4,4 may be displaced or rotated."""
+def drive(
+    displaced_m: float = 0.0, rotated_deg: float = 0.0, errors: Errors | None = None
+) -> SimulatedSession:
+    """Drive over twelve landmarks; the landmark at 4,4 may be displaced or rotated."""
     unknown = np.full(7, np.nan)
     built = AsBuiltLandmark(displaced_m, 0.0, math.radians(rotated_deg), unknown[:4], unknown)
     is_faulty = displaced_m or rotated_deg
     floor = replace(FLOOR, built={(4, 4): built} if is_faulty else {})
     limits = RobotLimits(speed_mps=0.2)
-    options = SimulationOptions("path", cells=CORNERS, rate_hz=50.0, limits=limits, seed=4)
+    options = SimulationOptions(
+        "path", cells=CORNERS, rate_hz=50.0, limits=limits, errors=errors or Errors(), seed=4
+    )
     return simulate(floor, options)
 
 
@@ -111,6 +121,21 @@ def test_random_walk_is_estimated(walk_deg: float) -> None:
 
 
 @pytest.mark.slow
+def test_tolerance_of_installed_landmarks_is_estimated() -> None:
+    """Landmarks at 0.2 mm and at 4 mm from their positions; 1.5 mm are assumed at first."""
+    sigma, squares = {}, {}
+    for tolerance_m in (0.2e-3, 4e-3):
+        turn = tolerance_m * math.radians(0.5) / 1e-3
+        one = drive(errors=Errors(landmark_place_m=tolerance_m, landmark_turn_rad=turn))
+        robot = solved(one, odometry_of(one, 3))
+        assert codes(robot) == []
+        sigma[tolerance_m] = robot.trajectories[0].sigma[:, :2].mean()
+        squares[tolerance_m] = errors_of(one, robot)[1][:, :2].mean()
+    assert sigma[4e-3] > 3 * sigma[0.2e-3]
+    assert max(squares.values()) < 3
+
+
+@pytest.mark.slow
 def test_known_noise_is_used() -> None:
     one = drive()
     odometry = odometry_of(one, 5)
@@ -124,7 +149,10 @@ def test_known_noise_is_used() -> None:
 @pytest.mark.slow
 def test_lag_is_estimated_and_removed() -> None:
     one = drive()
-    robot = solved(one, odometry_of(one, 6, lag_s=0.06))
+    odometry = odometry_of(one, 6, lag_s=0.06)
+    late = identify_recording(one.samples[0], odometry, FLOOR, SolveOptions())
+    assert lag_of_visits(late) == pytest.approx(0.06, abs=0.01)
+    robot = solved(one, odometry)
     assert codes(robot) == ["odometry_lag"]
     assert "later than the fields" in robot.warnings[0].message
     error, squares = errors_of(one, robot)
@@ -181,15 +209,20 @@ def test_odometry_with_an_invalid_pose_without_lag() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "slip",
-    [(0.02, 0.0, 0.0), (0.0, 0.06, math.radians(-5)), (0.0, 0.0, math.radians(10))],
+    ("slip", "fraction"),
+    [
+        ((0.02, 0.0, 0.0), 0.43),
+        ((0.02, 0.0, 0.0), 0.52),
+        ((0.0, 0.06, math.radians(-5)), 0.52),
+        ((0.0, 0.0, math.radians(10)), 0.43),
+    ],
 )
-@pytest.mark.parametrize("fraction", [0.43, 0.52])
 def test_slip_is_named_and_released(slip: tuple[float, float, float], fraction: float) -> None:
     one = drive()
     odometry = slipped(odometry_of(one, 7), fraction, np.array(slip))
     robot = solved(one, odometry)
     assert set(codes(robot)) == {"wheel_slip"}
+    assert lag_of_visits(robot.identified) == 0
     error, squares = errors_of(one, robot)
     slip_ns = odometry.time_ns[round(fraction * len(odometry))]
     is_far = np.abs(robot.trajectories[0].time_ns - slip_ns) > 4_000_000_000
