@@ -22,6 +22,7 @@ from locatk.core.landmarks.localization.cell_filter import (
 )
 from locatk.core.landmarks.localization.consistency import (
     NO_MAP_WARNING,
+    contradicts_odometry,
     describe_visit,
     find_displaced_landmarks,
     is_map_contradicted,
@@ -322,9 +323,12 @@ def localize_robot(
     trajectory = smoothed.trajectory(identified.odometry)
     if trajectory is None:
         return replace(robot, facts=replace(facts, localised=False, provisional=False))
-    used = set(map(id, on_map))
-    unused = [visit for visit in visits if id(visit) not in used]
-    trajectory, contradictions = without_contradicted_ends(trajectory, on_map, unused)
+    on_map_ids, used_ids = ({id(one) for one in some} for some in (on_map, smoothed.visits))
+    unused = [visit for visit in visits if id(visit) not in on_map_ids]
+    slipped = [visit for visit in on_map if id(visit) not in used_ids]
+    trajectory, contradictions = without_contradicted_ends(
+        trajectory, smoothed.visits, [*filter(contradicts_odometry, unused), *slipped]
+    )
     displaced = find_displaced_landmarks(unused, trajectory, floor)
     probability = pose_probability(
         trajectory.time_ns,

@@ -234,7 +234,9 @@ def find_displaced_landmarks(
 
 
 def without_contradicted_ends(
-    trajectory: Trajectory, used: Sequence[IdentifiedVisit], unused: Sequence[IdentifiedVisit]
+    trajectory: Trajectory,
+    used: Sequence[IdentifiedVisit],
+    contradicting: Sequence[IdentifiedVisit],
 ) -> tuple[Trajectory, list[SolverWarning]]:
     """Return a trajectory without dead reckoning to visits that contradict it, and warnings.
 
@@ -245,12 +247,13 @@ def without_contradicted_ends(
     Parameters
     ----------
     trajectory : Trajectory
-    used, unused : sequence of IdentifiedVisit
-        Visits from which the trajectory was estimated, and the others.
+    used, contradicting : sequence of IdentifiedVisit
+        Visits from which the trajectory was estimated, and those that contradict the odometry or
+        during which a wheel slipped.
     """
     first_ns = used[0].segment.time_ns[0]
     last_ns = used[-1].segment.time_ns[-1]
-    times_ns = [one.segment.time_ns for one in unused if _is_contradiction(one)]
+    times_ns = [one.segment.time_ns for one in contradicting]
     is_kept = np.ones(len(trajectory), bool)
     removed = []
     if any(time_ns[0] < first_ns for time_ns in times_ns):
@@ -267,8 +270,8 @@ def without_contradicted_ends(
     return trajectory.select(is_kept), warnings
 
 
-def _is_contradiction(visit: IdentifiedVisit) -> bool:
-    """Return whether a visit that is not used contradicts the odometry from others to it."""
+def contradicts_odometry(visit: IdentifiedVisit) -> bool:
+    """Return whether a visit that is not on the map contradicts the odometry from others to it."""
     if visit.hypotheses.refused:
         return visit.hypotheses.refused == "not_explained"
     # Others are outside of the map.

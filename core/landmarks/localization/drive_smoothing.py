@@ -59,6 +59,8 @@ class SmoothedPart:
     Attributes
     ----------
     smoothed : RobustSmoothing
+    visits : list of IdentifiedVisit
+        Visits from which poses were estimated, those next to this part included.
     cells : frozenset of (row, column)
         Cells of the visits of this part.
     first_ns, stop_ns : int
@@ -66,6 +68,7 @@ class SmoothedPart:
     """
 
     smoothed: RobustSmoothing
+    visits: list[IdentifiedVisit]
     cells: frozenset[Cell]
     first_ns: int
     stop_ns: int
@@ -127,6 +130,11 @@ class SmoothedDrive:
     drift: OdometryDrift
 
     @property
+    def visits(self) -> list[IdentifiedVisit]:
+        """Visits from which poses were estimated, in order of time."""
+        return list({id(visit): visit for part in self.parts for visit in part.visits}.values())
+
+    @property
     def residual_sigma(self) -> float:
         """Rms residual of all fields, in standard deviations."""
         return math.sqrt(float(np.mean([part.residual_sigma**2 for part in self.parts])))
@@ -185,8 +193,7 @@ def smooth_drive(
     in parts, each with the visits next to it: visits farther away are of no use to each other,
     because the landmarks between them are known.
 
-    A visit during which a wheel slipped is not used, unless it is the first or the last one: its
-    path is not known.
+    A visit during which a wheel slipped is not used: its path is not known.
 
     Parameters
     ----------
@@ -208,9 +215,9 @@ def smooth_drive(
     parts = []
     for (start, stop), (first_ns, stop_ns) in ranges:
         near = visits[max(0, start - NEIGHBOURING_VISITS) : stop + NEIGHBOURING_VISITS]
-        smoothed = _smooth_part(near, odometry, floor, priors, estimate_walk=estimate_walk)
+        smoothed, used = _smooth_part(near, odometry, floor, priors, estimate_walk=estimate_walk)
         cells = frozenset(visit.cell for visit in visits[start:stop])
-        parts.append(SmoothedPart(smoothed, cells, first_ns, stop_ns))
+        parts.append(SmoothedPart(smoothed, used, cells, first_ns, stop_ns))
     return SmoothedDrive(parts, priors.drift)
 
 
@@ -221,8 +228,11 @@ def _smooth_part(
     priors: ModelPriors,
     *,
     estimate_walk: bool,
-) -> RobustSmoothing:
-    """Smooth successive visits, without those during which a wheel slipped."""
+) -> tuple[RobustSmoothing, list[IdentifiedVisit]]:
+    """Smooth successive visits, without those during which a wheel slipped, if two are left.
+
+    Returns the visits that were used as well.
+    """
     landmarks = landmark_priors(visits, floor, priors)
     of_model = replace(priors, model_error_t=SMOOTHED_MODEL_ERROR_T)
     while True:
@@ -233,10 +243,10 @@ def _smooth_part(
             of_model,
             estimate_walk=estimate_walk,
         )
-        unusable = smoothed.slipped_visits & set(range(1, len(visits) - 1))
-        if not unusable:
-            return smoothed
-        visits = [visit for n, visit in enumerate(visits) if n not in unusable]
+        usable = [visit for n, visit in enumerate(visits) if n not in smoothed.slipped_visits]
+        if len(usable) in (len(visits), 0, 1):
+            return smoothed, list(visits)
+        visits = usable
 
 
 def significant_lag(error: float, variance: float, drift: OdometryDrift) -> float:

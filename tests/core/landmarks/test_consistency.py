@@ -130,7 +130,8 @@ def test_dead_reckoning_ends_where_landmarks_contradict_it(
     time_ns = np.arange(21, dtype=np.int64) * 10**9
     path = Trajectory.from_positions("robot", "map", time_ns, np.zeros((21, 3)))
     used = [used_visit(5), used_visit(10)]
-    kept, warnings = consistency.without_contradicted_ends(path, used, unused)
+    contradicting = [one for one in unused if consistency.contradicts_odometry(one)]
+    kept, warnings = consistency.without_contradicted_ends(path, used, contradicting)
     assert (kept.time_ns[[0, -1]] == np.array([first_s, last_s]) * 10**9).all()
     assert len(warnings) == (first_s > 0) + (last_s < 20)
     assert all(each.code == "odometry_contradicted" for each in warnings)

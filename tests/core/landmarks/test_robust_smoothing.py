@@ -236,7 +236,7 @@ def test_slip_is_named_and_released(slip: tuple[float, float, float], fraction: 
 def test_covariance_contains_both_explanations() -> None:
     """A slip after the first landmark: that landmark may as well be displaced."""
     one = drive()
-    robot = solved(one, slipped(odometry_of(one, 7), 0.05, np.array([0.025, 0.0, 0.0])))
+    robot = solved(one, slipped(odometry_of(one, 7), 0.08, np.array([0.025, 0.0, 0.0])))
     (warning,) = robot.warnings
     assert "displaced, or a wheel slipped" in warning.message
     (path,) = robot.trajectories
@@ -244,6 +244,15 @@ def test_covariance_contains_both_explanations() -> None:
     assert squares[0].max() < 9
     assert path.sigma[0, 0] > 0.015
     assert path.sigma[-1, 0] < 0.002
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fraction", [0.05, 0.95])
+def test_a_slip_in_the_first_or_last_visit_ends_the_poses(fraction: float) -> None:
+    one = drive()
+    robot = solved(one, slipped(odometry_of(one, 7), fraction, np.array([0.025, 0.0, 0.0])))
+    assert "odometry_contradicted" in codes(robot)
+    assert np.hypot(*errors_of(one, robot)[0][:, :2].T).max() < 4e-3
 
 
 @pytest.mark.slow
