@@ -93,5 +93,6 @@ def test_searches_reach_the_stated_usage(requirement: tuple[str, str, int], limi
     floors = (DesignOptions(*size, window, alphabet, detect=detect, seed=7) for size in sizes)
     options = next(o for o in floors if word_usage(o) <= limit)
     if word_usage(options) > 0:
-        assert prove_map(design_map(options), steps=False).holds
-        assert np.unique(design_map(options).codes).size > 1
+        floor = design_map(options)
+        assert prove_map(floor, steps=False).holds
+        assert np.unique(floor.codes).size > 1
