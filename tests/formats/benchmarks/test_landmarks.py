@@ -76,6 +76,7 @@ def quick(
     """Use few cases: the code is tested, not the accuracy."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(landmarks_faults, "FAULTY_SESSIONS", 1)
+        patch.setattr(landmarks_faults, "SAMPLE_RATE_HZ", 20.0)
         first = dict(list(landmarks_faults.FAULTS.items())[:1])
         patch.setattr(landmarks_faults, "FAULTS", first)
         patch.setattr(landmarks, "SINGLE_PASSES", 6)
