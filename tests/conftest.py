@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 # long. Before anything imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Nothing of what is made until the tests begin is garbage: thousands of searches of it are a third
+# Little of what is made until the tests begin is garbage: thousands of searches for it are a third
 # of the time that each process takes to collect the tests.
 gc.disable()
 
