@@ -192,7 +192,7 @@ def test_wrong_order_of_sensors_is_named() -> None:
 @pytest.mark.slow
 def test_mirrored_sensors_give_no_wrong_pose() -> None:
     """A straight pass does not distinguish left from right, or a mirrored landmark."""
-    solution = solved(drive(cells=((2, 2), (2, 6))), field=lambda f: f[:, [0, 3, 2, 1]])
+    solution = solved(drive(cells=((2, 2), (2, 9))), field=lambda f: f[:, [0, 3, 2, 1]])
     assert not solution.trajectories
     assert solution.warnings
 
