@@ -10,6 +10,7 @@ Examples
 
 from __future__ import annotations
 
+import difflib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,10 +69,14 @@ def page() -> str:
 def main() -> int:
     text = page()
     if "--check" in sys.argv[1:]:
-        if not PAGE.exists() or PAGE.read_text(encoding="utf-8") != text:
-            print(f"{PAGE} is out of date; run: python .ci/commands.py", file=sys.stderr)
-            return 1
-        return 0
+        present = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
+        if present == text:
+            return 0
+        print(f"{PAGE} is out of date; run: python .ci/commands.py", file=sys.stderr)
+        lines = present.splitlines(), text.splitlines()
+        for line in difflib.unified_diff(*lines, "page", "help", n=0, lineterm=""):
+            print(line, file=sys.stderr)
+        return 1
     PAGE.write_text(text, encoding="utf-8")
     return 0
 

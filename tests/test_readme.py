@@ -25,6 +25,9 @@ PAGES = [
     ),
 ]
 
+CONTEXT = click.Context(app, **app.context_settings)
+"""Of ``locatk``. A command keeps its help option, with the names of the first context it has."""
+
 
 @pytest.mark.parametrize("heading", ["Run it", "Test it"])
 def test_one_line_does_all(root: Path, heading: str) -> None:
@@ -50,7 +53,7 @@ def command_of(words: list[str]) -> tuple[click.Command, list[str]]:
     """The command that ``locatk words...`` calls, and what is left of the words."""
     command: click.Command = app
     while isinstance(command, click.Group) and words and not words[0].startswith("-"):
-        child = command.get_command(click.Context(command), words[0])
+        child = command.get_command(CONTEXT, words[0])
         assert child is not None, words
         command, words = child, words[1:]
     return command, words
@@ -67,7 +70,7 @@ def test_command_lines_are_valid_usage(
         for line in re.findall(r"^(?:\$ )?locatk (.*)$", block, re.M):
             words = shlex.split(re.split(r" (?:[|>&]|2>)", line)[0], comments=True)
             command, words = command_of(words)
-            command.make_context("example", words)
+            command.make_context("example", words, parent=CONTEXT)
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -75,7 +78,7 @@ def test_mentioned_commands_and_options_are_there(root: Path, page: str) -> None
     text = (root / page).read_text(encoding="utf-8")
     for line in re.findall(r"(?<=`)locatk ([^`]+)(?=`)", text):
         command, words = command_of(line.split())
-        context = click.Context(command, help_option_names=["-h", "--help"])
+        context = click.Context(command, parent=CONTEXT)
         known = {name for option in command.get_params(context) for name in option.opts}
         known |= {name for option in command.get_params(context) for name in option.secondary_opts}
         assert {word for word in words if word.startswith("-")} <= known, line

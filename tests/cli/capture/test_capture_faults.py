@@ -373,7 +373,7 @@ def test_a_disk_that_fills(line: Any, process: Any, small_disk: Path, raw_bytes:
     given = ("--device", "raw", "-o", path, "--reserve", "2MB", "--json")
     capture = process("capture", port.path, *given)
     capture.until("Recording")
-    with sending(port, 1.2e6) as sent:
+    with sending(port, 2.4e6) as sent:
         assert capture.end() == 3
     assert "the disk will be full in" in capture.stderr
     assert "Incomplete: the disk is full up to --reserve" in capture.stderr

@@ -380,6 +380,7 @@ def test_a_floor_without_a_window(locatk, tmp_path: Path) -> None:
     assert locatk("map", "check", path).exit_code == 0
 
 
+@pytest.mark.slow
 def test_the_published_maps_hold(locatk, data: Path, tmp_path: Path) -> None:
     """Hexadecimal codes, the first line the row at y = 0; id6 holds pattern indices."""
     from locatk.core.landmarks.landmark import PATTERNS, code_of

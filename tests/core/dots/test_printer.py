@@ -77,6 +77,14 @@ def scan(
     return picture(ink, to_picture, (int(width), int(height)))
 
 
+@pytest.fixture(scope="module")
+def flat(coarse: Ink) -> NDArray[np.uint8]:
+    """A scan at the true size; tests that spoil it take a copy."""
+    image = scan(coarse, 300)
+    image.flags.writeable = False
+    return image
+
+
 def by_name(report: PrinterReport) -> dict[str, FieldScore]:
     return {field.name: field for field in report.fields}
 
@@ -136,10 +144,12 @@ def test_lost_dots_cost_their_field_also_in_a_photo(coarse: Ink) -> None:
 
 
 @pytest.mark.slow
-def test_dots_that_grow_are_measured_and_smaller_ones_recommended(coarse: Ink) -> None:
+def test_dots_that_grow_are_measured_and_smaller_ones_recommended(
+    coarse: Ink, flat: NDArray[np.uint8]
+) -> None:
     grown = cv2.dilate(coarse, np.ones((2, 2), np.uint8))
     plain, fat = (
-        calibrate(scan(ink, 300), (SCAN_DPI, SCAN_DPI), pitch_mm=0.508) for ink in (coarse, grown)
+        calibrate(image, (SCAN_DPI, SCAN_DPI), pitch_mm=0.508) for image in (flat, scan(grown, 300))
     )
     assert plain.recommended is not None
     assert fat.recommended is not None
@@ -152,8 +162,8 @@ def test_dots_that_grow_are_measured_and_smaller_ones_recommended(coarse: Ink) -
 
 
 @pytest.mark.slow
-def test_a_field_is_identified_by_its_code(coarse: Ink) -> None:
-    image = scan(coarse, 300)
+def test_a_field_is_identified_by_its_code(flat: NDArray[np.uint8]) -> None:
+    image = flat.copy()
     sheet = printer_sheet("A4", 300)
     with_faults = next(field for field in sheet.fields if field.name == "B4")
     # The picture of the page starts 40 px before it: see scan().
@@ -177,32 +187,31 @@ def test_a_too_coarse_picture_gives_no_result_for_the_printer(coarse: Ink) -> No
 
 
 @pytest.mark.slow
-def test_a_wrong_resolution_is_noticed(coarse: Ink) -> None:
-    image = scan(coarse, 300)
-    doubt = calibrate(image, (1.1 * SCAN_DPI, 1.1 * SCAN_DPI)).doubt
+def test_a_wrong_resolution_is_noticed(flat: NDArray[np.uint8]) -> None:
+    doubt = calibrate(flat, (1.1 * SCAN_DPI, 1.1 * SCAN_DPI)).doubt
     assert doubt is not None
     assert "times its size" in doubt
     # Squeezed towards its lower edge, as a photo is.
-    height, width = image.shape
+    height, width = flat.shape
     here = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     there = here + np.array([[0, 0], [0, 0], [-60, 0], [60, 0]], np.float32)
-    tilted = cv2.warpPerspective(image, cv2.getPerspectiveTransform(here, there), (width, height))
+    tilted = cv2.warpPerspective(flat, cv2.getPerspectiveTransform(here, there), (width, height))
     doubt = calibrate(tilted, (SCAN_DPI, SCAN_DPI)).doubt
     assert doubt is not None
     assert "no scan" in doubt
 
 
 @pytest.mark.slow
-def test_pictures_without_a_readable_sheet_are_refused(coarse: Ink) -> None:
+def test_pictures_without_a_readable_sheet_are_refused(flat: NDArray[np.uint8]) -> None:
     noise = np.random.default_rng(3).integers(0, 256, (900, 700), np.uint8)
     for image in (noise, np.full((900, 700), 255, np.uint8)):
         with pytest.raises(DegenerateError, match="markers"):
             calibrate(image)
-    bare = scan(coarse, 300)
+    bare = flat.copy()
     bare[480:-480, 480:] = 240  # only the markers are left
     with pytest.raises(DegenerateError, match="none of the 11 fields"):
         calibrate(bare)
-    small = cv2.resize(scan(coarse, 300), None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(flat, None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
     with pytest.raises(InputError, match="two test sheets"):
         calibrate(np.hstack([small, small]))
     with pytest.raises(DegenerateError, match="fields"):

@@ -234,6 +234,7 @@ def test_pose_at_known_landmark_at_rest() -> None:
     assert 0.5 < np.mean(squares) < 5
 
 
+@pytest.mark.slow
 def test_covariance_of_robot_pose() -> None:
     """By differences of the pose by each parameter."""
     one = nominal()[0]

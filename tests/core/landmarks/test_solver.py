@@ -193,17 +193,9 @@ def test_wrong_order_of_sensors_is_named() -> None:
 @pytest.mark.slow
 def test_mirrored_sensors_give_no_wrong_pose() -> None:
     """A straight pass does not distinguish left from right, or a mirrored landmark."""
-    message = ""
-    try:
-        solution = solved(
-            drive(cells=((2, 2), (2, 5), (4, 5), (4, 3))), field=lambda f: f[:, [0, 3, 2, 1]]
-        )
-    except InputError as error:
-        message = str(error)
-    else:
-        assert not solution.trajectories
-        assert solution.warnings
-    assert not message or "order" in message
+    solution = solved(drive(cells=((2, 2), (2, 9))), field=lambda f: f[:, [0, 3, 2, 1]])
+    assert not solution.trajectories
+    assert solution.warnings
 
 
 @pytest.mark.slow
@@ -398,37 +390,36 @@ def test_invalid_poses_of_odometry_do_not_stop_the_solver(value: float) -> None:
     assert np.isfinite(solution.trajectories[0].position).all()
 
 
+@functools.cache
+def short() -> SimulatedSession:
+    """Return a session for the checks of the wiring, which fit each visit many times."""
+    return drive(cells=((2, 2), (2, 4), (3, 4)))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [0.25, 0.5, 0.7, 2.0])
+@pytest.mark.parametrize("scale", [0.25, 2.0])
 def test_a_common_scale_of_the_readings_is_corrected_and_named(scale: float) -> None:
-    solution = solved(session(), field=lambda field: scale * field)
+    solution = solved(short(), field=lambda field: scale * field)
     (warning,) = (each for each in solution.warnings if each.code == "sensor_scale")
     estimate = float(warning.message.split("fields are ")[1].split()[0])
     # Bars and sensors of the drive deviate by some percent themselves.
     assert estimate == pytest.approx(scale, rel=0.05)
-    assert [each.cell for each in solution.detections] == CELLS
-    assert farthest(session(), solution) < 5e-3
+    assert [each.cell for each in solution.detections] == CELLS[:4]
+    assert farthest(short(), solution) < 5e-3
 
 
 @pytest.mark.slow
 def test_a_nominal_drive_has_no_doubt_about_its_sensors() -> None:
-    assert not {"sensor_scale", "sensor_gain"} & set(warning_codes(solved(session())))
+    assert not {"sensor_scale", "sensor_gain"} & set(warning_codes(solution_on_map()))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 3)])
-def test_two_exchanged_sensors_are_named(pair: tuple[int, int]) -> None:
-    order = [0, 1, 2, 3]
-    order[pair[0]], order[pair[1]] = pair[1], pair[0]
-    names = [("front", "left", "rear", "right")[k] for k in order]
-    with pytest.raises(InputError, match=f"front, left, rear, right are {', '.join(names)}$"):
-        solved(session(), field=lambda field: field[:, order])
+def test_two_exchanged_sensors_are_named() -> None:
+    with pytest.raises(InputError, match=r"front, left, rear, right are front, right, rear, left$"):
+        solved(short(), field=lambda field: field[:, [0, 3, 2, 1]])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensor", range(4))
-def test_a_sensor_of_the_opposite_sign_is_named(sensor: int) -> None:
-    name = ("front", "left", "rear", "right")[sensor]
-    sign = np.where(np.arange(4) == sensor, -1.0, 1.0)
-    with pytest.raises(InputError, match=f"the {name} sensor of robot has the opposite sign"):
-        solved(session(), field=lambda field: sign * field)
+def test_a_sensor_of_the_opposite_sign_is_named() -> None:
+    with pytest.raises(InputError, match="the right sensor of robot has the opposite sign"):
+        solved(short(), field=lambda field: field * [1, 1, 1, -1])

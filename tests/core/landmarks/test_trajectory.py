@@ -73,6 +73,7 @@ def test_a_pose_is_as_probable_as_the_less_probable_neighbouring_visit() -> None
     np.testing.assert_allclose(found, 0.5 * np.array(expected))
 
 
+@pytest.mark.slow
 def test_probabilities_of_poses_agree_with_the_facts() -> None:
     one, trajectory = session(1)
     facts = solver.solve(one.samples, FLOOR, odometry=one.odometry).facts.robots["robot"]

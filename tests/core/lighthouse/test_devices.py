@@ -146,7 +146,7 @@ def marked(world: Any, count: int, seconds: float) -> tuple[Any, Any, tuple[Mark
 
 @pytest.mark.slow
 def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> None:
-    lamps, sweeps, markers = marked(world, 4, 6.0)
+    lamps, sweeps, markers = marked(world, 4, 4.5)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     scene = solution.artifact
     assert (scene.scale, scene.frame) == ("markers", "floor")

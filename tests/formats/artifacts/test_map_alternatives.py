@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import re
 from dataclasses import replace
 from typing import Any
@@ -89,9 +90,15 @@ def test_holes_count() -> None:
 def test_searches_reach_the_stated_usage(requirement: tuple[str, str, int], limit: float) -> None:
     """Sides of 2:3, and a seed with which the limits were not measured."""
     alphabet, window, detect = requirement
-    sizes = ((side, max(2, round(1.5 * side))) for side in range(200, 1, -1))
-    floors = (DesignOptions(*size, window, alphabet, detect=detect, seed=7) for size in sizes)
-    options = next(o for o in floors if word_usage(o) <= limit)
+
+    def floor_of(side: int) -> DesignOptions:
+        columns = max(2, round(1.5 * side))
+        return DesignOptions(side, columns, window, alphabet, detect=detect, seed=7)
+
+    sides = range(2, 201)
+    above = bisect.bisect_right(sides, limit, key=lambda side: word_usage(floor_of(side)))
+    options = floor_of(sides[above - 1])
     if word_usage(options) > 0:
-        assert prove_map(design_map(options), steps=False).holds
-        assert np.unique(design_map(options).codes).size > 1
+        floor = design_map(options)
+        assert prove_map(floor, steps=False).holds
+        assert np.unique(floor.codes).size > 1

@@ -87,12 +87,12 @@ def test_typed_results_are_restored(tmp_path: Path, solution: Solution) -> None:
 
 def test_probabilities_of_poses_are_restored(tmp_path: Path) -> None:
     """Devices of unknown probability have none, as have files of earlier versions."""
-    time_ns = 1_700_000_000_000_000_000 + 10**7 * np.arange(3000)
-    unknown = Trajectory.from_positions("b", "map", time_ns, np.zeros((3000, 3)))
-    probability = np.linspace(0.95, 1.0, 3000)
-    probability[1500] = np.nan
+    time_ns = 1_700_000_000_000_000_000 + 10**7 * np.arange(300)
+    unknown = Trajectory.from_positions("b", "map", time_ns, np.zeros((300, 3)))
+    probability = np.linspace(0.95, 1.0, 300)
+    probability[150] = np.nan
     known = replace(unknown, device="a", probability=probability)
-    certain = replace(unknown, device="c", probability=np.full(3000, 0.9995))
+    certain = replace(unknown, device="c", probability=np.full(300, 0.9995))
     path = tmp_path / "solved.mcap"
     solution = Solution("landmarks", "field", (known, unknown, certain))
     write_solution(path, solution, source="run.mcap")
