@@ -172,6 +172,36 @@ def decode_tag(
     return replace(result, symbols=tuple(nearest.tolist()))
 
 
+def coincidence_probability(tags: Tags, cells: Sequence[Cell], decoded: DecodedTag) -> float:
+    """Return the probability that arbitrary orientations in some cells decode to a used id.
+
+    It is that of at most as many corrected steps as those of the decoded tag; for the redundant
+    code, which corrects a single magnet, an upper limit. The ids in use are those of the tags on
+    the site if the decoded one is among them, else those of the family. If neither is given, it is
+    one, except for the redundant code.
+    """
+    half_turn, count = tags.orientations // 2, len(cells)
+    if decoded.tag_id in tags.site:
+        ids: tuple[int, ...] | None = tuple(tags.site)
+    else:
+        ids = tags.ids
+    if ids is not None:
+        columns = [row * tags.order + column for column, row in cells]
+        misplaced = (_members(tags, ids)[:, columns] == families.EMPTY_CELL).sum(axis=1)
+    elif tags.codec == "redundant":
+        misplaced = np.zeros(codec.capacity(tags), int)
+    else:
+        return 1.0
+    probability = 0.0
+    for empty, members in zip(*np.unique(misplaced, return_counts=True), strict=True):
+        steps = decoded.corrected - empty * half_turn
+        if steps >= 0:
+            counts = families.lee_weight_counts(count - empty, tags.orientations)
+            words = tags.orientations ** int(count - empty)
+            probability += members * sum(counts[: steps + 1]) / words
+    return min(float(probability), 1.0)
+
+
 def _misplaced(tags: Tags, cells: Sequence[Cell]) -> str:
     """Return the reason if magnets are on impossible cells, else ""."""
     if not all(0 <= index < tags.order for cell in cells for index in cell):

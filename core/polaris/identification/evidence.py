@@ -1,8 +1,9 @@
 """Evidence against a match: magnets of the pass, or properties of the tag, of another design.
 
 A part of a larger tag fits the grid of a smaller one perfectly. It differs in the magnets that are
-left over: they have the same moment and continue the lattice. Magnets of a neighbouring tag, whose
-position is arbitrary, are on the lattice only by chance, and iron has another moment.
+left over: they have the same moment and continue the lattice. Magnets of a neighbouring tag do so
+if the tags are parallel at a distance of whole spacings (laid edge to edge). Then the id decides: a
+part of another tag has one of a few ids only by coincidence. Iron has another moment.
 """
 
 from __future__ import annotations
@@ -28,8 +29,13 @@ arbitrary position is with a probability of 3 % (pi 0.1^2), so that one magnet o
 outweighs another one that is not, if 5 % of the magnets of a tag are measured that badly."""
 
 MIN_MAGNETS_IN_GRID = 2
-"""Number of strong magnets off the lattice but within the grid from which they are no iron. Tags do
-not overlap."""
+"""Number of strong magnets within the grid, on its lattice or not, that cannot be iron. They are
+those of another design, because tags do not overlap."""
+
+MAX_COINCIDENCE_PROBABILITY = 1e-3
+"""Probability up to which the id of a tag is no coincidence, so that magnets that continue its
+lattice are those of its neighbours. One pass in five over the larger tags of
+``formats/benchmarks/polaris/designs.py`` fits the smaller grid at all."""
 
 MAX_DESIGN_MOMENT_RATIO, MAX_DESIGN_HEIGHT_RATIO = 3.0, 2.0
 """Ratios of moment and height to those of the design up to which they are of that design. Grades of
@@ -41,10 +47,14 @@ MAX_SPACING_ERROR, MAX_SPACING_SIGMAS = 0.02, 4.0
 standard deviations."""
 
 
-def has_unexplained_magnets(
-    magnets: DetectedMagnets, tags: Tags, match: TagMatch, unexplained: Iterable[int]
+def is_part_of_larger_tag(
+    magnets: DetectedMagnets,
+    tags: Tags,
+    match: TagMatch,
+    unexplained: Iterable[int],
+    coincidence_probability: float = 1.0,
 ) -> bool:
-    """Return whether magnets that no tag explains belong to the matched one.
+    """Return whether magnets that no tag explains belong to the tag of a match.
 
     Parameters
     ----------
@@ -54,20 +64,25 @@ def has_unexplained_magnets(
     match : TagMatch
     unexplained : iterable of int
         Indices of magnets.
+    coincidence_probability : float
+        Probability that a part of another tag has an id as good as that of the match.
     """
     indices = _comparable(magnets, match, unexplained)
     grid = _grid_coordinates(magnets, tags, match)[indices]
-    beyond = np.maximum(-grid, grid - (tags.order - 1)).max(axis=1, initial=0.0)
-    is_inside = beyond < 0.5
-    # A finer lattice of another design has the points of this one.
-    refined = np.where(is_inside[:, None], 2 * grid, grid)
-    error = np.hypot(*(refined - np.rint(refined)).T) / np.where(is_inside, 2, 1)
-    is_on_lattice = error < LATTICE_TOLERANCE_SPACINGS
-    is_near = beyond < tags.order
-    count = np.count_nonzero(is_on_lattice & is_near)
+    excess_spacings = np.maximum(-grid, grid - (tags.order - 1)).max(axis=1, initial=0.0)
+    is_inside = excess_spacings < 0.5
     if np.count_nonzero(is_inside) >= MIN_MAGNETS_IN_GRID:
         return True
-    return bool(count > 0 and count >= np.count_nonzero(~is_on_lattice & is_near))
+    # A finer lattice of another design has the points of this one.
+    refined = np.where(is_inside[:, None], 2 * grid, grid)
+    error_spacings = np.hypot(*(refined - np.rint(refined)).T) / np.where(is_inside, 2, 1)
+    is_on_lattice = error_spacings < LATTICE_TOLERANCE_SPACINGS
+    is_evidence = is_inside
+    if coincidence_probability > MAX_COINCIDENCE_PROBABILITY:
+        is_evidence = excess_spacings < tags.order
+    count = np.count_nonzero(is_on_lattice & is_evidence)
+    # Each magnet on the lattice outweighs one off it (LATTICE_TOLERANCE_SPACINGS).
+    return bool(count > 0 and count >= np.count_nonzero(~is_on_lattice & is_evidence))
 
 
 def is_in_grid(

@@ -18,7 +18,7 @@ from locatk.core.polaris.identification.tags import (
     may_be_one_tag,
 )
 from locatk.core.polaris.magnets import DetectedMagnets
-from locatk.core.polaris.tag import AsBuiltTag, TagLayout, Tags
+from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, TagLayout, Tags
 
 Array = NDArray[np.float64]
 
@@ -350,6 +350,56 @@ def test_a_magnet_beside_a_tag_is_reported(x: float, y: float, is_read: bool, wo
         assert other.moment_am2 == pytest.approx(1.8e-3)
     else:
         assert result.refused in ("other_design", "too_many_magnets")
+
+
+EDGE_TO_EDGE_M = 0.12
+"""Distance of two tags whose lattices continue each other."""
+
+
+@pytest.mark.parametrize(
+    ("ids", "site", "is_read"),
+    [
+        (None, (), False),
+        (range(20), (), True),
+        # A family that one orientation in a hundred belongs to by coincidence.
+        (range(0, 327_680, 100), (), False),
+        (None, (SYMBOLS, OTHER), True),
+        (None, (OTHER,), False),
+    ],
+)
+def test_a_neighbour_edge_to_edge(ids: Any, site: Any, is_read: bool, world: Any) -> None:
+    """Two of its magnets, at the end of the bar, continue the lattice."""
+    tag = world.Tag(CELLS, SYMBOLS)
+    neighbour = world.Tag(CELLS, OTHER, y=EDGE_TO_EDGE_M)
+    at_the_bar = np.flatnonzero(neighbour.places[:, 1] < 0.09)
+    magnets = detected_magnets(tag, neighbour, keep=[*range(5), *(5 + at_the_bar)])
+    family = None if ids is None else (id_of(), *(k for k in ids if k != id_of()))
+    poses = {id_of(symbols): PlanarPose(0.0, 0.0, 0.0) for symbols in site}
+    tags = replace(TAGS, ids=family, site=poses)
+    result = one(identify_tags(magnets, recording(), [tags]))
+    assert result.tag_id == (id_of() if is_read else None)
+    assert result.refused == ("" if is_read else "other_design")
+
+
+@pytest.mark.parametrize("is_on_site", [True, False])
+def test_five_magnets_of_two_tags_that_fit_the_grid(is_on_site: bool, world: Any) -> None:
+    """The column of a neighbour that the bar covers forms another tag with two of the tag."""
+    cells = ((0, 0), (1, 0), (0, 2), (1, 2), (2, 2))
+    tag_id = codec.id_of(TAGS, TagLayout(cells, SYMBOLS))
+    neighbour_cells = ((1, 0), (0, 1), (2, 2), (0, 0), (0, 2))
+    neighbour = world.Tag(neighbour_cells, OTHER, y=EDGE_TO_EDGE_M)
+    at_the_bar = np.flatnonzero(neighbour.places[:, 1] < 0.09)
+    keep = [*range(5), *(5 + at_the_bar)]
+    magnets = detected_magnets(world.Tag(cells, SYMBOLS), neighbour, keep=keep)
+    site = {tag_id: PlanarPose(0.0, 0.0, 0.0)} if is_on_site else {}
+    result = identify_tags(magnets, recording(), [replace(TAGS, site=site)])
+    assert [each.tag_id for each in result] == [tag_id if is_on_site else None]
+
+
+def test_magnets_within_the_grid_outweigh_the_id(world: Any) -> None:
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS), world.Tag(((2, 0),), (2,)))
+    tags = replace(TAGS, site={id_of(): PlanarPose(0.0, 0.0, 0.0)})
+    assert one(identify_tags(magnets, recording(), [tags])).tag_id is None
 
 
 def test_several_strong_magnets_within_the_grid(world: Any) -> None:
