@@ -8,7 +8,7 @@ rescaled, and a given path that does not explain the samples is replaced by the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,8 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.detection.magnets import WHITE_RESIDUAL_SIGMAS
 from locatk.core.polaris.identification.matching import SCALE_SIGMA, refit_match
 from locatk.core.polaris.identification.tags import TagObservation
+from locatk.core.polaris.magnets import DetectedMagnets
+from locatk.core.polaris.preprocessing import PassRange
 from locatk.core.polaris.tag import as_built_magnets
 from locatk.core.solution import SolverWarning
 
@@ -67,13 +69,21 @@ def contradicted_scale(observation: TagObservation) -> float | None:
     return refitted.scale if deviation > MIN_CONTRADICTION_SIGMAS else None
 
 
+def known_path(given_m: Array | None, part: PassRange) -> Array | None:
+    """Return the given path; None if it is unknown at a sample of a pass."""
+    if given_m is None or not np.isfinite(given_m[part.first : part.stop]).all():
+        return None
+    return given_m
+
+
 def compare_path(given_m: Array, observation: TagObservation) -> PathContradiction | None:
     """Compare the path of a pass with the given one; None if they agree or nothing is known.
 
     Parameters
     ----------
     given_m : (n,) ndarray
-        Distance that the array had moved at each sample of the recording, as given.
+        Distance that the array had moved at each sample of the recording, as given; nan if
+        unknown.
     observation : TagObservation
         Its path, if it is not the given one, was estimated from the samples or rescaled.
     """
@@ -81,7 +91,7 @@ def compare_path(given_m: Array, observation: TagObservation) -> PathContradicti
     if observation.tag_id is None and not magnets.residual_sigma < WHITE_RESIDUAL_SIGMAS:
         return None
     given = given_m[magnets.first : magnets.stop]
-    is_known = magnets.path_sigma_m < MAX_COMPARED_SIGMA_M
+    is_known = (magnets.path_sigma_m < MAX_COMPARED_SIGMA_M) & np.isfinite(given)
     if is_known.sum() < MIN_COMPARED_SAMPLES:
         return None
     given, path = given[is_known], magnets.path_m[is_known]
@@ -123,3 +133,18 @@ def contradiction_warning(
         if speed_mps is not None:
             message += f" ({(low + high) / 2 * speed_mps:.4f} m/s)"
     return SolverWarning("path_contradicted", message)
+
+
+def coverage_warning(given_m: Array, passes: Sequence[DetectedMagnets]) -> SolverWarning | None:
+    """Return a warning for the passes whose samples odometry does not cover; None without any.
+
+    ``given_m`` (n,) is nan at such samples of the recording.
+    """
+    uncovered = [np.isnan(given_m[each.first : each.stop]).any() for each in passes]
+    if not any(uncovered):
+        return None
+    message = (
+        f"the odometry does not cover the samples of {sum(uncovered)} of {len(passes)} passes: "
+        "their paths are estimated from the field. Check that both clocks are the same"
+    )
+    return SolverWarning("samples_without_odometry", message)

@@ -101,15 +101,16 @@ def localize(
 def distance_along(odometry: Trajectory, time_ns: NDArray[np.int64]) -> Array:
     """Return the distance (n,) that a robot had driven forward by its odometry [m].
 
-    Driving backward counts as negative, by the heading of the odometry. Before its first and after
-    its last pose the robot is assumed to rest.
+    Driving backward counts as negative, by the heading of the odometry. The distance is nan before
+    its first and after its last pose.
     """
     step = np.diff(odometry.position[:, :2], axis=0)
     heading = heading_from_quaternion(odometry.quaternion)
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
     forward_step = (step * (forward[1:] + forward[:-1]) / 2).sum(axis=1)
     distance = np.concatenate([[0.0], np.cumsum(forward_step)])
-    return np.asarray(np.interp(time_ns, odometry.time_ns, distance))
+    interpolated = np.interp(time_ns, odometry.time_ns, distance, left=np.nan, right=np.nan)
+    return np.asarray(interpolated)
 
 
 @dataclass(frozen=True)

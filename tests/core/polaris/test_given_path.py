@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,3 +132,79 @@ def test_one_warning_for_all_passes(scales: Any, speed_mps: Any, expected: Any) 
     passes = [None if scale is None else PathContradiction(scale) for scale in scales]
     warning = contradiction_warning(passes, speed_mps)
     assert (None if warning is None else warning.message) == expected
+
+
+def with_nan_pose(odometry: Trajectory) -> Trajectory:
+    position = odometry.position.copy()
+    position[200] = np.nan
+    return replace(odometry, position=position)
+
+
+def with_nan_heading(odometry: Trajectory) -> Trajectory:
+    quaternion = odometry.quaternion.copy()
+    quaternion[150:153] = np.nan
+    return replace(odometry, quaternion=quaternion)
+
+
+def with_equal_stamps(odometry: Trajectory) -> Trajectory:
+    return replace(odometry, time_ns=np.repeat(odometry.time_ns[::2], 2))
+
+
+def with_stamps_out_of_order(odometry: Trajectory) -> Trajectory:
+    order = np.arange(len(odometry))
+    order[180:184] = order[180:184][::-1]
+    return odometry.select(order)
+
+
+def without_poses(odometry: Trajectory) -> Trajectory:
+    return odometry.select(np.zeros(len(odometry), bool))
+
+
+def of_another_clock(odometry: Trajectory) -> Trajectory:
+    return odometry.shifted(10**12)
+
+
+def from_the_middle_on(odometry: Trajectory) -> Trajectory:
+    return odometry.select(np.arange(len(odometry)) > 200)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("damage", "expected"),
+    [
+        (with_nan_pose, ["odometry_invalid"]),
+        (with_nan_heading, ["odometry_invalid"]),
+        (with_equal_stamps, ["odometry_invalid"]),
+        (with_stamps_out_of_order, []),
+        (without_poses, ["odometry_invalid"]),
+        (of_another_clock, ["samples_without_odometry"]),
+        (from_the_middle_on, ["samples_without_odometry"]),
+    ],
+)
+def test_damaged_odometry(
+    damage: Callable[[Trajectory], Trajectory], expected: list[str], world: Any
+) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, heading=0.7)
+    course = world.line(length=0.3)
+    samples = world.record([tag], course, seed=531)
+    solution = solve([samples], TAGS, odometry=[damage(driven_odometry(course, 1.0))])
+    assert angle_errors_deg(world, solution, tag).max() < 0.35
+    assert [warning.code for warning in solution.warnings] == expected
+    (poses,) = solution.trajectories
+    assert np.isfinite(poses.position).all()
+    assert np.all(np.diff(poses.time_ns) > 0)
+
+
+@pytest.mark.slow
+def test_only_passes_without_odometry_are_named(world: Any) -> None:
+    places_m = (0.0, 0.6)
+    tags = [world.Tag(CELLS, SYMBOLS, x=x, heading=0.7) for x in places_m]
+    course = world.line(length=0.9, past=(0.3, 0.0))
+    samples = world.record(tags, course, seed=532)
+    driven = driven_odometry(course, 0.9)
+    t = np.arange(len(driven)) / len(driven)
+    solution = solve([samples], TAGS, odometry=[driven.select(t < 0.5)])
+    assert [detection.tag_id for detection in solution.detections] == [TAG_ID, TAG_ID]
+    messages = {warning.code: warning.message for warning in solution.warnings}
+    assert "1 of 2 passes" in messages["samples_without_odometry"]
+    assert "1 of 2 passes" in messages["path_contradicted"]
