@@ -47,14 +47,18 @@ class PathContradiction:
     Attributes
     ----------
     scale : float
-        Length of the path that fits, relative to the given one.
+        Length of the path that fits, relative to the given one: negative if the array moved in the
+        other direction, infinite if the given path rests.
     """
 
     scale: float
 
 
-def contradicted_scale(observation: TagObservation) -> float | None:
-    """Return the scale that the spacing of a tag gives to a known path; None if 1 is plausible."""
+def scale_to_apply(observation: TagObservation) -> float | None:
+    """Return the factor by which a given path must be multiplied; None if 1 is plausible.
+
+    It is that of the spacing of the tag.
+    """
     match, tag_id, tags = observation.match, observation.tag_id, observation.tags
     if match is None or tag_id is None or tags is None:
         return None
@@ -124,14 +128,20 @@ def contradiction_warning(
     scales = [c.scale for c in each if c is not None]
     if not scales:
         return None
-    low, high = min(scales), max(scales)
     source = "odometry" if speed_mps is None else f"speed of {speed_mps:.4g} m/s"
     message = f"the given {source} contradicts the samples of {len(scales)} of {len(each)} passes"
-    if np.isfinite(high):
-        factor = f"{low:.3f}" if high - low < 5e-4 else f"{low:.3f} to {high:.3f}"
+    finite = [scale for scale in scales if np.isfinite(scale)]
+    if finite:
+        lengths = sorted({abs(min(finite, key=abs)), abs(max(finite, key=abs))})
+        factor = " to ".join(dict.fromkeys(f"{length:.3g}" for length in lengths))
         message += f"; {factor} times the given lengths fit"
         if speed_mps is not None:
-            message += f" ({(low + high) / 2 * speed_mps:.4f} m/s)"
+            message += f" ({np.mean(lengths) * speed_mps:.3g} m/s)"
+    if any(scale < 0 for scale in scales):
+        backward = sum(scale < 0 for scale in scales)
+        message += f"; the array moved in the opposite direction in {backward} of them"
+    if len(finite) < len(scales):
+        message += f"; it rests in {len(scales) - len(finite)} of them"
     return SolverWarning("path_contradicted", message)
 
 

@@ -15,10 +15,10 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.magnets import detect_magnets
 from locatk.core.polaris.given_path import (
     compare_path,
-    contradicted_scale,
     contradiction_warning,
     coverage_warning,
     known_path,
+    scale_to_apply,
 )
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
@@ -251,7 +251,7 @@ def _identify_passes(
         result = identify_with(part, path_m)
         if path_m is None or result is None or result.magnets.is_path_estimated:
             return result
-        scale = contradicted_scale(result.observations[0])
+        scale = scale_to_apply(result.observations[0])
         if scale is None:
             return result
         rescaled = identify_with(part, scale * path_m)
