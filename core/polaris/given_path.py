@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from locatk.core.polaris import codec
 from locatk.core.polaris.detection.magnets import WHITE_RESIDUAL_SIGMAS
 from locatk.core.polaris.identification.matching import SCALE_SIGMA, refit_match
-from locatk.core.polaris.identification.tags import TagObservation
+from locatk.core.polaris.identification.tags import IdentifiedPass, TagObservation
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import PassRange
 from locatk.core.polaris.tag import as_built_magnets
@@ -158,3 +158,33 @@ def coverage_warning(given_m: Array, passes: Sequence[DetectedMagnets]) -> Solve
         "their paths are estimated from the field. Check that both clocks are the same"
     )
     return SolverWarning("samples_without_odometry", message)
+
+
+def backward_warning(
+    passes: Iterable[IdentifiedPass], given_m: Array | None
+) -> SolverWarning | None:
+    """Return a warning if an array moved backward over tags, which no given path says.
+
+    Inverted X axes give the field of the mirror image of a tag, in backward motion.
+
+    Parameters
+    ----------
+    passes : iterable of IdentifiedPass
+    given_m : (n,) ndarray or None
+        Distance that the array had moved at each sample of the recording, as given; nan if unknown.
+    """
+    ids = []
+    for each in passes:
+        rows = slice(each.magnets.first, each.magnets.stop)
+        is_given = given_m is not None and given_m[rows][-1] < given_m[rows][0]
+        if each.magnets.path_m[-1] < each.magnets.path_m[0] and not is_given:
+            ids += [tag.tag_id for tag in each.observations if tag.tag_id is not None]
+    if not ids:
+        return None
+    names = ", ".join(map(str, dict.fromkeys(ids)))
+    message = (
+        f"the array moved backward over {'tag' if len(ids) == 1 else 'tags'} {names}: right if the "
+        "robot drove backward or the bar is mounted backward; otherwise the X axis of the sensors "
+        "is inverted, and the ids are those of mirrored tags"
+    )
+    return SolverWarning("moved_backward", message)

@@ -14,6 +14,7 @@ from locatk.core.errors import InputError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.magnets import detect_magnets
 from locatk.core.polaris.given_path import (
+    backward_warning,
     compare_path,
     contradiction_warning,
     coverage_warning,
@@ -185,6 +186,7 @@ def _solve_array(
                 contradiction_warning(contradictions, options.speed_mps),
                 coverage_warning(path_m, [each.magnets for each in passes]),
             ]
+        path_warnings.append(backward_warning(passes, path_m))
     observations = [each for part in passes for each in part.observations]
     rejected.update(each.refused for each in observations if each.refused)
     identified = [each for each in observations if each.tag_id is not None]

@@ -225,3 +225,43 @@ def test_only_passes_without_odometry_are_named(world: Any) -> None:
     messages = {warning.code: warning.message for warning in solution.warnings}
     assert "1 of 2 passes" in messages["samples_without_odometry"]
     assert "1 of 2 passes" in messages["path_contradicted"]
+
+
+def backward_course(world: Any) -> Any:
+    return world.driven(world.line(length=0.3), [0, 3], [1, 0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(541, 544))
+def test_backward_motion_is_reported(seed: int, world: Any) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, heading=1.7 * seed)
+    samples = world.record([tag], backward_course(world), seed=seed)
+    solution = solve([samples], TAGS)
+    assert [detection.tag_id for detection in solution.detections] == [TAG_ID]
+    (warning,) = solution.warnings
+    assert warning.code == "moved_backward"
+    assert f"tag {TAG_ID}:" in warning.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(541, 544))
+def test_inverted_axes_are_reported_as_backward_motion(seed: int, world: Any) -> None:
+    """The id is that of the mirrored tag, which the field alone cannot tell."""
+    tag = world.Tag(CELLS, SYMBOLS, heading=1.7 * seed)
+    samples = world.record([tag], world.line(length=0.3), seed=seed)
+    inverted = replace(samples, field_t=samples.field_t * [-1, 1, 1])
+    solution = solve([inverted], TAGS)
+    (detection,) = solution.detections
+    assert detection.tag_id != TAG_ID
+    if detection.tag_id is not None:
+        assert [warning.code for warning in solution.warnings] == ["moved_backward"]
+
+
+@pytest.mark.slow
+def test_odometry_that_moves_backward_is_believed(world: Any) -> None:
+    tag = world.Tag(CELLS, SYMBOLS, heading=0.7)
+    course = backward_course(world)
+    samples = world.record([tag], course, seed=545)
+    solution = solve([samples], TAGS, odometry=[driven_odometry(course, 1.0)])
+    assert [detection.tag_id for detection in solution.detections] == [TAG_ID]
+    assert solution.warnings == ()
