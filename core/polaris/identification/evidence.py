@@ -12,10 +12,13 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from locatk.core.polaris import codec
+from locatk.core.polaris.identification.decoding import DecodedTag, coincidence_probability
 from locatk.core.polaris.identification.matching import TagMatch, measure_spacing
 from locatk.core.polaris.magnets import DetectedMagnets
-from locatk.core.polaris.tag import Tags
+from locatk.core.polaris.tag import PlanarPose, Tags, cell_positions
 
 Array = NDArray[np.float64]
 
@@ -69,7 +72,7 @@ def is_part_of_larger_tag(
     """
     indices = _comparable(magnets, match, unexplained)
     grid = _grid_coordinates(magnets, tags, match)[indices]
-    excess_spacings = np.maximum(-grid, grid - (tags.order - 1)).max(axis=1, initial=0.0)
+    excess_spacings = _excess(tags, grid)
     is_inside = excess_spacings < 0.5
     if np.count_nonzero(is_inside) >= MIN_MAGNETS_IN_GRID:
         return True
@@ -90,7 +93,7 @@ def is_in_grid(
 ) -> NDArray[np.bool_]:
     """Return which of some magnets are within the grid of a match."""
     grid = _grid_coordinates(magnets, tags, match)[list(indices)]
-    return np.asarray(((grid > -0.5) & (grid < tags.order - 0.5)).all(axis=1))
+    return _excess(tags, grid) < 0.5
 
 
 def contradicts_design(magnets: DetectedMagnets, tags: Tags, match: TagMatch) -> bool:
@@ -107,6 +110,45 @@ def contradicts_design(magnets: DetectedMagnets, tags: Tags, match: TagMatch) ->
     return abs(spacing - 1) > max(MAX_SPACING_ERROR, MAX_SPACING_SIGMAS * sigma)
 
 
+def conflicting_tags(tags: Tags) -> list[tuple[int, int]]:
+    """Return the pairs of tags on a site of which one makes the other unreadable.
+
+    Magnets of one are within the grid of the other, or they continue its lattice and its id may be
+    a coincidence.
+    """
+    ids = tuple(tags.site)
+    if len(ids) < 2:
+        return []
+    centre_m = np.array([[tags.site[tag_id].x_m, tags.site[tag_id].y_m] for tag_id in ids])
+    # Half a diagonal of both grids, and the distance up to which magnets count.
+    range_m = (2 * np.sqrt(2) + 1) * tags.order * tags.spacing_m
+    pairs = cKDTree(centre_m).query_pairs(range_m)
+    return sorted(
+        (ids[i], ids[k])
+        for i, k in pairs
+        if _makes_unreadable(tags, ids[i], ids[k]) or _makes_unreadable(tags, ids[k], ids[i])
+    )
+
+
+def _makes_unreadable(tags: Tags, neighbour_id: int, tag_id: int) -> bool:
+    """Return whether magnets of a neighbour on the site make a tag unreadable."""
+    pose, neighbour = tags.site[tag_id], tags.site[neighbour_id]
+    cells = codec.layout_of(tags, neighbour_id).cells
+    cos, sin = np.cos(neighbour.heading_rad), np.sin(neighbour.heading_rad)
+    position_m = cell_positions(tags, cells) @ np.array([[cos, sin], [-sin, cos]])
+    grid = _to_grid(tags, pose, position_m + [neighbour.x_m, neighbour.y_m])
+    excess_spacings = _excess(tags, grid)
+    if np.any(excess_spacings < 0.5):
+        return True
+    is_on_lattice = np.hypot(*(grid - np.rint(grid)).T) < LATTICE_TOLERANCE_SPACINGS
+    if not np.any(is_on_lattice & (excess_spacings < tags.order)):
+        return False
+    layout = codec.layout_of(tags, tag_id)
+    decoded = DecodedTag(tag_id, 0.0, 0, 0, layout.symbols)
+    probability = coincidence_probability(tags, layout.cells, decoded)
+    return probability > MAX_COINCIDENCE_PROBABILITY
+
+
 def _comparable(
     magnets: DetectedMagnets, match: TagMatch, indices: Iterable[int]
 ) -> NDArray[np.intp]:
@@ -120,9 +162,20 @@ def _comparable(
 def _grid_coordinates(magnets: DetectedMagnets, tags: Tags, match: TagMatch) -> Array:
     """Return the positions (M, 2) of all magnets in cells of a match, column and row from v1."""
     scale = match.scale if magnets.is_path_estimated else 1.0
-    offset = magnets.position_m * [scale, 1.0] - [match.x_m, match.y_m]
-    cos, sin = np.cos(match.heading_rad), np.sin(match.heading_rad)
+    pose = PlanarPose(match.x_m, match.y_m, match.heading_rad)
+    return _to_grid(tags, pose, magnets.position_m * [scale, 1.0])
+
+
+def _to_grid(tags: Tags, pose: PlanarPose, position_m: Array) -> Array:
+    """Return positions (M, 2) in cells of a tag, column and row from v1."""
+    offset = position_m - [pose.x_m, pose.y_m]
+    cos, sin = np.cos(pose.heading_rad), np.sin(pose.heading_rad)
     x = cos * offset[:, 0] + sin * offset[:, 1]
     y = cos * offset[:, 1] - sin * offset[:, 0]
     middle = (tags.order - 1) / 2
     return np.column_stack([middle - y / tags.spacing_m, x / tags.spacing_m + middle])
+
+
+def _excess(tags: Tags, grid: Array) -> Array:
+    """Return the distance (M,) beyond the outermost cells, in spacings; not positive within."""
+    return np.asarray(np.maximum(-grid, grid - (tags.order - 1)).max(axis=1, initial=-np.inf))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples, SensorArray
+from locatk.core.polaris.identification.evidence import conflicting_tags
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
     TagObservation,
@@ -513,3 +514,29 @@ def test_a_white_residual_needs_no_margin(world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, turned=np.radians([0, 0, 17.0, 0, 0]))
     result = one(identify_tags(detected_magnets(tag, residual_sigma=1.59), recording(), [TAGS]))
     assert result.tag_id == id_of()
+
+
+MINI = Tags(order=2, magnets=3)
+
+
+@pytest.mark.parametrize(
+    ("tags", "x_m", "y_m", "heading", "is_conflict"),
+    [
+        (TAGS, 0.0, 0.12, 0.0, False),  # Two ids of many: read.
+        (TAGS, 0.0, 0.06, 0.0, True),  # Overlapping.
+        (TAGS, 0.08, 0.08, np.pi / 4, True),
+        (MINI, 0.0, 0.08, 0.0, True),
+        (MINI, 0.12, 0.04, np.pi / 2, True),
+        (MINI, 0.0, 0.09, 0.0, False),
+        (MINI, 0.0, 0.13, 0.6, False),
+        (MINI, 0.0, 0.40, 0.0, False),
+    ],
+)
+def test_tags_on_a_site_that_make_each_other_unreadable(
+    tags: Tags, x_m: float, y_m: float, heading: float, is_conflict: bool
+) -> None:
+    at = PlanarPose(0.3, -1.2, 0.7)
+    cos, sin = np.cos(at.heading_rad), np.sin(at.heading_rad)
+    x, y = at.x_m + cos * x_m - sin * y_m, at.y_m + sin * x_m + cos * y_m
+    site = {5: at, 77: PlanarPose(x, y, at.heading_rad + heading)}
+    assert conflicting_tags(replace(tags, site=site)) == ([(5, 77)] if is_conflict else [])
