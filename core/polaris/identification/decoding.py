@@ -9,6 +9,7 @@ as in :mod:`~locatk.core.polaris.codec.families`; a magnet that was not observed
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -188,18 +189,19 @@ def coincidence_probability(tags: Tags, cells: Sequence[Cell], decoded: DecodedT
     if ids is not None:
         columns = [row * tags.order + column for column, row in cells]
         misplaced = (_members(tags, ids)[:, columns] == families.EMPTY_CELL).sum(axis=1)
+        ids_by_misplaced = Counter(misplaced.tolist())
     elif tags.codec == "redundant":
-        misplaced = np.zeros(codec.capacity(tags), int)
+        ids_by_misplaced = Counter({0: codec.capacity(tags)})
     else:
         return 1.0
     probability = 0.0
-    for empty, members in zip(*np.unique(misplaced, return_counts=True), strict=True):
+    for empty, members in ids_by_misplaced.items():
         steps = decoded.corrected - empty * half_turn
         if steps >= 0:
             counts = families.lee_weight_counts(count - empty, tags.orientations)
-            words = tags.orientations ** int(count - empty)
+            words = tags.orientations ** (count - empty)
             probability += members * sum(counts[: steps + 1]) / words
-    return min(float(probability), 1.0)
+    return min(probability, 1.0)
 
 
 def _misplaced(tags: Tags, cells: Sequence[Cell]) -> str:

@@ -37,8 +37,9 @@ those of another design, because tags do not overlap."""
 
 MAX_COINCIDENCE_PROBABILITY = 1e-3
 """Probability up to which the id of a tag is no coincidence, so that magnets that continue its
-lattice are those of its neighbours. One pass in five over the larger tags of
-``formats/benchmarks/polaris/designs.py`` fits the smaller grid at all."""
+lattice are those of its neighbours. A part of a larger tag fits the smaller grid in one pass in
+five (11 of 57, of tags of 4 x 4 and 5 x 5 read as 3 x 3), so that one such pass in 5,000 is read at
+most."""
 
 MAX_DESIGN_MOMENT_RATIO, MAX_DESIGN_HEIGHT_RATIO = 3.0, 2.0
 """Ratios of moment and height to those of the design up to which they are of that design. Grades of
