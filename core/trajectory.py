@@ -99,21 +99,21 @@ class Trajectory:
         """True if a pose is less probable than :data:`PROVISIONAL_PROBABILITY`."""
         return self.min_probability < PROVISIONAL_PROBABILITY
 
-    def select(self, mask: NDArray[np.bool_]) -> Trajectory:
-        """Return only the poses whose ``mask`` (n,) is true."""
-        time_ns, covariance = self.time_ns[mask], self.covariance
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Trajectory:
+        """Return only the poses that a mask (n,) or indices choose, in the order of the indices."""
+        time_ns, covariance = self.time_ns[chosen], self.covariance
         if len(covariance) and covariance.strides[0] == 0:
             # One unknown covariance is broadcast to all poses and stays one matrix in memory.
             covariance = np.broadcast_to(covariance[0], (len(time_ns), 6, 6))
         else:
-            covariance = covariance[mask]
+            covariance = covariance[chosen]
         return replace(
             self,
             time_ns=time_ns,
-            position=self.position[mask],
-            quaternion=self.quaternion[mask],
+            position=self.position[chosen],
+            quaternion=self.quaternion[chosen],
             covariance=covariance,
-            probability=None if self.probability is None else self.probability[mask],
+            probability=None if self.probability is None else self.probability[chosen],
         )
 
     def shifted(self, shift_ns: int) -> Trajectory:

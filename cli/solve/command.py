@@ -197,6 +197,10 @@ def command(
 
     if scheduler is not None and jobs != 1:
         raise click.UsageError("--jobs is for this machine: leave it out with --scheduler.")
+    if artifact is not None and tag:
+        raise click.UsageError(
+            "--artifact and --tag both replace the tags of the session: give each file with --tag."
+        )
     if save_scene is not None and resume:
         raise click.UsageError("--save-scene cannot be combined with --resume.")
     found = pipeline.find_sessions(sessions, pipeline.default_output if output is None else None)

@@ -19,7 +19,7 @@ from locatk.cli.tag.options import reading_conditions, reading_options
 @options.as_json
 @options.verbosity
 def command(tag: Path, as_json: bool, **conditions: Any) -> None:
-    """Evaluate the design of the tags in TAG (tag.toml), and the distances between their ids.
+    """Evaluate the tags in TAG (tag.toml): their design, ids, and positions on a site.
 
     The output is that of `locatk tag design`. The exit status is 3 if a requirement is not met.
 
@@ -31,6 +31,7 @@ def command(tag: Path, as_json: bool, **conditions: Any) -> None:
     """
     from locatk.core.polaris.codec import families
     from locatk.core.polaris.design.planning import evaluate_design
+    from locatk.core.polaris.identification.evidence import conflicting_tags
     from locatk.formats.artifacts.tags import read_tags
 
     tags = read_tags(tag)
@@ -51,4 +52,12 @@ def command(tag: Path, as_json: bool, **conditions: Any) -> None:
                 f"ids {pair[0]} and {pair[1]} have a distance of {distance}, not "
                 f"{tags.min_distance}; drop one of them"
             )
+    conflicts = conflicting_tags(tags)
+    if conflicts:
+        first, second = conflicts[0]
+        warnings.append(
+            f"{len(conflicts)} pairs of tags on the site, as {first} and {second}, overlap or "
+            "continue each other's grid, so that they are refused (other_design); change their "
+            "distance by a quarter of the spacing, or use a family"
+        )
     report_evaluation(report, warnings, {"input": tag, "smallest_distance": distance}, as_json)

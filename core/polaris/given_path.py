@@ -8,7 +8,7 @@ rescaled, and a given path that does not explain the samples is replaced by the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from locatk.core.polaris import codec
 from locatk.core.polaris.detection.magnets import WHITE_RESIDUAL_SIGMAS
 from locatk.core.polaris.identification.matching import SCALE_SIGMA, refit_match
-from locatk.core.polaris.identification.tags import TagObservation
+from locatk.core.polaris.identification.tags import IdentifiedPass, TagObservation
+from locatk.core.polaris.magnets import DetectedMagnets
+from locatk.core.polaris.preprocessing import PassRange
 from locatk.core.polaris.tag import as_built_magnets
 from locatk.core.solution import SolverWarning
 
@@ -45,14 +47,18 @@ class PathContradiction:
     Attributes
     ----------
     scale : float
-        Length of the path that fits, relative to the given one.
+        Length of the path that fits, relative to the given one: negative if the array moved in the
+        other direction, infinite if the given path rests.
     """
 
     scale: float
 
 
-def contradicted_scale(observation: TagObservation) -> float | None:
-    """Return the scale that the spacing of a tag gives to a known path; None if 1 is plausible."""
+def scale_to_apply(observation: TagObservation) -> float | None:
+    """Return the factor by which a given path must be multiplied; None if 1 is plausible.
+
+    It is that of the spacing of the tag.
+    """
     match, tag_id, tags = observation.match, observation.tag_id, observation.tags
     if match is None or tag_id is None or tags is None:
         return None
@@ -67,13 +73,21 @@ def contradicted_scale(observation: TagObservation) -> float | None:
     return refitted.scale if deviation > MIN_CONTRADICTION_SIGMAS else None
 
 
+def known_path(given_m: Array | None, part: PassRange) -> Array | None:
+    """Return the given path; None if it is unknown at a sample of a pass."""
+    if given_m is None or not np.isfinite(given_m[part.first : part.stop]).all():
+        return None
+    return given_m
+
+
 def compare_path(given_m: Array, observation: TagObservation) -> PathContradiction | None:
     """Compare the path of a pass with the given one; None if they agree or nothing is known.
 
     Parameters
     ----------
     given_m : (n,) ndarray
-        Distance that the array had moved at each sample of the recording, as given.
+        Distance that the array had moved at each sample of the recording, as given; nan if
+        unknown.
     observation : TagObservation
         Its path, if it is not the given one, was estimated from the samples or rescaled.
     """
@@ -81,7 +95,7 @@ def compare_path(given_m: Array, observation: TagObservation) -> PathContradicti
     if observation.tag_id is None and not magnets.residual_sigma < WHITE_RESIDUAL_SIGMAS:
         return None
     given = given_m[magnets.first : magnets.stop]
-    is_known = magnets.path_sigma_m < MAX_COMPARED_SIGMA_M
+    is_known = (magnets.path_sigma_m < MAX_COMPARED_SIGMA_M) & np.isfinite(given)
     if is_known.sum() < MIN_COMPARED_SAMPLES:
         return None
     given, path = given[is_known], magnets.path_m[is_known]
@@ -114,12 +128,63 @@ def contradiction_warning(
     scales = [c.scale for c in each if c is not None]
     if not scales:
         return None
-    low, high = min(scales), max(scales)
     source = "odometry" if speed_mps is None else f"speed of {speed_mps:.4g} m/s"
     message = f"the given {source} contradicts the samples of {len(scales)} of {len(each)} passes"
-    if np.isfinite(high):
-        factor = f"{low:.3f}" if high - low < 5e-4 else f"{low:.3f} to {high:.3f}"
+    finite = [scale for scale in scales if np.isfinite(scale)]
+    if finite:
+        lengths = sorted({abs(min(finite, key=abs)), abs(max(finite, key=abs))})
+        factor = " to ".join(dict.fromkeys(f"{length:.3g}" for length in lengths))
         message += f"; {factor} times the given lengths fit"
         if speed_mps is not None:
-            message += f" ({(low + high) / 2 * speed_mps:.4f} m/s)"
+            message += f" ({np.mean(lengths) * speed_mps:.3g} m/s)"
+    if any(scale < 0 for scale in scales):
+        backward = sum(scale < 0 for scale in scales)
+        message += f"; the array moved in the opposite direction in {backward} of them"
+    if len(finite) < len(scales):
+        message += f"; it rests in {len(scales) - len(finite)} of them"
     return SolverWarning("path_contradicted", message)
+
+
+def coverage_warning(given_m: Array, passes: Sequence[DetectedMagnets]) -> SolverWarning | None:
+    """Return a warning for the passes whose samples odometry does not cover; None without any.
+
+    ``given_m`` (n,) is nan at such samples of the recording.
+    """
+    uncovered = [np.isnan(given_m[each.first : each.stop]).any() for each in passes]
+    if not any(uncovered):
+        return None
+    message = (
+        f"the odometry does not cover the samples of {sum(uncovered)} of {len(passes)} passes: "
+        "their paths are estimated from the field. Check that both clocks are the same"
+    )
+    return SolverWarning("samples_without_odometry", message)
+
+
+def backward_warning(
+    passes: Iterable[IdentifiedPass], given_m: Array | None
+) -> SolverWarning | None:
+    """Return a warning if an array moved backward over tags, which no given path says.
+
+    Inverted X axes give the field of the mirror image of a tag, in backward motion.
+
+    Parameters
+    ----------
+    passes : iterable of IdentifiedPass
+    given_m : (n,) ndarray or None
+        Distance that the array had moved at each sample of the recording, as given; nan if unknown.
+    """
+    ids = []
+    for each in passes:
+        rows = slice(each.magnets.first, each.magnets.stop)
+        is_given = given_m is not None and given_m[rows][-1] < given_m[rows][0]
+        if each.magnets.path_m[-1] < each.magnets.path_m[0] and not is_given:
+            ids += [tag.tag_id for tag in each.observations if tag.tag_id is not None]
+    if not ids:
+        return None
+    names = ", ".join(map(str, dict.fromkeys(ids)))
+    message = (
+        f"the array moved backward over {'tag' if len(ids) == 1 else 'tags'} {names}: right if the "
+        "robot drove backward or the bar is mounted backward; otherwise the X axis of the sensors "
+        "is inverted, and the ids are those of mirrored tags"
+    )
+    return SolverWarning("moved_backward", message)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading, wrap_angle
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.identification.tags import TagObservation
+from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.results import HeadingCorrection
 from locatk.core.polaris.tag import PlanarPose
 from locatk.core.solution import SolverWarning
@@ -29,6 +30,10 @@ HEIGHT_SCALE_SIGMA = 0.025
 """Standard deviation of the scale of a height, besides its noise. The height has the scale of a
 path from the field alone; the true one was 0.985 to 1.043 times as long on the 57 recordings of the
 authors of the paper (docs/polaris.md). Wheels are no better."""
+
+MAX_REST_STEP_RATIO, MIN_JUMP_STEP_RATIO = 0.2, 2.0
+"""Ratios of a step to the usual one up to which the array may have rested, and from which two steps
+in opposite directions are no motion: a robot that turns back has small steps in between."""
 
 MIN_GAP_PERIODS = 5
 """Time between poses, in usual intervals, from which odometry fills the gap."""
@@ -84,7 +89,9 @@ def localize(
         if frame != "site" and is_first:
             site_pose = PlanarPose(0.0, 0.0, 0.0)
         if site_pose is not None:
-            parts.append(_poses_over_tag(samples, observation, site_pose))
+            poses_over_tag = _poses_over_tag(samples, observation, site_pose)
+            if len(poses_over_tag.time_ns):
+                parts.append(poses_over_tag)
         else:
             location = "on the site" if frame == "site" else f"in the frame of {frame}"
             message = f"tag {observation.tag_id} has no position {location}"
@@ -101,15 +108,16 @@ def localize(
 def distance_along(odometry: Trajectory, time_ns: NDArray[np.int64]) -> Array:
     """Return the distance (n,) that a robot had driven forward by its odometry [m].
 
-    Driving backward counts as negative, by the heading of the odometry. Before its first and after
-    its last pose the robot is assumed to rest.
+    Driving backward counts as negative, by the heading of the odometry. The distance is nan before
+    its first and after its last pose.
     """
     step = np.diff(odometry.position[:, :2], axis=0)
     heading = heading_from_quaternion(odometry.quaternion)
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
     forward_step = (step * (forward[1:] + forward[:-1]) / 2).sum(axis=1)
     distance = np.concatenate([[0.0], np.cumsum(forward_step)])
-    return np.asarray(np.interp(time_ns, odometry.time_ns, distance))
+    interpolated = np.interp(time_ns, odometry.time_ns, distance, left=np.nan, right=np.nan)
+    return np.asarray(interpolated)
 
 
 @dataclass(frozen=True)
@@ -132,7 +140,8 @@ def _poses_over_tag(
     along = magnets.position_m[list(match.magnets), 0]
     is_over = magnets.path_m >= along.min() - POSE_MARGIN_M
     is_over &= magnets.path_m <= along.max() + POSE_MARGIN_M
-    is_over &= np.nan_to_num(magnets.path_sigma_m) < MAX_PATH_SIGMA_M
+    path_sigma_m = _path_sigma(magnets, along.min(), along.max())
+    is_over &= path_sigma_m < MAX_PATH_SIGMA_M
     path = magnets.path_m[is_over]
     n = len(path)
     heading = tag_pose.heading_rad - match.heading_rad
@@ -152,7 +161,7 @@ def _poses_over_tag(
     jacobian[:, 2, 2] = -1.0
     inner = np.zeros((n, 4, 4))
     inner[:, :3, :3] = match.covariance
-    inner[:, 3, 3] = np.nan_to_num(magnets.path_sigma_m[is_over]) ** 2
+    inner[:, 3, 3] = path_sigma_m[is_over] ** 2
     covariance = np.full((n, 6, 6), np.nan)
     covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] = (
         jacobian @ inner @ jacobian.transpose(0, 2, 1)
@@ -163,6 +172,37 @@ def _poses_over_tag(
     covariance[:, 2, 2] = magnets.height_sigma_m**2 + scale_sigma_m**2
     time = samples.time_ns[magnets.first : magnets.stop][is_over]
     return _PlanarPoses(time, position, np.full(n, heading), covariance)
+
+
+def _path_sigma(magnets: DetectedMagnets, first_m: float, last_m: float) -> Array:
+    """Return the standard deviation (n,) of a path over magnets from ``first_m`` to ``last_m``.
+
+    It is that of the fit, zero for a path without one, with two exceptions:
+
+    - Farther than its height before the first magnet or after the last one, fields fade, and the
+      path follows its prior. In a pass with rests, that is a rest, but the array may have moved.
+    - If the path jumps there and back within a sample, by far more than the usual step, that sample
+      is at a wrong minimum of the fit or has a wrong time. Its standard deviation is infinite.
+    """
+    path, sigma = magnets.path_m, np.nan_to_num(magnets.path_sigma_m)
+    step = np.diff(path)
+    if not sigma.any() or not step.any():
+        return sigma
+    # Half of the distance was covered by smaller steps.
+    ascending = np.sort(np.abs(step))
+    distance = np.cumsum(ascending)
+    usual_step_m = ascending[np.searchsorted(distance, distance[-1] / 2)]
+    is_moving = np.abs(step) > MAX_REST_STEP_RATIO * usual_step_m
+    starts = np.flatnonzero(np.append(True, is_moving))
+    counts = np.diff(np.append(starts, len(path)))
+    # A uniform motion has this rms distance from its first position.
+    moved_m = np.repeat(np.where(counts > 1, counts, 0) * usual_step_m / np.sqrt(3), counts)
+    is_outside = (path < first_m - magnets.height_m) | (path > last_m + magnets.height_m)
+    sigma = np.hypot(sigma, np.where(is_outside, moved_m, 0.0))
+    is_large = np.abs(step) > MIN_JUMP_STEP_RATIO * usual_step_m
+    is_jump = is_large[:-1] & is_large[1:] & (step[:-1] * step[1:] < 0)
+    sigma[1:-1][is_jump] = np.inf
+    return np.asarray(sigma)
 
 
 def _concatenate(device: str, frame: str, parts: Sequence[_PlanarPoses]) -> Trajectory:
@@ -257,6 +297,8 @@ def _heading_corrections(
         if tag_pose == target:
             continue
         poses = _poses_over_tag(samples, observation, tag_pose)
+        if not len(poses.time_ns):
+            continue
         offset = np.array([target.x_m, target.y_m]) - poses.position[-1, :2]
         distance = float(np.hypot(*offset))
         if distance == 0:

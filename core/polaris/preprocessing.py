@@ -15,6 +15,7 @@ from locatk.core.errors import InputError
 from locatk.core.magnetics import dipole_field
 from locatk.core.polaris.array import Samples
 from locatk.core.solution import SolverWarning
+from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -140,6 +141,28 @@ def preprocess(samples: Samples) -> PreprocessedSamples:
         warnings.append(SolverWarning("samples_missing", message).about(samples.device))
     cleaned = replace(samples, field_t=field)
     return PreprocessedSamples(cleaned, estimate_noise(cleaned), tuple(warnings))
+
+
+def valid_odometry(odometry: Trajectory) -> tuple[Trajectory | None, tuple[SolverWarning, ...]]:
+    """Return the valid poses of odometry in order of time, and a warning if there are others.
+
+    Poses are invalid if they are not finite numbers, or have the time stamp of another pose. Less
+    than two valid ones are no odometry.
+    """
+    is_finite = np.isfinite(np.hstack([odometry.position[:, :2], odometry.quaternion])).all(axis=1)
+    finite = odometry.select(np.asarray(is_finite))
+    _, first = np.unique(finite.time_ns, return_index=True)
+    valid = finite.select(first)
+    if len(valid) == len(odometry) >= 2:
+        return valid, ()
+    message = (
+        f"{len(odometry) - len(valid)} of {len(odometry)} poses of the odometry are not finite "
+        "numbers or have the time of another one; left out"
+    )
+    if len(valid) < 2:
+        message = f"the odometry has {len(valid)} valid poses and is not used"
+    warning = SolverWarning("odometry_invalid", message).about(odometry.device)
+    return (valid if len(valid) >= 2 else None), (warning,)
 
 
 def _check(samples: Samples) -> None:
@@ -310,7 +333,7 @@ def is_no_pass(
     noise_t : (N, 3) ndarray
         Standard deviation of one sample [T].
     path_m : (n,) ndarray, optional
-        Distance that the array had moved at each sample of the recording.
+        Distance that the array had moved at each sample of the recording, known in the pass.
     magnet_field_t : float, optional
         Least change of the bar's field by a magnet of the tag (:func:`least_magnet_field`) [T].
     """

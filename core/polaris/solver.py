@@ -14,9 +14,12 @@ from locatk.core.errors import InputError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.magnets import detect_magnets
 from locatk.core.polaris.given_path import (
+    backward_warning,
     compare_path,
-    contradicted_scale,
     contradiction_warning,
+    coverage_warning,
+    known_path,
+    scale_to_apply,
 )
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
@@ -33,6 +36,7 @@ from locatk.core.polaris.preprocessing import (
     is_no_pass,
     least_magnet_field,
     preprocess,
+    valid_odometry,
 )
 from locatk.core.polaris.published import pipeline as published
 from locatk.core.polaris.published.templates import TemplateGrid
@@ -163,10 +167,13 @@ def _solve_array(
     """Preprocess, detect, identify and localize for one array."""
     designs = tuple(named_designs.values())
     driven = next((t for t in odometry if t.device == recording.device), None)
+    odometry_warnings: tuple[SolverWarning, ...] = ()
+    if driven is not None:
+        driven, odometry_warnings = valid_odometry(driven)
     preprocessed = preprocess(recording)
     recording = preprocessed.samples
     rejected: Counter[str] = Counter()
-    contradiction = None
+    path_warnings: list[SolverWarning | None] = []
     if options.method == "paper":
         passes = _identify_published(recording, designs, options)
     else:
@@ -174,9 +181,12 @@ def _solve_array(
         passes, counts = _identify_passes(preprocessed, designs, path_m)
         rejected.update(counts)
         if path_m is not None:
-            contradiction = contradiction_warning(
-                (compare_path(path_m, each.observations[0]) for each in passes), options.speed_mps
-            )
+            contradictions = [compare_path(path_m, each.observations[0]) for each in passes]
+            path_warnings = [
+                contradiction_warning(contradictions, options.speed_mps),
+                coverage_warning(path_m, [each.magnets for each in passes]),
+            ]
+        path_warnings.append(backward_warning(passes, path_m))
     observations = [each for part in passes for each in part.observations]
     rejected.update(each.refused for each in observations if each.refused)
     identified = [each for each in observations if each.tag_id is not None]
@@ -192,10 +202,11 @@ def _solve_array(
         rejected,
         [
             *preprocessed.warnings,
+            *odometry_warnings,
             *localization.warnings,
             *(warning.about(recording.device) for warning in of_passes),
             *_other_magnets(recording.device, observations),
-            *((contradiction.about(recording.device),) if contradiction else ()),
+            *(warning.about(recording.device) for warning in path_warnings if warning),
         ],
     )
 
@@ -215,14 +226,17 @@ def _other_magnets(device: str, observations: Sequence[TagObservation]) -> list[
 def _known_path(
     recording: Samples, speed_mps: float | None, driven: Trajectory | None
 ) -> Array | None:
-    """Return the distance moved at each sample, by speed or odometry; None without either."""
+    """Return the distance moved at each sample, by speed or odometry; None without either.
+
+    It is nan at samples that odometry does not cover.
+    """
     if speed_mps is not None:
         return (recording.time_ns - recording.time_ns[0]) * 1e-9 * speed_mps
     return None if driven is None else distance_along(driven, recording.time_ns)
 
 
 def _identify_passes(
-    preprocessed: PreprocessedSamples, designs: Sequence[Tags], path_m: Array | None
+    preprocessed: PreprocessedSamples, designs: Sequence[Tags], given_m: Array | None
 ) -> tuple[list[IdentifiedPass], Counter[str]]:
     """Detect and identify the tags of all passes, in order of time.
 
@@ -235,10 +249,11 @@ def _identify_passes(
     """
 
     def identify(part: PassRange) -> IdentifiedPass | None:
+        path_m = known_path(given_m, part)
         result = identify_with(part, path_m)
         if path_m is None or result is None or result.magnets.is_path_estimated:
             return result
-        scale = contradicted_scale(result.observations[0])
+        scale = scale_to_apply(result.observations[0])
         if scale is None:
             return result
         rescaled = identify_with(part, scale * path_m)
@@ -264,7 +279,7 @@ def _identify_passes(
         current = identify(part)
         if (current is None or not current.is_identified) and (
             (current is not None and _is_at_rest(current))
-            or is_no_pass(samples, part, noise_t, path_m, magnet_field_t)
+            or is_no_pass(samples, part, noise_t, known_path(given_m, part), magnet_field_t)
         ):
             rejected["no_pass"] += 1
             continue

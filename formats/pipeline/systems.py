@@ -50,7 +50,7 @@ class SolveRequest:
     templates : str, optional
         Polaris, method ``paper``: resolution of the templates, as in ``"36,5,80"``.
     tag : tuple of Path, optional
-        Polaris: designs of the tags on a site, instead of the one in the session.
+        Polaris: designs of the tags on a site, instead of the one in the session or ``artifact``.
     odometry_noise : float, optional
         Landmarks: random walk of the heading by odometry [deg/sqrt(m)].
     odometry_lag : float, optional
@@ -209,9 +209,7 @@ def _prepare_polaris(session: Session, request: SolveRequest) -> Callable[[], So
 
 def _read_designs(session: Session, request: SolveRequest) -> Tags | dict[str, Tags] | None:
     """Read the designs of the tags, by the names of their files if there are several."""
-    paths = request.tag or ()
-    if request.artifact is not None:
-        paths = (request.artifact, *paths)
+    paths = request.tag or ((request.artifact,) if request.artifact is not None else ())
     if len(paths) > 1:
         return tags.read_designs(paths)
     return tags.read_tags(paths[0]) if paths else observations.read_tags(session)

@@ -229,7 +229,8 @@ def _polaris_reasons() -> dict[str, Reason]:
         "magnets.",
         "too_many_magnets": "There are more magnets on the grid than a tag has.",
         "other_design": "The tag is one of another design: further magnets of the same strength "
-        "continue its grid, or its spacing, height or magnets differ from the design.",
+        "continue its grid, or its spacing, height or magnets differ from the design. Without a "
+        "family or positions on the site, a tag edge to edge with another one looks the same.",
         "not_in_family": "The distance to all tags of the family exceeds what may be corrected.",
         "beyond_code": "There are more errors than the redundant code can correct.",
         "tie": "Two ids are equally near, to within "

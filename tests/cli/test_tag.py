@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.codec import families
-from locatk.core.polaris.tag import AsBuiltTag, Tags
+from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, Tags
 from locatk.formats.artifacts.tags import read_tags, write_tags
 
 
@@ -83,6 +84,17 @@ def test_a_family_and_its_bill(locatk, tmp_path: Path) -> None:
     result = locatk("tag", "check", path)
     assert result.exit_code == 0
     assert "Smallest distance in the family" in result.stdout
+
+
+def test_tags_that_overlap_on_a_site_are_reported(locatk, tag: Path) -> None:
+    site = {5: PlanarPose(0.0, 0.0, 0.0), 77: PlanarPose(0.06, 0.0, 0.0)}
+    write_tags(tag, replace(Tags(), site=site), overwrite=True)
+    result = locatk("tag", "check", tag)
+    assert result.exit_code == 3
+    assert "5 and 77" in " ".join(result.stderr.split())
+    far = {**site, 77: PlanarPose(0.12, 0.0, 0.0)}
+    write_tags(tag, replace(Tags(), site=far), overwrite=True)
+    assert locatk("tag", "check", tag).exit_code == 0
 
 
 def test_named_ids(locatk, tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def closest_pair(tags: Tags, ids: tuple[int, ...]) -> tuple[int, tuple[int, ...]
         The codec does not have one of the ids.
     """
     rows = symbol_table(tags, ids)
-    counts = _weight_counts(tags.magnets, tags.orientations)
+    counts = lee_weight_counts(tags.magnets, tags.orientations)
     for radius in range(tags.orientations // 2):
         if IDS_PER_NEAR_TAG * counts[radius] > len(ids):
             break
@@ -334,7 +334,7 @@ def _near_any(
     """Return whether any member is within a radius of each of the tags (n,)."""
     magnets, base = tags.magnets, tags.orientations
     if radius < base // 2:
-        size = sum(_weight_counts(magnets, base)[: radius + 1])
+        size = sum(lee_weight_counts(magnets, base)[: radius + 1])
         if IDS_PER_NEAR_TAG * size < len(member_rows):
             words = [_rotations_of_weight(magnets, base, steps) for steps in range(radius + 1)]
             pairs = _NearTags(tags, member_rows).find(rows, np.vstack(words))
@@ -398,8 +398,8 @@ class _NearTags:
 
 
 @functools.cache
-def _weight_counts(magnets: int, orientations: int) -> tuple[int, ...]:
-    """Return the number of words of each Lee weight."""
+def lee_weight_counts(magnets: int, orientations: int) -> tuple[int, ...]:
+    """Return the number of words of ``magnets`` symbols of each Lee weight, from 0 on."""
     per_magnet = [0] * (orientations // 2 + 1)
     for symbol in range(orientations):
         per_magnet[min(symbol, orientations - symbol)] += 1

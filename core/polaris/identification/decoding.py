@@ -9,6 +9,7 @@ as in :mod:`~locatk.core.polaris.codec.families`; a magnet that was not observed
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -170,6 +171,37 @@ def decode_tag(
         return result
     nearest[is_known] = result.symbols
     return replace(result, symbols=tuple(nearest.tolist()))
+
+
+def coincidence_probability(tags: Tags, cells: Sequence[Cell], decoded: DecodedTag) -> float:
+    """Return the probability that arbitrary orientations in some cells decode to a used id.
+
+    It is that of at most as many corrected steps as those of the decoded tag; for the redundant
+    code, which corrects a single magnet, an upper limit. The ids in use are those of the tags on
+    the site if the decoded one is among them, else those of the family. If neither is given, it is
+    one, except for the redundant code.
+    """
+    half_turn, count = tags.orientations // 2, len(cells)
+    if decoded.tag_id in tags.site:
+        ids: tuple[int, ...] | None = tuple(tags.site)
+    else:
+        ids = tags.ids
+    if ids is not None:
+        columns = [row * tags.order + column for column, row in cells]
+        misplaced = (_members(tags, ids)[:, columns] == families.EMPTY_CELL).sum(axis=1)
+        ids_by_misplaced = Counter(misplaced.tolist())
+    elif tags.codec == "redundant":
+        ids_by_misplaced = Counter({0: codec.capacity(tags)})
+    else:
+        return 1.0
+    probability = 0.0
+    for empty, members in ids_by_misplaced.items():
+        steps = decoded.corrected - empty * half_turn
+        if steps >= 0:
+            counts = families.lee_weight_counts(count - empty, tags.orientations)
+            words = tags.orientations ** (count - empty)
+            probability += members * sum(counts[: steps + 1]) / words
+    return min(probability, 1.0)
 
 
 def _misplaced(tags: Tags, cells: Sequence[Cell]) -> str:

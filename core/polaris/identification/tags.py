@@ -24,11 +24,16 @@ from locatk.core.polaris.detection.magnets import (
     MagnetHypothesis,
     detect_magnets_at,
 )
-from locatk.core.polaris.identification.decoding import DecodedTag, decode_tag
+from locatk.core.polaris.identification.decoding import (
+    DecodedTag,
+    coincidence_probability,
+    decode_tag,
+)
 from locatk.core.polaris.identification.evidence import (
+    MAX_COINCIDENCE_PROBABILITY,
     contradicts_design,
-    has_unexplained_magnets,
     is_in_grid,
+    is_part_of_larger_tag,
 )
 from locatk.core.polaris.identification.matching import (
     MAX_MISFIT_SPACINGS,
@@ -371,7 +376,7 @@ def _name_larger_tag(magnets: DetectedMagnets, observation: TagObservation) -> T
     if match is None or tags is None or len(match.cells) < MIN_TAG_MAGNETS:
         return observation
     unexplained = frozenset(range(len(magnets))) - frozenset(match.magnets)
-    is_larger = has_unexplained_magnets(magnets, tags, match, unexplained)
+    is_larger = is_part_of_larger_tag(magnets, tags, match, unexplained)
     if is_larger and observation.refused in LARGER_TAG_REASONS:
         return replace(observation, refused="other_design")
     return observation
@@ -389,11 +394,12 @@ def _check_tags(
     ids = [(each.tags, each.tag_id) for each in found if each.tag_id is not None]
     checked = []
     for index, observation in enumerate(found):
-        match, tags = observation.match, observation.tags
+        match, tags, decoded = observation.match, observation.tags, observation.decoded
         refused = observation.refused
-        if match is not None and tags is not None and not refused:
+        if match is not None and tags is not None and decoded is not None and not refused:
             of_others = used - frozenset(match.magnets)
-            if has_unexplained_magnets(magnets, tags, match, unexplained) or any(
+            probability = coincidence_probability(tags, match.cells, decoded)
+            if is_part_of_larger_tag(magnets, tags, match, unexplained, probability) or any(
                 is_in_grid(magnets, tags, match, of_others)
             ):
                 refused = "other_design"
@@ -422,6 +428,13 @@ def _best_observation(
         if reason in ("magnets_missing", "vertex_missing") and len(match.cells) < tags.magnets:
             reason = _missing_reason(magnets, samples, tags, match)
         return TagObservation(magnets, match, decoded, reason, tags)
+    # Magnets of two tags may fit the grid as well, with an id that is not in use.
+    certain = [
+        (match, decoded)
+        for match, decoded in with_id
+        if coincidence_probability(tags, match.cells, decoded) < MAX_COINCIDENCE_PROBABILITY
+    ]
+    with_id = certain or with_id
     match, decoded = with_id[0]
     shared = set(match.magnets)
     if len({other.tag_id for rival, other in with_id if shared & set(rival.magnets)}) > 1:

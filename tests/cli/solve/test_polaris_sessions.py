@@ -614,3 +614,6 @@ def test_designs_are_given_once(locatk, tmp_path: Path) -> None:
     assert "the same tags as in a.toml" in result.stderr
     result = locatk("solve", run, "--tag", first, "--tag", first)
     assert "two designs of tags are named a.toml" in result.stderr
+    result = locatk("solve", run, "--artifact", first, "--tag", again)
+    assert result.exit_code == 2
+    assert "--artifact and --tag both replace the tags" in result.stderr

@@ -15,8 +15,13 @@ from hypothesis import strategies as st
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.codec import families, redundant
-from locatk.core.polaris.identification.decoding import MAX_TIE_STEPS, DecodedTag, decode_tag
-from locatk.core.polaris.tag import AsBuiltTag, Cell, Tags
+from locatk.core.polaris.identification.decoding import (
+    MAX_TIE_STEPS,
+    DecodedTag,
+    coincidence_probability,
+    decode_tag,
+)
+from locatk.core.polaris.tag import AsBuiltTag, Cell, PlanarPose, Tags
 
 SMALL = Tags(order=2, magnets=3, orientations=5)
 DEFAULT = Tags()
@@ -488,3 +493,33 @@ def test_every_id_of_every_codec_is_read_as_itself() -> None:
         for tag_id in itertools.islice(range(count), 0, None, max(1, count // 500)):
             assert decode_tag(tags, *magnets(tags, tag_id)).tag_id == tag_id
     assert redundant.MAX_DECODING_WEIGHT == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "tags",
+    [
+        Tags(ids=tuple(range(0, 327_680, 41)), min_distance=1),
+        Tags(ids=families.generate_family(Tags(), 900, 4), min_distance=4),
+        Tags(site={k: PlanarPose(0.0, 0.0, 0.0) for k in range(0, 327_680, 37)}),
+        Tags(codec="redundant", magnets=8),
+    ],
+)
+def test_how_often_arbitrary_orientations_have_an_id_in_use(tags: Tags) -> None:
+    """Drawn at random, as many orientations decode with so few corrections as predicted."""
+    rng = np.random.default_rng(72)
+    trials = 4000 if tags.codec == "mosk" else 20_000
+    cells = codec.layout_of(tags, 0).cells
+    ids = set(tags.site or tags.ids or range(codec.capacity(tags)))
+    corrected, predicted = [], {}
+    for steps in rng.integers(0, 8, (trials, len(cells))):
+        decoded = decode_tag(tags, cells, steps)
+        if decoded.tag_id in ids:
+            corrected.append(decoded.corrected)
+            predicted[decoded.corrected] = coincidence_probability(tags, cells, decoded)
+    assert 0 in predicted
+    for limit, probability in predicted.items():
+        if limit > 1:
+            continue  # The redundant code corrects no two magnets.
+        count = np.count_nonzero(np.array(corrected) <= limit)
+        assert abs(count - trials * probability) < 4 * np.sqrt(trials * probability) + 1

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.magnets import detect_magnets
-from locatk.core.polaris.identification.tags import identify_pass
+from locatk.core.polaris.identification.tags import TagObservation, identify_pass
 from locatk.core.polaris.localization import distance_along, localize
 from locatk.core.polaris.preprocessing import find_passes, preprocess
 from locatk.core.polaris.solver import solve
@@ -236,3 +236,49 @@ def test_poses_of_a_tag_are_over_its_own_magnets(world: Any) -> None:
         assert np.ptp(driven) == pytest.approx(0.14, abs=0.01)
         assert np.mean(driven) == pytest.approx(x, abs=0.01)
         assert poses.position[:, 0] == pytest.approx(driven - x, abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def first_tag(tour: tuple[Any, Samples]) -> TagObservation:
+    _, recording = tour
+    preprocessed = preprocess(recording)
+    part = find_passes(preprocessed.samples, preprocessed.noise_t)[0]
+    identified = identify_pass(detect_magnets(preprocessed, part, TAGS), recording, [TAGS])
+    assert identified is not None
+    return identified.observations[0]
+
+
+def with_path(observation: TagObservation, path_m: Array) -> TagObservation:
+    return replace(observation, magnets=replace(observation.magnets, path_m=path_m))
+
+
+def localized_times(recording: Samples, observation: TagObservation) -> NDArray[np.int64]:
+    (poses,) = localize(recording, [observation]).trajectories
+    return poses.time_ns
+
+
+def test_a_sample_far_off_its_neighbours_has_no_pose(
+    tour: tuple[Any, Samples], first_tag: TagObservation
+) -> None:
+    _, recording = tour
+    magnets = first_tag.magnets
+    damaged = int(np.argmin(np.abs(magnets.path_m - 0.02)))
+    path_m = magnets.path_m.copy()
+    path_m[damaged] -= 0.03
+    before = localized_times(recording, first_tag)
+    after = localized_times(recording, with_path(first_tag, path_m))
+    assert set(before) - set(after) == {recording.time_ns[magnets.first + damaged]}
+
+
+@pytest.mark.parametrize(("beyond_m", "has_poses"), [(0.02, False), (0.005, True), (-0.03, True)])
+def test_a_rest_away_from_the_magnets_may_be_a_motion(
+    beyond_m: float, has_poses: bool, tour: tuple[Any, Samples], first_tag: TagObservation
+) -> None:
+    _, recording = tour
+    magnets = first_tag.magnets
+    last_m = magnets.position_m[:, 0].max()
+    path_m = np.minimum(magnets.path_m, last_m + beyond_m)
+    rest_ns = recording.time_ns[magnets.first : magnets.stop][path_m == path_m.max()]
+    assert len(rest_ns) > 10
+    is_localized = np.isin(rest_ns, localized_times(recording, with_path(first_tag, path_m)))
+    assert is_localized.tolist() == [has_poses] * len(rest_ns)

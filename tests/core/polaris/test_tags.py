@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import Samples, SensorArray
+from locatk.core.polaris.identification.evidence import conflicting_tags
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
     TagObservation,
@@ -18,7 +19,7 @@ from locatk.core.polaris.identification.tags import (
     may_be_one_tag,
 )
 from locatk.core.polaris.magnets import DetectedMagnets
-from locatk.core.polaris.tag import AsBuiltTag, TagLayout, Tags
+from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, TagLayout, Tags
 
 Array = NDArray[np.float64]
 
@@ -352,6 +353,56 @@ def test_a_magnet_beside_a_tag_is_reported(x: float, y: float, is_read: bool, wo
         assert result.refused in ("other_design", "too_many_magnets")
 
 
+EDGE_TO_EDGE_M = 0.12
+"""Distance of two tags whose lattices continue each other."""
+
+
+@pytest.mark.parametrize(
+    ("ids", "site", "is_read"),
+    [
+        (None, (), False),
+        (range(20), (), True),
+        # A family that one orientation in a hundred belongs to by coincidence.
+        (range(0, 327_680, 100), (), False),
+        (None, (SYMBOLS, OTHER), True),
+        (None, (OTHER,), False),
+    ],
+)
+def test_a_neighbour_edge_to_edge(ids: Any, site: Any, is_read: bool, world: Any) -> None:
+    """Two of its magnets, at the end of the bar, continue the lattice."""
+    tag = world.Tag(CELLS, SYMBOLS)
+    neighbour = world.Tag(CELLS, OTHER, y=EDGE_TO_EDGE_M)
+    at_the_bar = np.flatnonzero(neighbour.places[:, 1] < 0.09)
+    magnets = detected_magnets(tag, neighbour, keep=[*range(5), *(5 + at_the_bar)])
+    family = None if ids is None else (id_of(), *(k for k in ids if k != id_of()))
+    poses = {id_of(symbols): PlanarPose(0.0, 0.0, 0.0) for symbols in site}
+    tags = replace(TAGS, ids=family, site=poses)
+    result = one(identify_tags(magnets, recording(), [tags]))
+    assert result.tag_id == (id_of() if is_read else None)
+    assert result.refused == ("" if is_read else "other_design")
+
+
+@pytest.mark.parametrize("is_on_site", [True, False])
+def test_five_magnets_of_two_tags_that_fit_the_grid(is_on_site: bool, world: Any) -> None:
+    """The column of a neighbour that the bar covers forms another tag with two of the tag."""
+    cells = ((0, 0), (1, 0), (0, 2), (1, 2), (2, 2))
+    tag_id = codec.id_of(TAGS, TagLayout(cells, SYMBOLS))
+    neighbour_cells = ((1, 0), (0, 1), (2, 2), (0, 0), (0, 2))
+    neighbour = world.Tag(neighbour_cells, OTHER, y=EDGE_TO_EDGE_M)
+    at_the_bar = np.flatnonzero(neighbour.places[:, 1] < 0.09)
+    keep = [*range(5), *(5 + at_the_bar)]
+    magnets = detected_magnets(world.Tag(cells, SYMBOLS), neighbour, keep=keep)
+    site = {tag_id: PlanarPose(0.0, 0.0, 0.0)} if is_on_site else {}
+    result = identify_tags(magnets, recording(), [replace(TAGS, site=site)])
+    assert [each.tag_id for each in result] == [tag_id if is_on_site else None]
+
+
+def test_magnets_within_the_grid_outweigh_the_id(world: Any) -> None:
+    magnets = detected_magnets(world.Tag(CELLS, SYMBOLS), world.Tag(((2, 0),), (2,)))
+    tags = replace(TAGS, site={id_of(): PlanarPose(0.0, 0.0, 0.0)})
+    assert one(identify_tags(magnets, recording(), [tags])).tag_id is None
+
+
 def test_several_strong_magnets_within_the_grid(world: Any) -> None:
     strays = [world.Tag(((0, 0),), (2,), x=0.012, y=y, order=1) for y in (0.03, -0.03)]
     magnets = detected_magnets(world.Tag(CELLS, SYMBOLS), *strays)
@@ -463,3 +514,29 @@ def test_a_white_residual_needs_no_margin(world: Any) -> None:
     tag = world.Tag(CELLS, SYMBOLS, turned=np.radians([0, 0, 17.0, 0, 0]))
     result = one(identify_tags(detected_magnets(tag, residual_sigma=1.59), recording(), [TAGS]))
     assert result.tag_id == id_of()
+
+
+MINI = Tags(order=2, magnets=3)
+
+
+@pytest.mark.parametrize(
+    ("tags", "x_m", "y_m", "heading", "is_conflict"),
+    [
+        (TAGS, 0.0, 0.12, 0.0, False),  # Two ids of many: read.
+        (TAGS, 0.0, 0.06, 0.0, True),  # Overlapping.
+        (TAGS, 0.08, 0.08, np.pi / 4, True),
+        (MINI, 0.0, 0.08, 0.0, True),
+        (MINI, 0.12, 0.04, np.pi / 2, True),
+        (MINI, 0.0, 0.09, 0.0, False),
+        (MINI, 0.0, 0.13, 0.6, False),
+        (MINI, 0.0, 0.40, 0.0, False),
+    ],
+)
+def test_tags_on_a_site_that_make_each_other_unreadable(
+    tags: Tags, x_m: float, y_m: float, heading: float, is_conflict: bool
+) -> None:
+    at = PlanarPose(0.3, -1.2, 0.7)
+    cos, sin = np.cos(at.heading_rad), np.sin(at.heading_rad)
+    x, y = at.x_m + cos * x_m - sin * y_m, at.y_m + sin * x_m + cos * y_m
+    site = {5: at, 77: PlanarPose(x, y, at.heading_rad + heading)}
+    assert conflicting_tags(replace(tags, site=site)) == ([(5, 77)] if is_conflict else [])
