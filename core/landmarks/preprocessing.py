@@ -161,8 +161,8 @@ class HallRecording:
     def rescaled(self, scale: float) -> HallRecording:
         """Return the recording with readings divided by a factor, with a warning."""
         message = (
-            f"fields are {scale:.2g} times those expected of the bars; corrected. Check the unit "
-            "and the gain of the readings, the height of the sensors, and the bars of the map"
+            f"fields are about {scale:.2g} times those expected of the bars; corrected. Check the "
+            "unit and the gain of the readings, the height of the sensors, and the bars of the map"
         )
         warning = SolverWarning("sensor_scale", message).about(self.samples.device)
         return replace(

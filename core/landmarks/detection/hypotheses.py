@@ -18,6 +18,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -131,8 +132,12 @@ MAX_MEAN_SQUARED_DEVIATION = 3.1
 """Mean square of gains, strengths and height, in standard deviations of their priors, above which
 a visit is doubtful: the 99.9 % quantile of chi-square with nine degrees of freedom, by each."""
 
-CHECKED_SCALES = tuple(2 ** (k / 2) for k in (-6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6))
+SCALE_STEP = math.sqrt(2)
+CHECKED_SCALES = tuple(SCALE_STEP**k for k in range(-6, 7) if k)
 """Common scales of the readings that are tried; the steps are smaller than :data:`.GAIN_RANGE`."""
+
+SCALE_ROUNDS = 4
+"""Number of corrections of such a scale by the gains and strengths that are left."""
 
 MIN_CHANGE_LOG_ODDS = 20.0
 """Log evidence of all checked visits in favour of a change from which on it is believed: one in a
@@ -151,8 +156,13 @@ times."""
 MAX_PERMUTED_SENSORS = 4
 """Number of sensors up to which order, signs and faulty sensors are checked."""
 
-MAX_REFINED_CHANGES = 3
-"""Most likely changes of the sensors by the longest visit, which are tried on all of them."""
+RANKING_VISITS, MAX_REFINED_CHANGES = 2, 3
+"""Number of visits by which changes of the sensors are ranked, and of the most likely ones by each
+of them, which are tried on all visits: a fit to a single visit may miss the minimum."""
+
+MAX_RIVAL_LOG_ODDS = 7.0
+"""Log evidence below that of the most likely change down to which others are named as well
+(1 : 1000). On a straight path, sensors that follow each other can be exchanged in their roles."""
 
 MAX_GAIN_SIGMAS = 4.0
 """Deviation of a sensor's gain, in standard deviations of its prior, above which a warning is
@@ -805,41 +815,68 @@ def check_wiring(
     traces = [*doubtful[:MAX_CHECKED_VISITS], *others[:MAX_CHECKED_VISITS]]
 
     @functools.cache
-    def best_fit(change: SensorChange, index: int) -> LandmarkFit | None:
+    def best_fit(change: SensorChange, index: int, grid: ScanGrid) -> LandmarkFit | None:
         trace = traces[index]
+        if not has_strong_field(trace, geometry):
+            return None
         field = trace.field_t[:, list(change.order)] * change.sign
         scaled = replace(geometry, remanence_t=change.scale * geometry.remanence_t)
-        fits = fit_landmarks(replace(trace, field_t=field), scaled, priors, thorough=False)
+        fits = _fit_intact(replace(trace, field_t=field), scaled, priors, grid)
         return _best(fits) if fits else None
 
-    def evidence(change: SensorChange, index: int) -> float:
-        fit = best_fit(change, index)
+    @functools.cache
+    def refined_fit(change: SensorChange, index: int) -> LandmarkFit | None:
+        """Return the best fit, from a finer grid if that of the coarse one does not fit."""
+        fit = best_fit(change, index, COARSE_GRID)
+        if fit is None or fit.residual_sigma > MAX_FITTING_RESIDUAL_SIGMAS:
+            fits = [one for one in (fit, best_fit(change, index, FINE_GRID)) if one is not None]
+            fit = max(fits, key=lambda one: one.log_odds, default=None)
+        return fit
+
+    def evidence(fit: LandmarkFit | None) -> float:
         return fit.log_odds if fit is not None else -MAX_LOG_EVIDENCE
 
     as_given, *changes = _sensor_changes(len(names))
-    likely = sorted(changes, key=lambda change: -evidence(change, 0))[:MAX_REFINED_CHANGES]
     indices = range(len(traces))
-    best = max(likely, key=lambda change: sum(evidence(change, index) for index in indices))
-    gains = [evidence(best, index) - evidence(as_given, index) for index in indices]
+    likely: dict[SensorChange, None] = {}
+    for index in indices[:RANKING_VISITS]:
+        ranking = [(evidence(best_fit(change, index, COARSE_GRID)), change) for change in changes]
+        ranking.sort(key=operator.itemgetter(0), reverse=True)
+        likely |= {change: None for _, change in ranking[:MAX_REFINED_CHANGES]}
+    total = {
+        change: sum(evidence(refined_fit(change, index)) for index in indices) for change in likely
+    }
+    best = max(likely, key=total.__getitem__)
+    gains = [
+        evidence(refined_fit(best, index)) - evidence(refined_fit(as_given, index))
+        for index in indices
+    ]
     if sum(gains) < MIN_CHANGE_LOG_ODDS or min(gains) < -MAX_CHANGE_LOG_LOSS:
         return 1.0
-    fits = [fit for index in indices if (fit := best_fit(best, index)) is not None]
+    fits = [fit for index in indices if (fit := refined_fit(best, index)) is not None]
     if np.median([fit.residual_sigma for fit in fits]) > MAX_FITTING_RESIDUAL_SIGMAS:
         return 1.0
-    if best.order != as_given.order:
-        actual = ", ".join(names[best.order.index(k)] for k in as_given.order)
-        raise InputError(
-            f"the hall sensors of {device} are in the wrong order: {', '.join(names)} are {actual}",
-            hint="Name the columns in that order, or correct halls.toml",
-        )
-    if best.sign != as_given.sign:
-        raise _opposite_sign_error(names[best.sign.index(-1)], device)
+    if best.scale == 1:
+        rivals = [
+            change
+            for change in likely
+            if change.scale == 1 and total[change] > total[best] - MAX_RIVAL_LOG_ODDS
+        ]
+        raise wiring_error(sorted(rivals, key=lambda one: -total[one]), names, device)
     gain = ParameterLayout.of(len(names), 0).gain
-    remaining = [
-        np.mean(1 + priors.gain * fit.parameters[gain]) * np.mean(np.abs(fit.strength))
-        for fit in fits
-    ]
-    return best.scale * float(np.median(remaining))
+    scale = best.scale
+    for _ in range(SCALE_ROUNDS):
+        # The scales that were tried are far apart, and priors keep gains and strengths near 1.
+        remaining = [
+            np.mean(1 + priors.gain * fit.parameters[gain]) * np.mean(np.abs(fit.strength))
+            for fit in fits
+        ]
+        scale *= float(np.median(remaining))
+        changed = replace(best, scale=scale)
+        fits = [
+            fit for index in indices if (fit := best_fit(changed, index, COARSE_GRID)) is not None
+        ]
+    return scale
 
 
 def _is_doubtful(visit: DetectedVisit) -> bool:
@@ -895,6 +932,29 @@ def _sensor_changes(count: int) -> list[SensorChange]:
     for k in given:
         changes.append(SensorChange(given, (*ones[:k], -1.0, *ones[k + 1 :])))
     return changes + [SensorChange(given, ones, scale) for scale in CHECKED_SCALES]
+
+
+def wiring_error(changes: Sequence[SensorChange], names: Sequence[str], device: str) -> InputError:
+    """Return the error that names a wrong wiring, or those that are as likely."""
+    given = tuple(range(len(names)))
+    descriptions = []
+    for change in changes:
+        if change.order != given:
+            actual = ", ".join(names[change.order.index(k)] for k in given)
+            descriptions.append(
+                f"the hall sensors of {device} are in the wrong order: {', '.join(names)} are "
+                f"{actual}"
+            )
+        else:
+            name = names[change.sign.index(-1)]
+            if len(changes) == 1:
+                return _opposite_sign_error(name, device)
+            descriptions.append(f"the {name} sensor of {device} has the opposite sign")
+    if len(changes) == 1:
+        hint = "Name the columns in that order, or correct halls.toml"
+    else:
+        hint = "Drive over more landmarks, with turns: the recording does not show which"
+    return InputError("; or ".join(descriptions), hint=hint)
 
 
 def _opposite_sign_error(name: str, device: str) -> InputError:

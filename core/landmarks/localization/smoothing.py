@@ -291,7 +291,8 @@ def constant_error_information(
 ) -> tuple[Array, Array]:
     """Return what the fits of single visits say of the constant errors of the odometry.
 
-    The posterior of each fit without its prior N(0, I) is independent evidence.
+    The posterior of each fit without its prior N(0, I) is independent evidence. There is none where
+    the posterior is wider than the prior, because the fit is poor.
 
     Returns
     -------
@@ -305,8 +306,10 @@ def constant_error_information(
         first = ParameterLayout.of_trace(trace).correction.start
         own = slice(first, first + CONSTANT_ERROR_COUNT)
         inverse = np.linalg.inv(fit.covariance[own, own])
-        information[k] = inverse - np.eye(CONSTANT_ERROR_COUNT)
-        vector[k] = inverse @ fit.parameters[own]
+        value, basis = np.linalg.eigh(inverse - np.eye(CONSTANT_ERROR_COUNT))
+        basis = basis[:, value > 0]
+        information[k] = basis * value[value > 0] @ basis.T
+        vector[k] = basis @ (basis.T @ (inverse @ fit.parameters[own]))
     return information, vector
 
 

@@ -32,6 +32,7 @@ from locatk.core.landmarks.detection.trace import Trace
 from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import Geometry, rotated, signs
+from locatk.core.landmarks.localization.smoothing import constant_error_information
 from locatk.core.landmarks.preprocessing import (
     HallRecording,
     VisitSegment,
@@ -390,3 +391,41 @@ def test_successive_visits_to_one_landmark_are_merged(
     visits = detect_visits(recording_of(), GEOMETRY, ModelPriors(), 0.2)
     assert len(visits) == count
     assert visits[0].segment.stop == (10 if count == 1 else 5)
+
+
+def test_alternative_wirings_are_named_together() -> None:
+    given, ones = (0, 1, 2, 3), (1.0, 1.0, 1.0, 1.0)
+    names = ("front", "left", "rear", "right")
+    inverted = hypotheses.SensorChange(given, (1.0, 1.0, -1.0, 1.0))
+    exchanged = hypotheses.SensorChange((2, 1, 0, 3), ones)
+    one = hypotheses.wiring_error([inverted], names, "robot")
+    assert "the rear sensor of robot has the opposite sign of the others" in str(one)
+    both = hypotheses.wiring_error([exchanged, inverted], names, "robot")
+    assert "are rear, left, front, right; or the rear sensor" in str(both)
+    assert both.hint is not None
+    assert "more landmarks" in both.hint
+
+
+@pytest.mark.parametrize(("variance", "expected"), [(0.25, 3.0), (1.0, 0.0), (4.0, 0.0)])
+def test_poor_fits_say_nothing_of_the_odometry(variance: float, expected: float) -> None:
+    """Where the posterior of a fit is wider than the prior, it is no evidence."""
+    layout = ParameterLayout.of(4, 6)
+    parameters = np.full(layout.size, 0.5)
+    fit = replace(fit_of(), covariance=variance * np.eye(layout.size), parameters=parameters)
+    trace = replace(line_trace(5), field_t=np.zeros((5, 4)), correction=np.zeros((5, 3, 6)))
+    information, vector = constant_error_information([(fit, trace)])
+    np.testing.assert_allclose(information[0], expected * np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(vector[0], 0.5 / variance if expected else 0.0, atol=1e-12)
+
+
+def test_covariances_of_poor_fits_grow_with_correlated_residuals() -> None:
+    covariance = np.diag([1e-6, 4e-6])
+    scores = np.zeros((40, 4, 2))
+    scores[..., 0] = np.random.default_rng(0).normal(size=(40, 4))
+    white = hypotheses.widened_covariance(covariance, scores, 1.5)
+    scores[:, 1, 1] = 2e3
+    correlated = hypotheses.widened_covariance(covariance, scores, 1.5)
+    np.testing.assert_allclose(np.diag(white), 1.5**2 * np.diag(covariance))
+    assert correlated[0, 0] == pytest.approx(white[0, 0])
+    # Four clusters of ten scores of one sign, and the factor n / (n - 1) of 16 clusters.
+    assert correlated[1, 1] == pytest.approx((4e-6 * 2e4) ** 2 * 4 * 16 / 15)
