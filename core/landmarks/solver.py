@@ -36,7 +36,11 @@ from locatk.core.landmarks.localization.consistency import (
     warn_of_opposite_polarity,
 )
 from locatk.core.landmarks.localization.odometry_path import without_lag
-from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing, smooth_robustly
+from locatk.core.landmarks.localization.robust_smoothing import (
+    DisplacedLandmark,
+    RobustSmoothing,
+    smooth_robustly,
+)
 from locatk.core.landmarks.localization.smoothing import (
     LAG_COLUMN,
     POSE_SIZE,
@@ -332,7 +336,15 @@ def localize_robot(
         smoothed.slipped_links,
     )
     unused = [visit for visit in visits if not any(visit is used for used in on_map)]
-    displaced = find_displaced_landmarks(unused, trajectory, floor)
+    named = {
+        cause.cell
+        for causes in smoothed.causes
+        for cause in causes
+        if isinstance(cause, DisplacedLandmark)
+    }
+    displaced = [
+        one for one in find_displaced_landmarks(unused, trajectory, floor) if one.cell not in named
+    ]
     probability = pose_probability(
         trajectory.time_ns,
         [visit.segment for visit in on_map],
