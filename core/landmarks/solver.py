@@ -329,7 +329,10 @@ def localize_robot(
     trajectory, contradictions = without_contradicted_ends(
         trajectory, smoothed.visits, [*filter(contradicts_odometry, unused), *slipped]
     )
-    displaced = find_displaced_landmarks(unused, trajectory, floor)
+    named = smoothed.displaced_cells
+    displaced = [
+        one for one in find_displaced_landmarks(unused, trajectory, floor) if one.cell not in named
+    ]
     probability = pose_probability(
         trajectory.time_ns,
         [visit.segment for visit in on_map],

@@ -19,6 +19,7 @@ from locatk.core.landmarks.localization.consistency import (
 )
 from locatk.core.landmarks.localization.robust_smoothing import (
     Cause,
+    DisplacedLandmark,
     RobustSmoothing,
     WheelSlip,
     smooth_robustly,
@@ -133,6 +134,12 @@ class SmoothedDrive:
     def visits(self) -> list[IdentifiedVisit]:
         """Visits from which poses were estimated, in order of time."""
         return list({id(visit): visit for part in self.parts for visit in part.visits}.values())
+
+    @property
+    def displaced_cells(self) -> set[Cell]:
+        """Cells whose landmarks are named as displaced."""
+        causes = [one for part in self.parts for cause in part.causes() for one in cause]
+        return {one.cell for one in causes if isinstance(one, DisplacedLandmark)}
 
     @property
     def residual_sigma(self) -> float:

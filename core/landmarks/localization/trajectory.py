@@ -21,6 +21,7 @@ from locatk.core.landmarks.detection.trace import (
     compose,
     planar_rotation,
     relative,
+    walk_units,
 )
 from locatk.core.landmarks.localization.odometry_path import OdometryPath
 from locatk.core.landmarks.localization.smoothing import (
@@ -38,6 +39,10 @@ from locatk.core.trajectory import Trajectory
 Array = NDArray[np.float64]
 TimedPoses = tuple[NDArray[np.int64], Array, Array]
 """Times (n,), poses (n, 3) in the frame of the map, and their covariances (n, 3, 3)."""
+
+FITTED_WALK_FRACTION = 0.4
+"""Variance of a random walk about the straight line that fits it best, relative to that about the
+line between its ends: span^2 / 15 and span^2 / 6 on average."""
 
 
 def estimate_trajectory(
@@ -146,7 +151,9 @@ def _during(visit: _Visit, path: OdometryPath) -> TimedPoses:
         (1 - fraction) * each[low] + fraction * each[high] for each in (by_errors, change)
     )
     local = relative(pose, segment.origin) + change[:, :, 0]
-    return time_ns, *_to_map(visit.estimate, local, correction)
+    pose, covariance = _to_map(visit.estimate, local, correction)
+    within_units = FITTED_WALK_FRACTION * _covariance_within_units(by_errors, correction)
+    return time_ns, pose, covariance + within_units
 
 
 def _between(visit: _Visit, following: _Visit, link: OdometryLink) -> TimedPoses:
@@ -166,6 +173,7 @@ def _between(visit: _Visit, following: _Visit, link: OdometryLink) -> TimedPoses
     # The covariances of the ends are interpolated by the variance of the walk.
     fraction = _walk_fraction(walk)[:, None, None]
     covariance = (1 - fraction) * start_covariance + fraction * end_covariance + bridge
+    covariance = covariance + _covariance_within_units(link.correction, link.correction)
     return link.time_ns, compose(start, local)[1:-1], covariance[1:-1]
 
 
@@ -194,6 +202,29 @@ def _between_with_slip(visit: _Visit, following: _Visit, link: OdometryLink) -> 
     spread = difference[:, :, None] * difference[:, None]
     covariance = covariance + fraction * (1 - fraction) * spread
     return link.time_ns, pose[1:-1], covariance[1:-1]
+
+
+def _covariance_within_units(unit_correction: Array, correction: Array) -> Array:
+    """Return the covariances (n, 3, 3) of the random walk about its linear ramps.
+
+    Between the ends of a unit it is a Brownian bridge, with the variance span^2 f (1 - f) at the
+    fraction f.
+
+    Parameters
+    ----------
+    unit_correction : (k, 3, m) ndarray
+        Corrections along whole units, see :class:`.trace.Trace`.
+    correction : (n, 3, m) ndarray
+        The same at the poses.
+    """
+    units = walk_units(correction.shape[2])
+    covariance = np.zeros((len(correction), POSE_SIZE, POSE_SIZE))
+    for row, columns in zip((2, 0, 1), units.T, strict=True):
+        ramp = unit_correction[:, row, columns]
+        value = correction[:, row, columns]
+        variance = (value - ramp.min(axis=0)) * (ramp.max(axis=0) - value)
+        covariance[:, row, row] = variance.sum(axis=1)
+    return covariance
 
 
 def _walk_fraction(walk: Array) -> Array:
@@ -255,6 +286,7 @@ def _dead_reckoning(
     rotation = planar_rotation(start[2])
     by_start = _gradient_by_pose(rotation, local)
     covariance = by_start @ start_covariance @ by_start.swapaxes(1, 2) + rotation @ own @ rotation.T
+    covariance = covariance + _covariance_within_units(link.correction, link.correction)
     return compose(start, local), covariance
 
 

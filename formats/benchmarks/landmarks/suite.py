@@ -19,6 +19,7 @@ from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.landmarks.endurance import endurance_figures
 from locatk.formats.benchmarks.landmarks.faults import fault_figures
 from locatk.formats.benchmarks.landmarks.global_localization import global_figures
+from locatk.formats.benchmarks.landmarks.odometry import odometry_figures
 from locatk.formats.benchmarks.landmarks.sessions import closed_loop_figures, session_figures
 from locatk.formats.benchmarks.landmarks.speed import map_figures, speed_figures
 from locatk.formats.benchmarks.landmarks.visits import (
@@ -75,6 +76,7 @@ def figures(data: Path) -> list[Figure]:
         *session_figures(folder),
         *closed_loop_figures(folder),
         *fault_figures(folder),
+        *odometry_figures(folder),
         *map_figures(folder),
         *speed_figures(),
         *endurance_figures(),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.landmark import CODE_COUNT, rotated
 from locatk.core.landmarks.map import windows
 from locatk.core.landmarks.map.floor import FloorMap, neighbour
@@ -19,11 +20,13 @@ from locatk.core.landmarks.simulation.passes import SinglePass, simulate_passes
 from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
 from locatk.core.landmarks.solver import solve
 from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks import timing
 from locatk.formats.benchmarks.figures import Duration, Figure
 from locatk.formats.benchmarks.landmarks import endurance as landmarks_endurance
 from locatk.formats.benchmarks.landmarks import faults as landmarks_faults
 from locatk.formats.benchmarks.landmarks import global_localization as landmarks_global
+from locatk.formats.benchmarks.landmarks import odometry as landmarks_odometry
 from locatk.formats.benchmarks.landmarks import sessions as landmarks_sessions
 from locatk.formats.benchmarks.landmarks import speed as landmarks_speed
 from locatk.formats.benchmarks.landmarks import suite as landmarks
@@ -79,6 +82,10 @@ def quick(
         patch.setattr(landmarks_faults, "SAMPLE_RATE_HZ", 20.0)
         first = dict(list(landmarks_faults.FAULTS.items())[:1])
         patch.setattr(landmarks_faults, "FAULTS", first)
+        patch.setattr(landmarks_odometry, "LONG_DRIVES", 1)
+        patch.setattr(landmarks_odometry, "LONG_DRIVE_CELLS", 9)
+        first_kind = dict(list(landmarks_odometry.KINDS.items())[:1])
+        patch.setattr(landmarks_odometry, "KINDS", first_kind)
         patch.setattr(landmarks, "SINGLE_PASSES", 6)
         patch.setattr(landmarks, "LONG_VISITS", 3)
         patch.setattr(landmarks, "STOPPED_ROBOTS", 4)
@@ -414,3 +421,22 @@ def test_a_wrong_cell_is_detected(solved: tuple[SimulatedSession, Solution]) -> 
     unlocalised = replace(solution, detections=detections, trajectories=())
     one = landmarks_sessions.score_session(made, unlocalised)
     assert (one.has_poses, one.is_wrong, one.wrong_cells) == (False, False, 0)
+
+
+def test_odometry_of_long_drives_is_that_of_its_kind() -> None:
+    time_ns = 10**18 + np.arange(200) * 20_000_000
+    true = Trajectory.from_positions(
+        "robot", "map", time_ns, np.column_stack([np.arange(200) * 4e-3, np.zeros((200, 2))])
+    )
+    floor = FloorMap(np.zeros((1, 1), np.int64))
+    session = SimulatedSession((), (true,), (true,), floor, (), (), 0, (), ())
+    late, noisy = (
+        landmarks_odometry.with_odometry(session, errors, 3).odometry[0]
+        for errors in (
+            landmarks_odometry.OdometryErrors(0.0, 0.0, scale=0.0, lag_s=0.06),
+            landmarks_odometry.OdometryErrors(0.01, 1e-3),
+        )
+    )
+    np.testing.assert_allclose(late.position[10:, 0], true.position[7:-3, 0], atol=1e-9)
+    heading = heading_from_quaternion(noisy.quaternion)
+    assert np.std(np.diff(heading)) == pytest.approx(0.01 * math.sqrt(4e-3), rel=0.2)
