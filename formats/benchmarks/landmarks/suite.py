@@ -1,8 +1,8 @@
 """Figures of the landmarks: the paper's study, simulated visits, sessions, maps and speed.
 
 No recording of a landmark floor is published. The simulations and their errors are described in
-:mod:`.visits`, :mod:`.global_localization`, :mod:`.sessions` and :mod:`.faults`. Only the verified
-maps are read from the data folder.
+:mod:`.visits`, :mod:`.global_localization`, :mod:`.sessions`, :mod:`.faults` and :mod:`.doubts`.
+Only the verified maps are read from the data folder.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from locatk.core.landmarks.published.study import study
 from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.landmarks.doubts import doubt_figures
 from locatk.formats.benchmarks.landmarks.endurance import endurance_figures
 from locatk.formats.benchmarks.landmarks.faults import fault_figures
 from locatk.formats.benchmarks.landmarks.global_localization import global_figures
@@ -77,6 +78,7 @@ def figures(data: Path) -> list[Figure]:
         *closed_loop_figures(folder),
         *fault_figures(folder),
         *odometry_figures(folder),
+        *doubt_figures(folder),
         *map_figures(folder),
         *speed_figures(),
         *endurance_figures(),
