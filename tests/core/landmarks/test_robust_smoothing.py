@@ -140,10 +140,13 @@ def test_known_noise_is_used() -> None:
     one = drive()
     odometry = odometry_of(one, 5)
     known, estimated = (
-        solved(one, odometry, **options).trajectories[0].sigma[:, 5].mean()
+        np.degrees(np.quantile(solved(one, odometry, **options).trajectories[0].sigma[:, 5], 0.8))
         for options in ({"odometry_noise": math.radians(2)}, {})
     )
     assert known > 2 * estimated
+    # Between the ends of a unit of 100 mm or more, a walk of 2 deg deviates by 0.3 deg. The fields
+    # leave about 0.3 deg at the ends.
+    assert known > 0.4
 
 
 @pytest.mark.slow
