@@ -71,18 +71,21 @@ def record_pass(
     *,
     clearance_m: float = 0.010,
     screws: int = 0,
+    speed_mps: float | None = None,
 ) -> Samples:
     """Simulate a bar that drives along x, with its middle at y = 0.
 
-    ``screws`` are placed at random within the tags and up to 60 mm beside them.
+    ``screws`` are placed at random within the tags and up to 60 mm beside them. The speed varies,
+    unless one is given.
     """
     position = np.vstack([_built_positions(each, rng) for each in placed])
     start_m, end_m = position[:, 0].min() - RUN_UP_M, position[:, 0].max() + RUN_UP_M
-    speed = rng.uniform(*SPEED_RANGE_MPS)
+    speed = speed_mps or rng.uniform(*SPEED_RANGE_MPS)
     time = np.arange(0.0, (end_m - start_m) / speed, 1 / RATE_HZ)
     wave_s, phase = rng.uniform(0.2, 0.6), rng.uniform(0, math.tau)
     ripple = np.sin(math.tau * time / wave_s + phase) - math.sin(phase)
-    path = start_m + speed * (time + SPEED_VARIATION * wave_s / math.tau * ripple)
+    variation = 0.0 if speed_mps else SPEED_VARIATION
+    path = start_m + speed * (time + variation * wave_s / math.tau * ripple)
     sensors = bar(SENSORS, SENSOR_SPACING_M)
     points = sensors + [0.0, 0.0, clearance_m] + np.zeros((len(time), 1, 3))
     points[..., 0] += path[:, None]
