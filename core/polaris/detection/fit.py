@@ -44,18 +44,24 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.linalg.lapack import dposv
 from scipy.ndimage import median_filter
+from scipy.stats import chi2
 
 from locatk.core.errors import DegenerateError
 from locatk.core.least_squares import Indices, cauchy_loss, minimize
 from locatk.core.polaris.detection.field_model import MagnetOffsets
+from locatk.core.polaris.detection.motion import MOTION_GROUPS, BarPoses, Motion
 from locatk.core.polaris.detection.window import PassPriors, PassWindow, trend_basis
 from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE, robust_sigma
 
 Array = NDArray[np.float64]
 
-NUISANCES = ("crab", "tilt")
+STRAIGHT_NUISANCES = ("crab", "tilt")
+NUISANCES = (*STRAIGHT_NUISANCES, *MOTION_GROUPS)
 """Unknowns that are fixed at zero until the samples contradict that: a path that is oblique to the
-bar, and magnets that are not flat."""
+bar, magnets that are not flat, and :mod:`locatk.core.polaris.detection.motion`."""
+
+COARSE_NUISANCES = ("curve", "attitude")
+"""Those that a coarse fit estimates: without them it takes the residual for further magnets."""
 
 GLOBAL_UNKNOWNS = ("height_m", "skew_periods", "crab_rad")
 """Attributes of :class:`PassState` that hold one number for the whole pass."""
@@ -86,9 +92,9 @@ OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
 """Residual beyond which a sample is an outlier, and the fraction of such samples from which they
 are reweighted: four times that of a normal distribution."""
 
-MIN_NUISANCE_GAIN = 9.0
-"""Decrease of the cost beyond one per unknown, in units of the noise, from which a nuisance is
-estimated: three standard deviations."""
+NUISANCE_SIGNIFICANCE = 1e-3
+"""Probability that noise alone lowers the cost (chi-square distribution) by as much as is asked of
+a nuisance that is estimated."""
 
 COARSE_ITERATIONS, COARSE_GAIN_FRACTION = 20, 1e-3
 """Steps that a coarse fit tries, and the relative decrease of the cost that ends it."""
@@ -118,6 +124,10 @@ class PassState:
         Mean distance moved in a sample period.
     height_m, skew_periods, crab_rad : float
         See :class:`~locatk.core.polaris.detection.window.PassPriors`.
+    motion : Motion or None
+        Curve, attitude and height along the path; None if it is straight and level.
+    free : frozenset of str
+        :data:`NUISANCES` that are estimated.
     """
 
     position_m: Array
@@ -127,6 +137,15 @@ class PassState:
     height_m: float
     skew_periods: float = 0.0
     crab_rad: float = 0.0
+    motion: Motion | None = None
+    free: frozenset[str] = frozenset()
+
+    @property
+    def bar_poses(self) -> BarPoses | None:
+        """Poses of the bar at each sample; None if the path is straight and level."""
+        if self.motion is None or self.motion.is_straight:
+            return None
+        return self.motion.poses(self.path_m, self.crab_rad)
 
 
 @dataclass(frozen=True)
@@ -167,7 +186,10 @@ class PassFit:
 
 
 def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> PassFit:
-    """Improve an initial guess, without outlier rejection, nuisances and covariance.
+    """Improve an initial guess, without outlier rejection and covariance.
+
+    Of the nuisances, only :data:`COARSE_NUISANCES` are estimated, and only if the samples show
+    any.
 
     Raises
     ------
@@ -178,6 +200,9 @@ def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> Pass
     with _degenerate_on_numerical_errors():
         problem = PassProblem(window, priors, weight, start)
         equations, converged = _minimize(problem, start, COARSE_ITERATIONS, COARSE_GAIN_FRACTION)
+        problem, equations, converged = _estimate_nuisances(
+            problem, equations, converged, COARSE_NUISANCES, COARSE_GAIN_FRACTION
+        )
         return _result(problem, equations.projected, weight, converged, reduced=None)
 
 
@@ -198,18 +223,55 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
         equations, converged = _minimize(problem, start, FINE_ITERATIONS, gain)
         if _has_outliers(problem.residual(equations.projected)):
             for _ in range(REWEIGHTING_ROUNDS):
-                factor = _student_weights(problem, equations.projected, weight)
-                problem = PassProblem(window, priors, weight * factor, start)
-                state = equations.projected.state
-                equations, converged = _minimize(problem, state, REWEIGHTED_ITERATIONS, gain)
-        while True:
-            projected = equations.projected
-            reduced = problem.with_free(frozenset(NUISANCES)).reduce(projected)
-            nuisance = _significant_nuisance(problem, reduced, len(start.position_m))
-            if nuisance is None:
-                return _result(problem, projected, weight, converged, reduced)
-            problem = problem.with_free(problem.free | {nuisance})
-            equations, converged = _minimize(problem, projected.state, NUISANCE_ITERATIONS, gain)
+                problem, equations, converged = _reweight(problem, equations, weight)
+        before = problem.free
+        problem, equations, converged = _estimate_nuisances(
+            problem, equations, converged, NUISANCES, gain
+        )
+        if problem.free != before:
+            # Samples that only a wrong motion had made outliers count again.
+            problem, equations, converged = _reweight(problem, equations, weight)
+        reduced = problem.with_free(problem.free | {*STRAIGHT_NUISANCES}).reduce(
+            equations.projected
+        )
+        return _result(problem, equations.projected, weight, converged, reduced)
+
+
+def _reweight(
+    problem: PassProblem, equations: PassEquations, weight: Array
+) -> tuple[PassProblem, PassEquations, bool]:
+    """Fit again with samples weighted by their residuals; with equal weights without outliers."""
+    projected = equations.projected
+    if _has_outliers(problem.unweighted_residual(projected, weight)):
+        weight = weight * _student_weights(problem, projected, weight)
+    problem = PassProblem(problem.window, problem.priors, weight, projected.state)
+    equations, converged = _minimize(
+        problem, projected.state, REWEIGHTED_ITERATIONS, FINE_GAIN_FRACTION
+    )
+    return problem, equations, converged
+
+
+def _estimate_nuisances(
+    problem: PassProblem,
+    equations: PassEquations,
+    converged: bool,
+    allowed: tuple[str, ...],
+    min_gain: float,
+) -> tuple[PassProblem, PassEquations, bool]:
+    """Estimate nuisances one after the other, while the samples show another one."""
+    while True:
+        projected = equations.projected
+        state = projected.state
+        if state.motion is None:
+            middle = float(state.position_m[:, 0].mean())
+            state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
+            projected = replace(projected, state=state)
+        nuisance = _significant_nuisance(problem, projected, allowed)
+        if nuisance is None:
+            return problem, equations, converged
+        problem = problem.with_free(problem.free | {nuisance})
+        state = replace(state, free=problem.free)
+        equations, converged = _minimize(problem, state, NUISANCE_ITERATIONS, min_gain)
 
 
 @contextmanager
@@ -246,6 +308,8 @@ class ProjectedState:
     Attributes
     ----------
     state : PassState
+    poses : BarPoses or None
+        None if the path is straight and level.
     offsets : MagnetOffsets
     unit_fields : (3 N, n, 3 M) ndarray
         Fields of unit moments in units of the noise.
@@ -258,6 +322,7 @@ class ProjectedState:
     """
 
     state: PassState
+    poses: BarPoses | None
     offsets: MagnetOffsets
     unit_fields: Array
     cross: Array
@@ -354,7 +419,7 @@ class PassProblem:
     ) -> None:
         self.window, self.priors = window, priors
         self.jitter_m = priors.jitter_fraction * abs(start.mean_step_m) + 1e-6
-        self.free: frozenset[str] = frozenset()
+        self.free = start.free
         self.gaps = np.diff(window.time_periods)
         n, sensors, _ = window.field_t.shape
         self.shape = (3 * sensors, n)
@@ -404,8 +469,15 @@ class PassProblem:
         }
         low, high = (ratio * state.height_m for ratio in HEIGHT_STEP_RATIOS)
         values["height_m"] = float(np.clip(values["height_m"], low, high))
+        motion, columns = state.motion, self.motion_columns(state)
+        if motion is not None and len(columns):
+            change = np.zeros(len(motion.coefficients))
+            start = 2 * m + len(GLOBAL_UNKNOWNS)
+            change[columns] = step.change[start : start + len(columns)]
+            motion = motion.with_added(change)
         return replace(
             state,
+            motion=motion,
             position_m=state.position_m + step.change[: 2 * m].reshape(2, m).T,
             path_m=state.path_m if step.path_m is None else state.path_m + step.path_m,
             mean_step_m=state.mean_step_m + step.mean_step_m,
@@ -452,13 +524,33 @@ class PassProblem:
         used = self.root.T.reshape(weight.shape)
         return self.residual(projected) * np.sqrt(weight) / np.where(used > 0, used, 1.0)
 
-    def magnet_offsets(self, state: PassState) -> MagnetOffsets:
+    def motion_columns(self, state: PassState) -> NDArray[np.intp]:
+        """Return the indices (k,) of the coefficients of the motion that are estimated."""
+        if state.motion is None:
+            return np.zeros(0, np.intp)
+        ranges = (part for name, part in state.motion.groups.items() if name in self.free)
+        return np.concatenate([np.zeros(0, np.intp), *(np.arange(r.start, r.stop) for r in ranges)])
+
+    def magnet_offsets(self, state: PassState, poses: BarPoses | None) -> MagnetOffsets:
         """Return the offsets from the magnets to the sensors at each sample."""
         sensors = self.window.sensors_m
         skew = np.outer(self.window.axis_order * state.skew_periods, self.local_step(state))
+        position = state.position_m
+        if poses is not None:
+            offset = np.empty((len(state.path_m), len(position), 3))
+            offset[..., :2] = poses.position_m[:, None, :2] - position
+            offset[..., 2] = (state.height_m + poses.position_m[:, 2])[:, None]
+            x, y, z = np.moveaxis(offset @ poses.rotation, -1, 0)
+            # Sensors on the inside of a curve move less.
+            speed = 1 - poses.yaw_rate * sensors[:, 1, None]
+            along = skew * speed[:, None]
+            return MagnetOffsets.from_components(
+                along[..., None] + (sensors[:, 0, None, None] + x)[:, None],
+                (sensors[:, 1, None, None] + y)[:, None],
+                (sensors[:, 2, None, None] + z)[:, None],
+            )
         along = state.path_m + skew
         across = np.tan(state.crab_rad) * (state.path_m if state.crab_rad else np.zeros(1))
-        position = state.position_m
         return MagnetOffsets.from_components(
             along[:, :, None] + (sensors[:, 0, None] - position[:, 0])[:, None, None],
             across[:, None] + (sensors[:, 1, None] - position[:, 1])[:, None, None],
@@ -475,8 +567,12 @@ class PassProblem:
 
     def project(self, state: PassState) -> ProjectedState:
         """Solve for the moments and backgrounds, given all other unknowns."""
-        offsets = self.magnet_offsets(state)
+        poses = state.bar_poses
+        offsets = self.magnet_offsets(state, poses)
         fields = offsets.unit_fields(self.window.disc_correction_m2)
+        if poses is not None:
+            # Moments are constant in the axes of the floor.
+            fields = fields @ poses.rotation.transpose(0, 2, 1)[None, None]
         m = fields.shape[3]
         unit_fields = self.whiten(fields.reshape(*self.shape, 3 * m))
         transposed = self.background.transpose(0, 2, 1)
@@ -492,7 +588,7 @@ class PassProblem:
         state = replace(state, moment_am2=moments.reshape(m, 3))
         cost = (residual**2).sum() + self.moment_information(m) @ moments**2
         cost += self.prior_cost(state)
-        return ProjectedState(state, offsets, unit_fields, cross, residual, float(cost))
+        return ProjectedState(state, poses, offsets, unit_fields, cross, residual, float(cost))
 
     def moment_information(self, m: int) -> Array:
         """Return the prior inverse variances (3 M,) of the moments."""
@@ -516,6 +612,8 @@ class PassProblem:
         for name in GLOBAL_UNKNOWNS:
             mean, sigma = self.global_prior(name)
             cost += ((getattr(state, name) - mean) / sigma) ** 2
+        if state.motion is not None:
+            cost += float(((state.motion.coefficients / state.motion.sigmas) ** 2).sum())
         if self.window.path_m is None:
             excess, scale = self.excess_steps(state)
             cost += 2 * float(np.log1p(excess**2 / scale**2).sum())
@@ -526,26 +624,68 @@ class PassProblem:
         excess = np.diff(state.path_m) - state.mean_step_m * self.gaps
         return excess, self.jitter_m * np.sqrt(self.gaps)
 
+    def _motion_fields(
+        self, totals: Array, fields: Array, velocity: Array, rate: Array
+    ) -> Array:
+        """Return the derivatives (N, 3, n, k) of the fields by motions of the bar.
+
+        With the gradient G of the field f at a sensor s, a velocity v and a rotation w of the bar
+        change the field in its axes by ``G (v + w x s) - w x f``.
+
+        Parameters
+        ----------
+        totals : (N, 3, n, 3) ndarray
+            Gradients of the fields of all magnets.
+        fields : (N, 3, n) ndarray
+            Fields of all magnets.
+        velocity, rate : (n, 3, k) ndarray
+            In the axes of the bar.
+        """
+        lever = np.cross(rate[None], self.window.sensors_m[:, None, :, None], axis=2)
+        moved = np.einsum("sani,snik->sank", totals, velocity + lever)
+        turned = np.cross(rate[None], fields.transpose(0, 2, 1)[..., None], axis=2)
+        return np.asarray(moved - turned.transpose(0, 2, 1, 3))
+
     def reduce(self, projected: ProjectedState) -> ReducedEquations:
         """Return the normal equations at a state, from which the path is eliminated."""
         channels, n = self.shape
         state = projected.state
         m = len(state.position_m)
-        by_x, by_y, by_z = projected.offsets.gradients(state.moment_am2)
+        moments = state.moment_am2
+        if projected.poses is not None:
+            moments = moments @ projected.poses.rotation
+        by_x, by_y, by_z = projected.offsets.gradients(moments)
         # Sums over few magnets: a product takes a quarter of the time of a sum.
         total_x, total_y, total_z = (by @ np.ones(m) for by in (by_x, by_y, by_z))
         tangent = np.tan(state.crab_rad)
-        p = 2 * m + len(GLOBAL_UNKNOWNS)
+        columns_free = self.motion_columns(state)
+        p = 2 * m + len(GLOBAL_UNKNOWNS) + len(columns_free)
         columns = np.empty((*total_x.shape, p))
-        np.negative(by_x, out=columns[..., :m])
-        np.negative(by_y, out=columns[..., m : 2 * m])
-        columns[..., 2 * m] = total_z
-        columns[..., 2 * m + 1] = total_x * np.outer(self.window.axis_order, self.local_step(state))
-        columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
+        skewed = np.outer(self.window.axis_order, self.local_step(state))
+        if state.motion is None or (projected.poses is None and not len(columns_free)):
+            np.negative(by_x, out=columns[..., :m])
+            np.negative(by_y, out=columns[..., m : 2 * m])
+            columns[..., 2 * m] = total_z
+            columns[..., 2 * m + 1] = total_x * skewed
+            columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
+            along = total_x + tangent * total_y
+        else:
+            poses = projected.poses or state.motion.poses(state.path_m, state.crab_rad)
+            for axis, inside in enumerate((slice(m), slice(m, 2 * m))):
+                x, y, z = poses.rotation[:, axis].T[..., None]
+                columns[..., inside] = -(x * by_x + y * by_y + z * by_z)
+            totals = np.stack([total_x, total_y, total_z], axis=-1)
+            columns[..., 2 * m] = np.einsum("sani,ni->san", totals, poses.rotation[:, 2])
+            speed = 1 - poses.yaw_rate * self.window.sensors_m[:, 1, None]
+            columns[..., 2 * m + 1] = total_x * skewed * speed[:, None]
+            velocity, rate = state.motion.derivatives(state.path_m, state.crab_rad, columns_free)
+            moved = self._motion_fields(totals, projected.offsets.fields(moments), velocity, rate)
+            along = moved[..., 0]
+            columns[..., 2 * m + 2 :] = moved[..., 1:]
         inner = np.concatenate(
             [self.whiten(columns.reshape(channels, n, p)), projected.unit_fields], axis=2
         )
-        along = self.whiten((total_x + tangent * total_y).reshape(channels, n))
+        along = self.whiten(along.reshape(channels, n))
         # Order: positions and globals (p), moments (up to q), the mean step, backgrounds.
         q = inner.shape[2]
         size = q + 1 + len(self.background_hessian)
@@ -563,8 +703,13 @@ class PassProblem:
             mean, sigma = self.global_prior(name)
             hessian[index, index] += 1 / sigma**2
             descent[index] -= (getattr(state, name) - mean) / sigma**2
-        moments = np.arange(p, q)
-        hessian[moments, moments] += self.moment_information(m)
+        if state.motion is not None and len(columns_free):
+            indices = np.arange(p - len(columns_free), p)
+            information = 1 / state.motion.sigmas[columns_free] ** 2
+            hessian[indices, indices] += information
+            descent[indices] -= information * state.motion.coefficients[columns_free]
+        indices = np.arange(p, q)
+        hessian[indices, indices] += self.moment_information(m)
         descent[p:q] -= self.moment_information(m) * state.moment_am2.ravel()
         if self.window.path_m is not None:
             hessian[q, q] += FIXING_WEIGHT
@@ -645,28 +790,54 @@ def _student_weights(problem: PassProblem, projected: ProjectedState, weight: Ar
 
 
 def _significant_nuisance(
-    problem: PassProblem, reduced: ReducedEquations, magnets: int
+    problem: PassProblem, projected: ProjectedState, allowed: tuple[str, ...]
 ) -> str | None:
     """Return the fixed nuisance that would explain the samples best; None if none is needed.
 
-    A score test: the decrease of the cost is predicted from normal equations in which all
-    nuisances are free.
+    A score test: the decrease of the cost is predicted from normal equations in which the nuisance
+    is free, in units of the residual. Of several significant ones, that of the least Bayesian
+    information criterion is chosen, which counts their unknowns.
     """
+    fixed = [name for name in allowed if name not in problem.free]
+    if not fixed or projected.state.motion is None:
+        return None
+    reduced = problem.with_free(problem.free | frozenset(fixed)).reduce(projected)
+    residual = problem.residual(projected)
+    unit = max(1.0, robust_sigma(residual)) ** 2
+    log_count = float(np.log(np.isfinite(residual).sum()))
+    indices = _nuisance_indices(problem, projected.state, reduced.first_moment, fixed)
+    base = reduced.hessian.copy()
+    every = np.concatenate(list(indices.values()))
+    base[every, every] *= FIXING_WEIGHT
+    without = float(reduced.descent @ solve_scaled(base, reduced.descent))
+    best, least = None, np.inf
+    for name, own in indices.items():
+        hessian = base.copy()
+        hessian[own, own] /= FIXING_WEIGHT
+        gain = float(reduced.descent @ solve_scaled(hessian, reduced.descent)) - without
+        criterion = len(own) * log_count - gain / unit
+        if gain / unit > chi2.isf(NUISANCE_SIGNIFICANCE, len(own)) and criterion < least:
+            best, least = name, criterion
+    return best
+
+
+def _nuisance_indices(
+    problem: PassProblem, state: PassState, first_moment: int, names: list[str]
+) -> dict[str, NDArray[np.intp]]:
+    """Return the indices of the unknowns of each of the ``names`` in the normal equations."""
+    m = len(state.position_m)
     indices = {
-        "crab": [2 * magnets + GLOBAL_UNKNOWNS.index("crab_rad")],
-        "tilt": [reduced.first_moment + 3 * k + 2 for k in range(magnets)],
+        "crab": np.array([2 * m + GLOBAL_UNKNOWNS.index("crab_rad")]),
+        "tilt": first_moment + 3 * np.arange(m) + 2,
     }
-    fixed = [name for name in NUISANCES if name not in problem.free]
-    gains = {}
-    for name in fixed:
-        hessian = reduced.hessian.copy()
-        for other in fixed:
-            if other != name:
-                hessian[indices[other], indices[other]] *= FIXING_WEIGHT
-        gain = float(reduced.descent @ solve_scaled(hessian, reduced.descent))
-        gains[name] = gain - len(indices[name])
-    best = max(gains, key=gains.__getitem__, default=None)
-    return best if best is not None and gains[best] > MIN_NUISANCE_GAIN else None
+    if state.motion is not None:
+        start = 2 * m + len(GLOBAL_UNKNOWNS)
+        for name, part in state.motion.groups.items():
+            if name in problem.free or name in names:
+                size = part.stop - part.start
+                indices[name] = np.arange(start, start + size)
+                start += size
+    return {name: indices[name] for name in names}
 
 
 def _result(

@@ -22,6 +22,7 @@ from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.field_model import MagnetOffsets
 from locatk.core.polaris.detection.fit import PassFit, PassState, fit_coarse, fit_pass
+from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
     PassPriors,
     PassWindow,
@@ -206,7 +207,7 @@ def detect_magnets_at(
     window, priors = prepared.window, prepared.priors[0]
     state = replace(
         hypothesis.fit.state,
-        position_m=positions_m + magnets.origin_m,
+        position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
         moment_am2=np.zeros((len(positions_m), 3)),
     )
     coarse = fit_coarse(window, state, priors)
@@ -518,12 +519,48 @@ def _find_missed_sources(prepared: PreparedPass, fit: PassFit) -> list[MagnetCan
     if fit.rms_sigma <= DEBRIS_RESIDUAL_SIGMAS:
         min_moment = 0.5 * MIN_MOMENT_RATIO * float(np.median(_horizontal_moments(state)))
     limit = MERGE_DISTANCE_HEIGHTS * state.height_m
+    candidates = [_in_floor_frame(candidate, state) for candidate in candidates]
     return [
         candidate
         for candidate in candidates
         if np.hypot(*candidate.moment_am2) > min_moment
         and np.all(np.linalg.norm(state.position_m - candidate.position_m, axis=1) > limit)
     ]
+
+
+def _in_floor_frame(candidate: MagnetCandidate, state: PassState) -> MagnetCandidate:
+    """Return a candidate whose position is along and across a path in the frame of the fit."""
+    if state.motion is None or state.motion.is_straight:
+        return candidate
+    along, across = candidate.position_m
+    poses = state.motion.poses(np.array([along]), state.crab_rad)
+    axes = poses.rotation[0, :2, :2]
+    return replace(
+        candidate,
+        position_m=poses.position_m[0, :2] + axes @ [0.0, across],
+        moment_am2=axes @ candidate.moment_am2,
+    )
+
+
+def _along_and_across(state: PassState) -> tuple[Array, Array]:
+    """Return the positions (M,), (M,) of the sources along the path, and across the bar there.
+
+    On a curve they belong to the sample at which the source was nearest to the bar.
+    """
+    poses = state.bar_poses
+    if poses is None:
+        return state.position_m[:, 0], state.position_m[:, 1]
+    offset = state.position_m[:, None] - poses.position_m[:, :2]
+    local = np.einsum("mni,nij->mnj", offset, poses.rotation[:, :2, :2])
+    nearest = np.abs(local[..., 0]).argmin(axis=1)
+    chosen = local[np.arange(len(local)), nearest]
+    return state.path_m[nearest] + chosen[:, 0], chosen[:, 1]
+
+
+def _rotation(angle_rad: float) -> Array:
+    """Return the matrix (2, 2) that turns row vectors clockwise: into axes turned by the angle."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 def _has_drift(window: PassWindow, fit: PassFit) -> bool:
@@ -573,10 +610,11 @@ def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassS
     """
     sensors, position = prepared.window.sensors_m, state.position_m
     margin = (SIDE_MARGIN_HEIGHTS + 0.5) * state.height_m
-    is_inside = position[:, 0] > state.path_m.min() + sensors[:, 0].min() - margin
-    is_inside &= position[:, 0] < state.path_m.max() + sensors[:, 0].max() + margin
-    is_inside &= position[:, 1] > sensors[:, 1].min() - margin
-    is_inside &= position[:, 1] < sensors[:, 1].max() + margin
+    along, across = _along_and_across(state)
+    is_inside = along > state.path_m.min() + sensors[:, 0].min() - margin
+    is_inside &= along < state.path_m.max() + sensors[:, 0].max() + margin
+    is_inside &= across > sensors[:, 1].min() - margin
+    is_inside &= across < sensors[:, 1].max() + margin
     moment = np.where(is_inside, _horizontal_moments(state), 0.0)
     by_strength = np.argsort(-moment)
     strongest = moment[by_strength[0]]
@@ -605,8 +643,9 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     """
     state, sensors = fit.state, prepared.window.sensors_m
     margin = SIDE_MARGIN_HEIGHTS * state.height_m
-    is_under_bar = state.position_m[:, 1] > sensors[:, 1].min() - margin
-    is_under_bar &= state.position_m[:, 1] < sensors[:, 1].max() + margin
+    _, across = _along_and_across(state)
+    is_under_bar = across > sensors[:, 1].min() - margin
+    is_under_bar &= across < sensors[:, 1].max() + margin
     moment = np.where(is_under_bar, _horizontal_moments(state), 0.0)
     expected = prepared.priors[0].moment_am2
     is_usual = moment > MIN_MOMENT_RATIO / 2 * expected
@@ -630,29 +669,42 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     if prepared.path_m is not None and prepared.window.path_m is not None:
         path = prepared.path_m + (state.path_m[0] - prepared.window.path_m[0])
     path_sigma = np.interp(index, prepared.group_index, fit.path_sigma_m) * noise_factor
+    motion = state.motion or Motion.straight(path, 0.0, state.height_m)
+    poses = motion.poses(path, state.crab_rad)
+    yaw = np.arctan2(poses.rotation[:, 1, 0], poses.rotation[:, 0, 0])
     # Near the magnets' middle, but at a sample whose position is well determined: it is not if
     # the field is weak there or the sample was damaged.
-    distance = np.abs(median_filter(path, 5) - position.mean(axis=0)[0])
+    distance = np.abs(median_filter(poses.position_m[:, 0], 5) - position.mean(axis=0)[0])
     reference = int(np.argmin(distance + 3 * path_sigma))
     rows = (3 * chosen[:, None] + np.arange(3)).ravel()
-    origin = path[reference] * np.array([1.0, np.tan(state.crab_rad)])
+    origin, heading = poses.position_m[reference, :2], float(yaw[reference])
+    into_array = _rotation(heading)
+    jacobian = np.eye(3)
+    jacobian[:2, :2] = into_array.T
+    jacobian = np.kron(np.eye(len(chosen)), jacobian)
+    covariance = jacobian @ fit.covariance[np.ix_(rows, rows)] @ jacobian.T
+    moment = state.moment_am2[chosen]
+    moment[:, :2] = moment[:, :2] @ into_array
+    forward, lateral = ((poses.position_m[:, :2] - origin) @ into_array).T
     moment = state.moment_am2[chosen]
     return DetectedMagnets(
         time_ns=int(samples.time_ns[prepared.first + reference]),
         first=prepared.first,
         stop=prepared.first + prepared.sample_count,
-        path_m=path - path[reference],
-        position_m=position - origin,
+        path_m=forward,
+        lateral_m=lateral,
+        heading_rad=yaw - heading,
+        position_m=(position - origin) @ into_array,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),
-        covariance=fit.covariance[np.ix_(rows, rows)] * noise_factor**2,
+        covariance=covariance * noise_factor**2,
         path_sigma_m=path_sigma,
-        crab_rad=state.crab_rad,
         is_path_estimated=prepared.window.path_m is None,
         height_m=state.height_m,
         height_sigma_m=fit.height_sigma_m * noise_factor,
         residual_sigma=fit.rms_sigma,
         robust_residual_sigma=fit.robust_sigma,
         origin_m=origin,
+        origin_heading_rad=heading,
         other_sources=len(state.position_m) - len(chosen),
     )
