@@ -44,7 +44,6 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.linalg.lapack import dposv
 from scipy.ndimage import median_filter
-from scipy.stats import chi2
 
 from locatk.core.errors import DegenerateError
 from locatk.core.least_squares import Indices, cauchy_loss, minimize
@@ -55,10 +54,10 @@ from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE, robust_sigma
 
 Array = NDArray[np.float64]
 
-STRAIGHT_NUISANCES = ("crab", "tilt")
-NUISANCES = (*STRAIGHT_NUISANCES, *MOTION_GROUPS)
+BUILD_NUISANCES = ("crab", "tilt", "depth")
+NUISANCES = (*BUILD_NUISANCES, *MOTION_GROUPS)
 """Unknowns that are fixed at zero until the samples contradict that: a path that is oblique to the
-bar, magnets that are not flat, and :mod:`locatk.core.polaris.detection.motion`."""
+bar, magnets that are not flat or not of one height, and :mod:`locatk.core.polaris.detection.motion`."""
 
 COARSE_NUISANCES = ("curve", "attitude")
 """Those that a coarse fit estimates: without them it takes the residual for further magnets."""
@@ -92,9 +91,19 @@ OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
 """Residual beyond which a sample is an outlier, and the fraction of such samples from which they
 are reweighted: four times that of a normal distribution."""
 
-NUISANCE_SIGNIFICANCE = 1e-3
-"""Probability that noise alone lowers the cost (chi-square distribution) by as much as is asked of
-a nuisance that is estimated."""
+DEBUG = False
+MIN_EVIDENCE = 18.4
+"""Twice the logarithm of the Bayes factor from which a nuisance is estimated: very strong evidence by
+Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2."""
+
+MAX_COARSE_RESIDUAL_SQUARE = 1.7
+"""Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
+that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak sources
+would be added."""
+
+CLUSTER_HEIGHTS = 1.0
+"""Length of path within which the errors of a sensor's samples are correlated, in heights: half the
+width of a magnet's field."""
 
 COARSE_ITERATIONS, COARSE_GAIN_FRACTION = 20, 1e-3
 """Steps that a coarse fit tries, and the relative decrease of the cost that ends it."""
@@ -124,6 +133,8 @@ class PassState:
         Mean distance moved in a sample period.
     height_m, skew_periods, crab_rad : float
         See :class:`~locatk.core.polaris.detection.window.PassPriors`.
+    depth_m : (M,) ndarray or None
+        Of the magnets below their common height; None if they are of one height.
     motion : Motion or None
         Curve, attitude and height along the path; None if it is straight and level.
     free : frozenset of str
@@ -137,6 +148,7 @@ class PassState:
     height_m: float
     skew_periods: float = 0.0
     crab_rad: float = 0.0
+    depth_m: Array | None = None
     motion: Motion | None = None
     free: frozenset[str] = frozenset()
 
@@ -200,9 +212,11 @@ def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> Pass
     with _degenerate_on_numerical_errors():
         problem = PassProblem(window, priors, weight, start)
         equations, converged = _minimize(problem, start, COARSE_ITERATIONS, COARSE_GAIN_FRACTION)
-        problem, equations, converged = _estimate_nuisances(
-            problem, equations, converged, COARSE_NUISANCES, COARSE_GAIN_FRACTION
-        )
+        size = np.abs(problem.residual(equations.projected))
+        if np.nanmean(size**2) > MAX_COARSE_RESIDUAL_SQUARE:
+            problem, equations, converged = _estimate_nuisances(
+                problem, equations, converged, COARSE_NUISANCES, COARSE_GAIN_FRACTION
+            )
         return _result(problem, equations.projected, weight, converged, reduced=None)
 
 
@@ -231,7 +245,7 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
         if problem.free != before:
             # Samples that only a wrong motion had made outliers count again.
             problem, equations, converged = _reweight(problem, equations, weight)
-        reduced = problem.with_free(problem.free | {*STRAIGHT_NUISANCES}).reduce(
+        reduced = problem.with_free(problem.free | {*BUILD_NUISANCES}).reduce(
             equations.projected
         )
         return _result(problem, equations.projected, weight, converged, reduced)
@@ -347,15 +361,33 @@ class ReducedEquations:
         The path's step is ``path - coupling @ x``; None if the path is known.
     band : (2, n) ndarray or None
         Tridiagonal block of the path.
+    inner, along, background : (C, n, k), (C, n), (C, n, D) ndarray
+        Derivatives of the samples, in units of their noise, by the unknowns before the mean step,
+        by the path, and by the backgrounds.
     """
 
     hessian: Array
     descent: Array
     first_moment: int
     full_diagonal: Array
+    inner: Array
+    along: Array
+    background: Array
     path: Array | None = None
     coupling: Array | None = None
     band: Array | None = None
+
+    def sample_changes(self, changes: Array) -> Array:
+        """Return the changes (C, n, k) of the samples by changes (q, k) of the unknowns.
+
+        The path changes with the unknowns as it does in the fit.
+        """
+        size, terms = self.inner.shape[2], self.background.shape[2]
+        levels = changes[size + 1 :].reshape(len(self.inner), terms, -1)
+        rows = self.inner @ changes[:size] + self.background @ levels
+        if self.coupling is not None:
+            rows -= self.along[:, :, None] * (self.coupling @ changes)
+        return np.asarray(rows)
 
 
 class PassEquations:
@@ -384,16 +416,17 @@ class PassEquations:
         limit = MAX_STEP_HEIGHTS * self.projected.state.height_m
         change *= min(1.0, limit / max(largest, 1e-12))
         if reduced.path is None or reduced.coupling is None:
-            return PassStep(change, None, 0.0)
+            return PassStep(change, reduced.first_moment, None, 0.0)
         path = reduced.path - reduced.coupling @ change
-        return PassStep(change, path, change[reduced.first_moment + 3 * m])
+        return PassStep(change, reduced.first_moment, path, change[reduced.first_moment + 3 * m])
 
 
 @dataclass(frozen=True)
 class PassStep:
-    """Step of the positions and global unknowns (first in ``change``), path and mean step."""
+    """Step of the unknowns before the moments (first in ``change``), path and mean step."""
 
     change: Array
+    first_moment: int
     path_m: Array | None
     mean_step_m: float
 
@@ -475,8 +508,13 @@ class PassProblem:
             start = 2 * m + len(GLOBAL_UNKNOWNS)
             change[columns] = step.change[start : start + len(columns)]
             motion = motion.with_added(change)
+        depth = state.depth_m
+        if "depth" in self.free:
+            depth = np.zeros(m) if depth is None else depth
+            depth = depth + step.change[step.first_moment - m : step.first_moment]
         return replace(
             state,
+            depth_m=depth,
             motion=motion,
             position_m=state.position_m + step.change[: 2 * m].reshape(2, m).T,
             path_m=state.path_m if step.path_m is None else state.path_m + step.path_m,
@@ -536,10 +574,11 @@ class PassProblem:
         sensors = self.window.sensors_m
         skew = np.outer(self.window.axis_order * state.skew_periods, self.local_step(state))
         position = state.position_m
+        height = state.height_m if state.depth_m is None else state.height_m + state.depth_m
         if poses is not None:
             offset = np.empty((len(state.path_m), len(position), 3))
             offset[..., :2] = poses.position_m[:, None, :2] - position
-            offset[..., 2] = (state.height_m + poses.position_m[:, 2])[:, None]
+            offset[..., 2] = poses.position_m[:, 2:] + height
             x, y, z = np.moveaxis(offset @ poses.rotation, -1, 0)
             # Sensors on the inside of a curve move less.
             speed = 1 - poses.yaw_rate * sensors[:, 1, None]
@@ -554,8 +593,31 @@ class PassProblem:
         return MagnetOffsets.from_components(
             along[:, :, None] + (sensors[:, 0, None] - position[:, 0])[:, None, None],
             across[:, None] + (sensors[:, 1, None] - position[:, 1])[:, None, None],
-            state.height_m,
+            height if isinstance(height, float) else height[None, None, None],
         )
+
+    def nuisance_sigmas(self, state: PassState) -> dict[str, Array]:
+        """Return the prior standard deviations of the unknowns of each nuisance."""
+        m, priors = len(state.position_m), self.priors
+        sigmas = {
+            "crab": np.array([priors.crab_sigma_rad]),
+            "tilt": np.full(m, priors.tilt_sigma * priors.moment_am2),
+            "depth": np.full(m, priors.depth_sigma_m),
+        }
+        if state.motion is not None:
+            of_motion = state.motion.sigmas
+            sigmas |= {name: of_motion[part] for name, part in state.motion.groups.items()}
+        return sigmas
+
+    def clusters(self, state: PassState) -> NDArray[np.intp]:
+        """Return the cluster (C, n) of each sample: a sensor over a stretch of the path.
+
+        Samples of a cluster may have errors in common, others have not.
+        """
+        length = CLUSTER_HEIGHTS * state.height_m
+        stretch = np.floor((state.path_m - state.path_m.min()) / length).astype(np.intp)
+        sensor = np.arange(self.shape[0]) // 3
+        return sensor[:, None] * (int(stretch.max()) + 1) + stretch
 
     def local_step(self, state: PassState) -> Array:
         """Return the step (n,) of a sample period around each sample, by a running median."""
@@ -614,6 +676,8 @@ class PassProblem:
             cost += ((getattr(state, name) - mean) / sigma) ** 2
         if state.motion is not None:
             cost += float(((state.motion.coefficients / state.motion.sigmas) ** 2).sum())
+        if state.depth_m is not None:
+            cost += float((state.depth_m**2).sum()) / self.priors.depth_sigma_m**2
         if self.window.path_m is None:
             excess, scale = self.excess_steps(state)
             cost += 2 * float(np.log1p(excess**2 / scale**2).sum())
@@ -659,7 +723,9 @@ class PassProblem:
         total_x, total_y, total_z = (by @ np.ones(m) for by in (by_x, by_y, by_z))
         tangent = np.tan(state.crab_rad)
         columns_free = self.motion_columns(state)
-        p = 2 * m + len(GLOBAL_UNKNOWNS) + len(columns_free)
+        g = 2 * m + len(GLOBAL_UNKNOWNS)
+        depth = slice(g + len(columns_free), g + len(columns_free) + m * ("depth" in self.free))
+        p = depth.stop
         columns = np.empty((*total_x.shape, p))
         skewed = np.outer(self.window.axis_order, self.local_step(state))
         if state.motion is None or (projected.poses is None and not len(columns_free)):
@@ -669,6 +735,7 @@ class PassProblem:
             columns[..., 2 * m + 1] = total_x * skewed
             columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
             along = total_x + tangent * total_y
+            columns[..., depth] = by_z[..., : depth.stop - depth.start]
         else:
             poses = projected.poses or state.motion.poses(state.path_m, state.crab_rad)
             for axis, inside in enumerate((slice(m), slice(m, 2 * m))):
@@ -681,7 +748,10 @@ class PassProblem:
             velocity, rate = state.motion.derivatives(state.path_m, state.crab_rad, columns_free)
             moved = self._motion_fields(totals, projected.offsets.fields(moments), velocity, rate)
             along = moved[..., 0]
-            columns[..., 2 * m + 2 :] = moved[..., 1:]
+            columns[..., 2 * m + 2 : depth.start] = moved[..., 1:]
+            if depth.stop > depth.start:
+                x, y, z = poses.rotation[:, 2].T[..., None]
+                columns[..., depth] = x * by_x + y * by_y + z * by_z
         inner = np.concatenate(
             [self.whiten(columns.reshape(channels, n, p)), projected.unit_fields], axis=2
         )
@@ -704,16 +774,24 @@ class PassProblem:
             hessian[index, index] += 1 / sigma**2
             descent[index] -= (getattr(state, name) - mean) / sigma**2
         if state.motion is not None and len(columns_free):
-            indices = np.arange(p - len(columns_free), p)
+            indices = np.arange(g, depth.start)
             information = 1 / state.motion.sigmas[columns_free] ** 2
             hessian[indices, indices] += information
             descent[indices] -= information * state.motion.coefficients[columns_free]
+        if depth.stop > depth.start:
+            information = 1 / self.priors.depth_sigma_m**2
+            indices = np.arange(depth.start, depth.stop)
+            hessian[indices, indices] += information
+            if state.depth_m is not None:
+                descent[depth] -= information * state.depth_m
         indices = np.arange(p, q)
         hessian[indices, indices] += self.moment_information(m)
         descent[p:q] -= self.moment_information(m) * state.moment_am2.ravel()
         if self.window.path_m is not None:
             hessian[q, q] += FIXING_WEIGHT
-            return ReducedEquations(hessian, descent, p, np.diag(hessian))
+            return ReducedEquations(
+                hessian, descent, p, np.diag(hessian), inner, along, self.background
+            )
         # The path: a tridiagonal block, coupled with all other unknowns.
         coupling = np.zeros((size, n))
         coupling[:q] = np.einsum("cn,cnq->qn", along, inner)
@@ -741,6 +819,9 @@ class PassProblem:
             descent=descent - coupling @ solved[:, -1],
             first_moment=p,
             full_diagonal=np.diag(hessian),
+            inner=inner,
+            along=along,
+            background=self.background,
             path=solved[:, -1],
             coupling=solved[:, :-1],
             band=band,
@@ -795,30 +876,58 @@ def _significant_nuisance(
     """Return the fixed nuisance that would explain the samples best; None if none is needed.
 
     A score test: the decrease of the cost is predicted from normal equations in which the nuisance
-    is free, in units of the residual. Of several significant ones, that of the least Bayesian
-    information criterion is chosen, which counts their unknowns.
+    is free. Its unit is not the noise but the variance of the score among clusters of samples that
+    the nuisance leaves unexplained (White, Econometrica 50 (1982) 1, section 3), because errors of
+    gains and axes of the sensors would else look like any nuisance. Of several significant ones,
+    that of the least Bayesian information criterion is chosen, which counts their unknowns.
     """
-    fixed = [name for name in allowed if name not in problem.free]
-    if not fixed or projected.state.motion is None:
+    fixed = [name for name in (*BUILD_NUISANCES, *MOTION_GROUPS) if name not in problem.free]
+    tested = [name for name in fixed if name in allowed]
+    if not tested or projected.state.motion is None:
         return None
     reduced = problem.with_free(problem.free | frozenset(fixed)).reduce(projected)
-    residual = problem.residual(projected)
-    unit = max(1.0, robust_sigma(residual)) ** 2
-    log_count = float(np.log(np.isfinite(residual).sum()))
+    sigmas = problem.nuisance_sigmas(projected.state)
     indices = _nuisance_indices(problem, projected.state, reduced.first_moment, fixed)
-    base = reduced.hessian.copy()
-    every = np.concatenate(list(indices.values()))
-    base[every, every] *= FIXING_WEIGHT
-    without = float(reduced.descent @ solve_scaled(base, reduced.descent))
-    best, least = None, np.inf
-    for name, own in indices.items():
-        hessian = base.copy()
-        hessian[own, own] /= FIXING_WEIGHT
-        gain = float(reduced.descent @ solve_scaled(hessian, reduced.descent)) - without
-        criterion = len(own) * log_count - gain / unit
-        if gain / unit > chi2.isf(NUISANCE_SIGNIFICANCE, len(own)) and criterion < least:
-            best, least = name, criterion
-    return best
+    clusters = problem.clusters(projected.state)
+    for group in (MOTION_GROUPS, BUILD_NUISANCES):
+        base = reduced.hessian.copy()
+        held = [name for name in fixed if group is BUILD_NUISANCES or name in MOTION_GROUPS]
+        every = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in held)])
+        base[every, every] *= FIXING_WEIGHT
+        without = float(reduced.descent @ solve_scaled(base, reduced.descent))
+        best, most = None, MIN_EVIDENCE
+        for name in (name for name in tested if name in group):
+            own = indices[name]
+            hessian = base.copy()
+            hessian[own, own] /= FIXING_WEIGHT
+            right = np.column_stack([reduced.descent, np.eye(len(hessian))[:, own]])
+            solved = solve_scaled(hessian, right)
+            gain = float(reduced.descent @ solved[:, 0]) - without
+            covariance = solved[own, 1:]
+            occam = 2 * np.log(sigmas[name]).sum() - np.linalg.slogdet(covariance)[1]
+            if gain < occam + MIN_EVIDENCE:
+                continue
+            # Unit variances and no correlations, if the residual was noise.
+            inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
+            changes = reduced.sample_changes(solved)
+            remaining = projected.residual - changes[..., 0]
+            rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
+            unit = max(1.0, float((cluster_sums(clusters, rows) ** 2).sum(axis=0).mean()))
+            evidence = gain / unit - (occam - len(own) * np.log(unit))
+            DEBUG and print(name, "gain", round(gain,1), "unit", round(unit,2), 'occam', round(occam,1), 'ev',round(evidence,1))
+            if evidence > most:
+                best, most = name, evidence
+        if best is not None:
+            return best
+    return None
+
+
+def cluster_sums(clusters: NDArray[np.intp], rows: Array) -> Array:
+    """Return the sums (K, k) of rows (C, n, k) over the clusters (C, n) 0 to K - 1."""
+    flat = rows.reshape(clusters.size, -1)
+    sums = np.zeros((int(clusters.max()) + 1, flat.shape[1]))
+    np.add.at(sums, clusters.ravel(), flat)
+    return sums
 
 
 def _nuisance_indices(
@@ -827,6 +936,7 @@ def _nuisance_indices(
     """Return the indices of the unknowns of each of the ``names`` in the normal equations."""
     m = len(state.position_m)
     indices = {
+        "depth": np.arange(first_moment - m, first_moment),
         "crab": np.array([2 * m + GLOBAL_UNKNOWNS.index("crab_rad")]),
         "tilt": first_moment + 3 * np.arange(m) + 2,
     }

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 MOTION_GROUPS = ("curve", "attitude", "height", "rocking")
 """Groups of coefficients, each of which is estimated as a whole."""
 
-YAW_SIGMAS_RAD = (0.5, 0.15, 0.08)
+YAW_SIGMAS_RAD = (0.5, 0.1, 0.04)
 """Standard deviations of the heading's polynomials over half a pass [rad]: a half pass of 0.1 m on
 a radius of 0.2 m is 0.5 rad. That of a change of curvature is a third of it, and of the change of
 this change a sixth."""
