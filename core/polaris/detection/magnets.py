@@ -695,7 +695,6 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     moment = state.moment_am2[chosen]
     moment[:, :2] = moment[:, :2] @ into_array
     forward, lateral = ((poses.position_m[:, :2] - origin) @ into_array).T
-    moment = state.moment_am2[chosen]
     return DetectedMagnets(
         time_ns=int(samples.time_ns[prepared.first + reference]),
         first=prepared.first,
