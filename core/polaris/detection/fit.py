@@ -92,9 +92,11 @@ OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
 are reweighted: four times that of a normal distribution."""
 
 DEBUG = False
-MIN_EVIDENCE = 18.4
-"""Twice the logarithm of the Bayes factor from which a nuisance is estimated: very strong evidence by
-Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2."""
+MIN_MOTION_EVIDENCE = 18.4
+"""Twice the logarithm of the Bayes factor from which a motion is estimated: a factor of 10,000, which
+leaves very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2) if one
+pass of a hundred has such a motion. Magnets are never quite flat, of one height and in line with the
+path: for them a factor of 1 is sufficient."""
 
 MAX_COARSE_RESIDUAL_SQUARE = 1.7
 """Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
@@ -889,13 +891,13 @@ def _significant_nuisance(
     sigmas = problem.nuisance_sigmas(projected.state)
     indices = _nuisance_indices(problem, projected.state, reduced.first_moment, fixed)
     clusters = problem.clusters(projected.state)
-    for group in (MOTION_GROUPS, BUILD_NUISANCES):
+    for group, min_evidence in ((MOTION_GROUPS, MIN_MOTION_EVIDENCE), (BUILD_NUISANCES, 0.0)):
         base = reduced.hessian.copy()
         held = [name for name in fixed if group is BUILD_NUISANCES or name in MOTION_GROUPS]
         every = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in held)])
         base[every, every] *= FIXING_WEIGHT
         without = float(reduced.descent @ solve_scaled(base, reduced.descent))
-        best, most = None, MIN_EVIDENCE
+        best, most = None, min_evidence
         for name in (name for name in tested if name in group):
             own = indices[name]
             hessian = base.copy()
@@ -905,7 +907,7 @@ def _significant_nuisance(
             gain = float(reduced.descent @ solved[:, 0]) - without
             covariance = solved[own, 1:]
             occam = 2 * np.log(sigmas[name]).sum() - np.linalg.slogdet(covariance)[1]
-            if gain < occam + MIN_EVIDENCE:
+            if gain < occam + min_evidence:
                 continue
             # Unit variances and no correlations, if the residual was noise.
             inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
