@@ -185,6 +185,8 @@ class PassFit:
     path_sigma_m : (n,) ndarray
         Of the path relative to the sample with the strongest field; 0 if the path is known.
     height_sigma_m : float
+    significance : (M,) ndarray
+        Square of each horizontal moment in standard deviations; ``inf`` after a coarse fit.
     converged : bool
     """
 
@@ -196,6 +198,7 @@ class PassFit:
     covariance: Array
     path_sigma_m: Array
     height_sigma_m: float
+    significance: Array
     converged: bool
 
 
@@ -310,7 +313,9 @@ def _minimize(
     problem: PassProblem, start: PassState, max_iterations: int, min_gain: float
 ) -> tuple[PassEquations, bool]:
     """Return the equations at the minimum near ``start``, and whether the fit converged."""
-    minimum = minimize(problem, start, max_iterations=max_iterations, min_gain=min_gain)
+    effort = problem.window.effort
+    iterations = min(max_iterations, effort.affordable_iterations(problem.work(start)))
+    minimum = minimize(problem, start, max_iterations=iterations, min_gain=min_gain)
     return minimum.equations, bool(minimum.converged[0])
 
 
@@ -491,8 +496,14 @@ class PassProblem:
         problem.free = free
         return problem
 
+    def work(self, state: PassState) -> float:
+        """Return the work of an iteration, in samples times unknowns."""
+        unknowns = 6 * len(state.position_m) + len(self.motion_columns(state))
+        return float(np.prod(self.shape) * unknowns)
+
     def linearize(self, state: PassState, problems: Indices) -> PassEquations:
         """Return the equations at a state."""
+        self.window.effort.spent += self.work(state)
         return PassEquations(self, self.project(state))
 
     def retract(self, state: PassState, step: PassStep) -> PassState:
@@ -969,9 +980,9 @@ def _result(
         unknowns += n
     correction = float(np.sqrt(count / max(count - unknowns, 1)))
     covariance, path_sigma = np.full((3 * m, 3 * m), np.nan), np.full(n, np.nan)
-    height_sigma = np.nan
+    height_sigma, significance = np.nan, np.full(m, np.inf)
     if reduced is not None:
-        covariance, path_sigma, height_sigma = _covariances(reduced, state)
+        covariance, path_sigma, height_sigma, significance = _covariances(reduced, state)
     return PassFit(
         state=state,
         residual=residual,
@@ -981,12 +992,18 @@ def _result(
         covariance=covariance,
         path_sigma_m=path_sigma,
         height_sigma_m=height_sigma,
+        significance=significance,
         converged=converged,
     )
 
 
-def _covariances(reduced: ReducedEquations, state: PassState) -> tuple[Array, Array, float]:
-    """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height."""
+def _covariances(
+    reduced: ReducedEquations, state: PassState
+) -> tuple[Array, Array, float, Array]:
+    """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height.
+
+    Last come the squares of the horizontal moments in standard deviations.
+    """
     m = len(state.position_m)
     full = solve_scaled(reduced.hessian, np.eye(len(reduced.hessian)))
     # From x, y and moment to x, y and angle.
@@ -1003,4 +1020,8 @@ def _covariances(reduced: ReducedEquations, state: PassState) -> tuple[Array, Ar
         coupled = np.einsum("nq,qr,nr->n", reduced.coupling, full, reduced.coupling, optimize=True)
         path = np.sqrt(np.maximum(np.diag(own) + coupled, 0.0))
     height = float(np.sqrt(full[2 * m, 2 * m]))
-    return jacobian @ full @ jacobian.T, path, height
+    horizontal = reduced.first_moment + 3 * np.arange(m)[:, None] + [0, 1]
+    of_moments = full[horizontal[:, :, None], horizontal[:, None, :]]
+    moments = state.moment_am2[:, :2, None]
+    significance = (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2))
+    return jacobian @ full @ jacobian.T, path, height, significance

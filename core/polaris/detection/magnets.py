@@ -205,6 +205,8 @@ def detect_magnets_at(
     """
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
+    if window.effort.is_exhausted:
+        raise DegenerateError("the effort for this pass is spent")
     state = replace(
         hypothesis.fit.state,
         position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
@@ -437,6 +439,8 @@ def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
         ]
         guesses.sort(key=lambda pair: pair[1].remaining)
         for timed, guess in guesses[:MAX_INITIAL_GUESSES]:
+            if prepared.window.effort.is_exhausted:
+                return
             try:
                 fit = _grow_fit(timed, guess)
             except DegenerateError:
@@ -466,7 +470,7 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
     fit = fit_coarse(coarse, state, priors)
     for _ in range(MAX_GROWTH_ROUNDS):
         missed = _find_missed_sources(prepared, fit)
-        if not missed:
+        if not missed or window.effort.is_exhausted:
             break
         before = fit
         fit = fit_coarse(coarse, _with_sources(fit.state, missed), priors)
@@ -478,13 +482,16 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
     if coarse.common_t and fit.shared_square > max(MAX_SHARED_SQUARE, 2 * fit.rms_sigma**2):
         information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
         window = replace(window, common_t=float(np.sqrt((fit.shared_square - 1) / information)))
+    state = _without_spurious_sources(fit.state, prepared)
     while True:
-        state = _without_spurious_sources(fit.state, prepared)
         fit = fit_pass(window, state, priors)
         if _has_drift(window, fit):
             window = replace(window, trend_terms=DRIFT_TREND_TERMS)
             fit = fit_pass(window, fit.state, priors)
-        if len(_without_spurious_sources(fit.state, prepared).position_m) == len(state.position_m):
+        is_significant = fit.significance > MIN_MAGNET_ENERGY
+        state = _without_spurious_sources(_select_sources(fit.state, is_significant), prepared)
+        is_complete = len(state.position_m) == len(fit.state.position_m)
+        if is_complete or window.effort.is_exhausted:
             return fit
 
 
