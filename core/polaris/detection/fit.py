@@ -98,6 +98,10 @@ leaves very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773
 pass of a hundred has such a motion. Magnets are never quite flat, of one height and in line with the
 path: for them a factor of 1 is sufficient."""
 
+FIXED_WORK_UNKNOWNS = 110
+"""Unknowns that would take as much time as the part of an iteration that does not depend on their
+number; measured."""
+
 MAX_COARSE_RESIDUAL_SQUARE = 1.7
 """Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
 that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak sources
@@ -499,7 +503,7 @@ class PassProblem:
     def work(self, state: PassState) -> float:
         """Return the work of an iteration, in samples times unknowns."""
         unknowns = 6 * len(state.position_m) + len(self.motion_columns(state))
-        return float(np.prod(self.shape) * unknowns)
+        return float(np.prod(self.shape) * (unknowns + FIXED_WORK_UNKNOWNS))
 
     def linearize(self, state: PassState, problems: Indices) -> PassEquations:
         """Return the equations at a state."""
@@ -622,15 +626,16 @@ class PassProblem:
             sigmas |= {name: of_motion[part] for name, part in state.motion.groups.items()}
         return sigmas
 
-    def clusters(self, state: PassState) -> NDArray[np.intp]:
-        """Return the cluster (C, n) of each sample: a sensor over a stretch of the path.
+    def clusters(self, state: PassState) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return two partitions (C, n) of the samples, by the number of the cluster.
 
-        Samples of a cluster may have errors in common, others have not.
+        Samples of a cluster may have errors in common: a sensor over a stretch of the path (field
+        of a magnet), and a sensor over the whole path (its gains and axes).
         """
         length = CLUSTER_HEIGHTS * state.height_m
         stretch = np.floor((state.path_m - state.path_m.min()) / length).astype(np.intp)
-        sensor = np.arange(self.shape[0]) // 3
-        return sensor[:, None] * (int(stretch.max()) + 1) + stretch
+        sensor = np.arange(self.shape[0])[:, None] // 3
+        return sensor * (int(stretch.max()) + 1) + stretch, sensor + 0 * stretch
 
     def local_step(self, state: PassState) -> Array:
         """Return the step (n,) of a sample period around each sample, by a running median."""
@@ -925,9 +930,11 @@ def _significant_nuisance(
             changes = reduced.sample_changes(solved)
             remaining = projected.residual - changes[..., 0]
             rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
-            unit = max(1.0, float((cluster_sums(clusters, rows) ** 2).sum(axis=0).mean()))
+            unit = max(
+                1.0,
+                *(float((cluster_sums(each, rows) ** 2).sum(axis=0).mean()) for each in clusters),
+            )
             evidence = gain / unit - (occam - len(own) * np.log(unit))
-            DEBUG and print(name, "gain", round(gain,1), "unit", round(unit,2), 'occam', round(occam,1), 'ev',round(evidence,1))
             if evidence > most:
                 best, most = name, evidence
         if best is not None:
