@@ -102,6 +102,8 @@ FIXED_WORK_UNKNOWNS = 110
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
 number; measured."""
 
+SANDWICH_FACTOR = 1.0
+
 MAX_COARSE_RESIDUAL_SQUARE = 1.7
 """Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
 that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak sources
@@ -989,7 +991,9 @@ def _result(
     covariance, path_sigma = np.full((3 * m, 3 * m), np.nan), np.full(n, np.nan)
     height_sigma, significance = np.nan, np.full(m, np.inf)
     if reduced is not None:
-        covariance, path_sigma, height_sigma, significance = _covariances(reduced, state)
+        covariance, path_sigma, height_sigma, significance = _covariances(
+            reduced, state, projected.residual, problem.clusters(state)
+        )
     return PassFit(
         state=state,
         residual=residual,
@@ -1005,11 +1009,16 @@ def _result(
 
 
 def _covariances(
-    reduced: ReducedEquations, state: PassState
+    reduced: ReducedEquations,
+    state: PassState,
+    residual: Array,
+    clusters: tuple[NDArray[np.intp], ...],
 ) -> tuple[Array, Array, float, Array]:
     """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height.
 
-    Last come the squares of the horizontal moments in standard deviations.
+    Last come the squares of the horizontal moments in standard deviations. Where residuals are
+    correlated within clusters, the standard deviations are those of the sandwich estimator (Liang
+    and Zeger, Biometrika 73 (1986) 13), which are never taken smaller than those of the model.
     """
     m = len(state.position_m)
     full = solve_scaled(reduced.hessian, np.eye(len(reduced.hessian)))
@@ -1031,4 +1040,11 @@ def _covariances(
     of_moments = full[horizontal[:, :, None], horizontal[:, None, :]]
     moments = state.moment_am2[:, :2, None]
     significance = (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2))
-    return jacobian @ full @ jacobian.T, path, height, significance
+    covariance = jacobian @ full @ jacobian.T
+    rows = reduced.sample_changes(full @ jacobian.T) * residual[..., None]
+    variance = np.diag(covariance)
+    for each in clusters:
+        sums = cluster_sums(each, rows)
+        variance = np.maximum(variance, SANDWICH_FACTOR * (sums**2).sum(axis=0))
+    inflation = np.sqrt(variance / np.diag(covariance))
+    return inflation[:, None] * covariance * inflation, path, height, significance

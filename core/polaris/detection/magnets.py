@@ -128,6 +128,11 @@ INITIAL_SEPARATION_HEIGHTS = 1.2
 """Least distance of two initial magnets, in heights: a closer one only corrects the shape of the
 other's field."""
 
+HIDDEN_DEBRIS_ANGLE, HIDDEN_DEBRIS_POSITION = 1.0, 0.25
+"""Variances of a magnet's direction, and of its x and y in squared heights, by a layer of dipoles of
+any direction: for a mean square moment of one magnet per squared height. They are integrals of the
+least-squares solution for one magnet over the plane of the sensors."""
+
 DEFAULT_SKEW_PERIODS = 0.2
 """Initial skew if the expected one is half a sample period or more."""
 
@@ -673,6 +678,27 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     return np.flatnonzero(moment > MIN_MOMENT_RATIO * np.median(usual))
 
 
+def _debris_covariance(
+    prepared: PreparedPass, fit: PassFit, magnets: NDArray[np.intp]
+) -> Array:
+    """Return the covariance (3 M, 3 M) of magnets by debris that is hidden under them.
+
+    Debris that was detected between the magnets shows how much of it is on the floor. What is
+    closer to a magnet than :data:`INITIAL_SEPARATION_HEIGHTS` changes its field, and is taken for
+    another position and moment of the magnet.
+    """
+    state, sensors = fit.state, prepared.window.sensors_m
+    moment = _horizontal_moments(state)
+    debris = np.setdiff1d(np.arange(len(moment)), magnets)
+    debris = debris[moment[debris] < MIN_MOMENT_RATIO * np.median(moment[magnets])]
+    width = np.ptp(sensors[:, 1]) + 2 * SIDE_MARGIN_HEIGHTS * state.height_m
+    # Two of three components of a moment of any direction are horizontal.
+    density = 1.5 * (moment[debris] ** 2).sum() / (width * np.ptp(state.path_m))
+    angle = HIDDEN_DEBRIS_ANGLE * density * state.height_m**2 / moment[magnets] ** 2
+    place = HIDDEN_DEBRIS_POSITION * density * state.height_m**4 / moment[magnets] ** 2
+    return np.diag(np.column_stack([place, place, angle]).ravel())
+
+
 def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> DetectedMagnets:
     """Return the magnets of a fit, in the array's frame at a sample near their middle."""
     state = fit.state
@@ -699,6 +725,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     jacobian[:2, :2] = into_array.T
     jacobian = np.kron(np.eye(len(chosen)), jacobian)
     covariance = jacobian @ fit.covariance[np.ix_(rows, rows)] @ jacobian.T
+    covariance = covariance * noise_factor**2 + _debris_covariance(prepared, fit, chosen)
     moment = state.moment_am2[chosen]
     moment[:, :2] = moment[:, :2] @ into_array
     forward, lateral = ((poses.position_m[:, :2] - origin) @ into_array).T
@@ -712,7 +739,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
         position_m=(position - origin) @ into_array,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),
-        covariance=covariance * noise_factor**2,
+        covariance=covariance,
         path_sigma_m=path_sigma,
         is_path_estimated=prepared.window.path_m is None,
         height_m=state.height_m,
