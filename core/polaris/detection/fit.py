@@ -92,17 +92,18 @@ OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
 are reweighted: four times that of a normal distribution."""
 
 DEBUG = False
-MIN_MOTION_EVIDENCE = 18.4
-"""Twice the logarithm of the Bayes factor from which a motion is estimated: a factor of 10,000, which
-leaves very strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2) if one
-pass of a hundred has such a motion. Magnets are never quite flat, of one height and in line with the
-path: for them a factor of 1 is sufficient."""
+MIN_EVIDENCE, MIN_MOTION_EVIDENCE = 10.0, 18.4
+"""Twice the logarithm of the Bayes factor from which a nuisance is estimated: very strong evidence
+(Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2). A motion needs a factor of 10,000,
+which leaves a hundred to one if one pass of a hundred has such a motion."""
 
 FIXED_WORK_UNKNOWNS = 110
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
 number; measured."""
 
-SANDWICH_FACTOR = 1.0
+MAX_UNEXPLAINED_FRACTION = 0.3
+"""Fraction of the samples' squares that magnets leave unexplained up to which nuisances are estimated.
+A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
 
 MAX_COARSE_RESIDUAL_SQUARE = 1.7
 """Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
@@ -256,9 +257,7 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
         if problem.free != before:
             # Samples that only a wrong motion had made outliers count again.
             problem, equations, converged = _reweight(problem, equations, weight)
-        reduced = problem.with_free(problem.free | {*BUILD_NUISANCES}).reduce(
-            equations.projected
-        )
+        reduced = problem.with_free(problem.free | {*BUILD_NUISANCES}).reduce(equations.projected)
         return _result(problem, equations.projected, weight, converged, reduced)
 
 
@@ -283,8 +282,13 @@ def _estimate_nuisances(
     allowed: tuple[str, ...],
     min_gain: float,
 ) -> tuple[PassProblem, PassEquations, bool]:
-    """Estimate nuisances one after the other, while the samples show another one."""
-    while True:
+    """Estimate nuisances one after the other, while the samples show another one.
+
+    None is estimated if the magnets explain too little of the samples: a fit from a wrong initial
+    guess would spend all effort on them.
+    """
+    unexplained = (equations.projected.residual**2).sum() / (problem.target**2).sum()
+    while unexplained < MAX_UNEXPLAINED_FRACTION:
         projected = equations.projected
         state = projected.state
         if state.motion is None:
@@ -297,6 +301,7 @@ def _estimate_nuisances(
         problem = problem.with_free(problem.free | {nuisance})
         state = replace(state, free=problem.free)
         equations, converged = _minimize(problem, state, NUISANCE_ITERATIONS, min_gain)
+    return problem, equations, converged
 
 
 @contextmanager
@@ -708,9 +713,7 @@ class PassProblem:
         excess = np.diff(state.path_m) - state.mean_step_m * self.gaps
         return excess, self.jitter_m * np.sqrt(self.gaps)
 
-    def _motion_fields(
-        self, totals: Array, fields: Array, velocity: Array, rate: Array
-    ) -> Array:
+    def _motion_fields(self, totals: Array, fields: Array, velocity: Array, rate: Array) -> Array:
         """Return the derivatives (N, 3, n, k) of the fields by motions of the bar.
 
         With the gradient G of the field f at a sensor s, a velocity v and a rotation w of the bar
@@ -903,15 +906,24 @@ def _significant_nuisance(
     """
     fixed = [name for name in (*BUILD_NUISANCES, *MOTION_GROUPS) if name not in problem.free]
     tested = [name for name in fixed if name in allowed]
+    if problem.window.path_m is not None:
+        # Errors of a path that was given would be taken for a curve.
+        tested = [name for name in tested if name != "curve"]
     if not tested or projected.state.motion is None:
         return None
     reduced = problem.with_free(problem.free | frozenset(fixed)).reduce(projected)
     sigmas = problem.nuisance_sigmas(projected.state)
     indices = _nuisance_indices(problem, projected.state, reduced.first_moment, fixed)
     clusters = problem.clusters(projected.state)
-    for group, min_evidence in ((MOTION_GROUPS, MIN_MOTION_EVIDENCE), (BUILD_NUISANCES, 0.0)):
+    # A path that is oblique to the bar is the simplest motion, and is not taken for a curve.
+    stages = (
+        (("crab",), MIN_EVIDENCE),
+        (MOTION_GROUPS, MIN_MOTION_EVIDENCE),
+        (BUILD_NUISANCES, MIN_EVIDENCE),
+    )
+    for group, min_evidence in stages:
         base = reduced.hessian.copy()
-        held = [name for name in fixed if group is BUILD_NUISANCES or name in MOTION_GROUPS]
+        held = [name for name in fixed if group is not MOTION_GROUPS or name in MOTION_GROUPS]
         every = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in held)])
         base[every, every] *= FIXING_WEIGHT
         without = float(reduced.descent @ solve_scaled(base, reduced.descent))
@@ -1045,6 +1057,6 @@ def _covariances(
     variance = np.diag(covariance)
     for each in clusters:
         sums = cluster_sums(each, rows)
-        variance = np.maximum(variance, SANDWICH_FACTOR * (sums**2).sum(axis=0))
+        variance = np.maximum(variance, (sums**2).sum(axis=0))
     inflation = np.sqrt(variance / np.diag(covariance))
     return inflation[:, None] * covariance * inflation, path, height, significance

@@ -77,6 +77,9 @@ SEARCH_SHARED_FIELD_T = 3e-6
 """Standard deviation of a field that all sensors share (motors, rotation in the Earth's field) that
 is allowed for while magnets are searched for [T]."""
 
+FORWARD_EFFORT_FRACTION = 0.5
+"""Fraction of the effort after which no further guess of forward travel is tried."""
+
 MAX_GROWTH_ROUNDS = 4
 """Maximum number of searches of the residual for more magnets."""
 
@@ -444,8 +447,9 @@ def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
         ]
         guesses.sort(key=lambda pair: pair[1].remaining)
         for timed, guess in guesses[:MAX_INITIAL_GUESSES]:
-            if prepared.window.effort.is_exhausted:
-                return
+            effort = prepared.window.effort
+            if effort.spent > (FORWARD_EFFORT_FRACTION if direction > 0 else 1.0) * effort.limit:
+                break
             try:
                 fit = _grow_fit(timed, guess)
             except DegenerateError:
@@ -678,9 +682,7 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     return np.flatnonzero(moment > MIN_MOMENT_RATIO * np.median(usual))
 
 
-def _debris_covariance(
-    prepared: PreparedPass, fit: PassFit, magnets: NDArray[np.intp]
-) -> Array:
+def _debris_covariance(prepared: PreparedPass, fit: PassFit, magnets: NDArray[np.intp]) -> Array:
     """Return the covariance (3 M, 3 M) of magnets by debris that is hidden under them.
 
     Debris that was detected between the magnets shows how much of it is on the floor. What is

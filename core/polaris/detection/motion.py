@@ -215,7 +215,10 @@ class Motion:
             start = groups["rocking"].start
             full_rate[:, 0, start : start + waves] = wave
             full_rate[:, :, start + waves :] = pitch_axis[:, :, None] * wave[:, None]
-            velocity[:, :, 2:], rate[:, :, 2:] = full_velocity[..., columns], full_rate[..., columns]
+            velocity[:, :, 2:], rate[:, :, 2:] = (
+                full_velocity[..., columns],
+                full_rate[..., columns],
+            )
         return poses, np.einsum("nji,njk->nik", rotation, velocity), rate
 
     @staticmethod

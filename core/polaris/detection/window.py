@@ -58,7 +58,7 @@ MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
 
-MAX_EFFORT = 7e7
+MAX_EFFORT = 9e7
 """Work that a pass may take, in samples times unknowns of all iterations: about a second of a
 processor. A hundred sources under a bar in a cluttered hall would take minutes."""
 

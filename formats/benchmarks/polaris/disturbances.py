@@ -201,7 +201,9 @@ class DisturbedPass:
     angle_rad: Array
 
 
-def simulate_disturbed(disturbance: Disturbance, seed: int, tags: Tags | None = None) -> DisturbedPass:
+def simulate_disturbed(
+    disturbance: Disturbance, seed: int, tags: Tags | None = None
+) -> DisturbedPass:
     """Simulate a pass over a tag with random id, heading and lateral offset."""
     rng = np.random.default_rng(seed)
     tags = tags or Tags()
@@ -216,7 +218,10 @@ def simulate_disturbed(disturbance: Disturbance, seed: int, tags: Tags | None = 
     path = BarPath(disturbance, rng)
     moment = tags.magnet.moment * rng.normal(1, 0.03, len(angle))
     bits = np.column_stack(
-        [rng.uniform(-0.09, 0.09, (disturbance.debris, 2)), rng.uniform(0, 1e-3, disturbance.debris)]
+        [
+            rng.uniform(-0.09, 0.09, (disturbance.debris, 2)),
+            rng.uniform(0, 1e-3, disturbance.debris),
+        ]
     )
     low, high = np.log(disturbance.debris_moment)
     bit_moments = rng.normal(size=bits.shape)
@@ -241,7 +246,9 @@ def simulate_disturbed(disturbance: Disturbance, seed: int, tags: Tags | None = 
     earth = EARTH_T * np.array([0.4 * math.cos(north), 0.4 * math.sin(north), -0.9])
     cylinders = [
         magpylib.magnet.Cylinder(
-            polarization=tags.magnet.remanence_t * strength * np.array([math.cos(a), math.sin(a), 0]),
+            polarization=tags.magnet.remanence_t
+            * strength
+            * np.array([math.cos(a), math.sin(a), 0]),
             dimension=(tags.magnet.diameter_m, tags.magnet.height_m),
             position=(x, y, 0.0),
         )
