@@ -117,7 +117,8 @@ class MagnetOffsets:
     def gradients(self, moments: Array) -> tuple[Array, Array, Array]:
         """Return the derivatives of the magnets' fields along x, y and z [T/m].
 
-        Each is (N, 3, n, M); ``moments`` is (M, 3) or (n, M, 3) in A m^2. They are those of point dipoles: the
+        Each is (N, 3, n, M); ``moments`` is (M, 3) or (n, M, 3) in A m^2. They are those
+        of point dipoles: the
         disc correction would change a step of the fit by a hundredth, and not its minimum.
         """
         by_axis = np.moveaxis(moments if moments.ndim == 3 else moments[None], -1, 0)

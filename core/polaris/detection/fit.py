@@ -57,7 +57,8 @@ Array = NDArray[np.float64]
 BUILD_NUISANCES = ("crab", "tilt", "depth")
 NUISANCES = (*BUILD_NUISANCES, *MOTION_GROUPS)
 """Unknowns that are fixed at zero until the samples contradict that: a path that is oblique to the
-bar, magnets that are not flat or not of one height, and :mod:`locatk.core.polaris.detection.motion`."""
+bar, magnets that are not flat or not of one height, and the groups of
+:mod:`locatk.core.polaris.detection.motion`."""
 
 COARSE_NUISANCES = ("curve", "attitude")
 """Those that a coarse fit estimates: without them it takes the residual for further magnets."""
@@ -94,21 +95,21 @@ are reweighted: four times that of a normal distribution."""
 DEBUG = False
 MIN_EVIDENCE, MIN_MOTION_EVIDENCE = 10.0, 18.4
 """Twice the logarithm of the Bayes factor from which a nuisance is estimated: very strong evidence
-(Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2). A motion needs a factor of 10,000,
-which leaves a hundred to one if one pass of a hundred has such a motion."""
+(Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2). A motion needs a factor of
+10,000, which leaves a hundred to one if one pass of a hundred has such a motion."""
 
 FIXED_WORK_UNKNOWNS = 110
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
 number; measured."""
 
 MAX_UNEXPLAINED_FRACTION = 0.3
-"""Fraction of the samples' squares that magnets leave unexplained up to which nuisances are estimated.
-A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
+"""Fraction of the samples' squares that magnets leave unexplained up to which nuisances are
+estimated. A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
 
 MAX_COARSE_RESIDUAL_SQUARE = 1.7
 """Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
-that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak sources
-would be added."""
+that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak
+sources would be added."""
 
 CLUSTER_HEIGHTS = 1.0
 """Length of path within which the errors of a sensor's samples are correlated, in heights: half the
@@ -1053,7 +1054,9 @@ def _covariances(
     moments = state.moment_am2[:, :2, None]
     significance = (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2))
     covariance = jacobian @ full @ jacobian.T
-    rows = reduced.sample_changes(full @ jacobian.T) * residual[..., None]
+    # A residual that is larger everywhere scales the whole covariance later.
+    relative = residual / max(1.0, robust_sigma(residual))
+    rows = reduced.sample_changes(full @ jacobian.T) * relative[..., None]
     variance = np.diag(covariance)
     for each in clusters:
         sums = cluster_sums(each, rows)

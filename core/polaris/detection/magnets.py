@@ -24,6 +24,7 @@ from locatk.core.polaris.detection.field_model import MagnetOffsets
 from locatk.core.polaris.detection.fit import PassFit, PassState, fit_coarse, fit_pass
 from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
+    MAX_EFFORT,
     PassPriors,
     PassWindow,
     PreparedPass,
@@ -132,8 +133,8 @@ INITIAL_SEPARATION_HEIGHTS = 1.2
 other's field."""
 
 HIDDEN_DEBRIS_ANGLE, HIDDEN_DEBRIS_POSITION = 1.0, 0.25
-"""Variances of a magnet's direction, and of its x and y in squared heights, by a layer of dipoles of
-any direction: for a mean square moment of one magnet per squared height. They are integrals of the
+"""Variances of a magnet's direction, and of its x and y in squared heights, by a layer of
+dipoles of any direction: for a mean square moment of one magnet per squared height. They are integrals of the
 least-squares solution for one magnet over the plane of the sensors."""
 
 DEFAULT_SKEW_PERIODS = 0.2
@@ -213,6 +214,8 @@ def detect_magnets_at(
     """
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
+    # The grid of a dense tag is the last resort, and has effort of its own.
+    window.effort.limit = 2 * MAX_EFFORT
     if window.effort.is_exhausted:
         raise DegenerateError("the effort for this pass is spent")
     state = replace(
@@ -497,7 +500,10 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
         if _has_drift(window, fit):
             window = replace(window, trend_terms=DRIFT_TREND_TERMS)
             fit = fit_pass(window, fit.state, priors)
+        moment = _horizontal_moments(fit.state)
+        # Magnets of a dense tag are correlated, and need not be significant alone.
         is_significant = fit.significance > MIN_MAGNET_ENERGY
+        is_significant |= moment > MIN_MOMENT_RATIO * moment.max()
         state = _without_spurious_sources(_select_sources(fit.state, is_significant), prepared)
         is_complete = len(state.position_m) == len(fit.state.position_m)
         if is_complete or window.effort.is_exhausted:
@@ -576,7 +582,7 @@ def _along_and_across(state: PassState) -> tuple[Array, Array]:
 
 
 def _rotation(angle_rad: float) -> Array:
-    """Return the matrix (2, 2) that turns row vectors clockwise: into axes turned by the angle."""
+    """Return the matrix (2, 2) that turns row vectors into axes turned by the angle."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[cos, -sin], [sin, cos]])
 

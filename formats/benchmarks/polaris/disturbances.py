@@ -3,8 +3,8 @@
 The generator shares no code with the simulator and the solver: the bar follows a curve, its
 attitude and height vary along the path, iron lies around the magnets, and the discs are cylinders
 (magpylib). The axes of a sensor are converted one after the other, with the noise of the published
-recordings (0.86, 0.89 and 1.24 uT), rounded to counts of 0.15 and 0.24 uT, an offset of each axis of
-each sensor, and the Earth's field, which rotates with the bar.
+recordings (0.86, 0.89 and 1.24 uT), rounded to counts of 0.15 and 0.24 uT, an offset of each axis
+of each sensor, and the Earth's field, which rotates with the bar.
 
 Estimated and true magnets are compared in the frame of the array at the time of the detection. The
 NEES (normalised estimation error squared) is that of single magnets, per degree of freedom: 1 is
@@ -158,7 +158,7 @@ class BarPath:
         return float(np.exp(self.rng.uniform(low, high)))
 
     def at(self, distance_m: Array) -> tuple[Array, Array]:
-        """Return positions (n, 3) and rotations (n, 3, 3) of the bar: yaw, then pitch, then roll."""
+        """Return positions (n, 3) and rotations (n, 3, 3) of the bar: yaw, pitch, roll."""
         x, y, z, roll, pitch, yaw = (
             np.interp(distance_m, self.distance_m, each) for each in self.pose.T
         )
@@ -343,7 +343,7 @@ def _magnet_errors(disturbed: DisturbedPass, detection: TagDetection) -> tuple[A
 
 
 def nees(outcomes: Sequence[DisturbedOutcome]) -> tuple[float, float]:
-    """Return the mean NEES of positions and of angles per degree of freedom; ``nan`` without any."""
+    """Return the mean NEES of positions and of angles per degree of freedom."""
     errors = [each.magnets for each in outcomes if len(each.magnets)]
     if not errors:
         return math.nan, math.nan
@@ -369,6 +369,6 @@ def disturbance_figures() -> Iterator[Figure]:
                      "of the same passes", 0.0)  # fmt: skip
         for what, value in zip(("position", "angle"), nees(outcomes), strict=True):
             yield Figure(f"{name}: NEES of a magnet's {what}", value, "per degree of freedom",
-                         "mean of the magnets that were read; 0.5 to 2 is the goal", 2.0)  # fmt: skip
-    yield Figure("disturbed passes: longest", max(durations), "s",
-                 f"processor time of solve(), of {len(durations)} passes", 1.0, workload="numpy")  # fmt: skip
+                         "mean of the magnets that were read; goal: 0.5 to 2", 2.0)  # fmt: skip
+    how = f"processor time of solve(), of {len(durations)} passes"
+    yield Figure("disturbed passes: longest", max(durations), "s", how, 1.0)
