@@ -133,9 +133,9 @@ INITIAL_SEPARATION_HEIGHTS = 1.2
 other's field."""
 
 HIDDEN_DEBRIS_ANGLE, HIDDEN_DEBRIS_POSITION = 1.0, 0.25
-"""Variances of a magnet's direction, and of its x and y in squared heights, by a layer of
-dipoles of any direction: for a mean square moment of one magnet per squared height. They are integrals of the
-least-squares solution for one magnet over the plane of the sensors."""
+"""Variances of a magnet's direction, and of its x and y in squared heights, by a layer of dipoles
+of any direction whose mean square moment on a squared height is that of the magnet. They are
+integrals of the least-squares solution for one magnet over the plane of the sensors."""
 
 DEFAULT_SKEW_PERIODS = 0.2
 """Initial skew if the expected one is half a sample period or more."""

@@ -35,6 +35,7 @@ from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import cell_positions, symbol_angles
 from locatk.formats.benchmarks.figures import Duration, Figure
+from locatk.formats.benchmarks.polaris.disturbances import disturbance_figures
 from locatk.formats.benchmarks.polaris.passes import pass_figures
 from locatk.formats.benchmarks.polaris.speed import speed_figures
 from locatk.formats.benchmarks.timing import run_single_threaded, time_each
@@ -72,7 +73,12 @@ AUTHORS = {"default": "authors", "varying": "authors, ten runs of the set"}
 
 def figures(data: Path) -> list[Figure]:
     """Return all figures of Polaris; ``data`` is the folder of published recordings."""
-    return [*published_figures(data / "polaris"), *pass_figures(), *speed_figures()]
+    return [
+        *published_figures(data / "polaris"),
+        *pass_figures(),
+        *disturbance_figures(),
+        *speed_figures(),
+    ]
 
 
 # ---- the published runs
