@@ -803,11 +803,11 @@ class PassProblem:
             hessian[indices, indices] += information
             descent[indices] -= information * state.motion.coefficients[columns_free]
         if depth.stop > depth.start:
-            information = 1 / self.priors.depth_sigma_m**2
+            depth_information = 1 / self.priors.depth_sigma_m**2
             indices = np.arange(depth.start, depth.stop)
-            hessian[indices, indices] += information
+            hessian[indices, indices] += depth_information
             if state.depth_m is not None:
-                descent[depth] -= information * state.depth_m
+                descent[depth] -= depth_information * state.depth_m
         indices = np.arange(p, q)
         hessian[indices, indices] += self.moment_information(m)
         descent[p:q] -= self.moment_information(m) * state.moment_am2.ravel()

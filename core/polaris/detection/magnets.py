@@ -731,8 +731,8 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     into_array = _rotation(heading)
     jacobian = np.eye(3)
     jacobian[:2, :2] = into_array.T
-    jacobian = np.kron(np.eye(len(chosen)), jacobian)
-    covariance = jacobian @ fit.covariance[np.ix_(rows, rows)] @ jacobian.T
+    by_magnet = np.kron(np.eye(len(chosen)), jacobian)
+    covariance = by_magnet @ fit.covariance[np.ix_(rows, rows)] @ by_magnet.T
     covariance = covariance * noise_factor**2 + _debris_covariance(prepared, fit, chosen)
     moment = state.moment_am2[chosen]
     moment[:, :2] = moment[:, :2] @ into_array

@@ -226,5 +226,7 @@ class Motion:
         """Return the polynomials (n, k) of the heading, zero in the middle, and their slopes."""
         terms = np.eye(len(YAW_SIGMAS_RAD) + 1)[1:].T
         legendre = np.polynomial.legendre
-        basis = legendre.legval(unit, terms) - legendre.legval(0.0, terms)[:, None]
-        return basis.T, legendre.legval(unit, legendre.legder(terms)).T
+        middle = legendre.legval(np.zeros(1), terms)
+        basis = legendre.legval(unit, terms) - middle
+        slope = legendre.legval(unit, legendre.legder(terms))
+        return np.asarray(basis.T, float), np.asarray(slope.T, float)
