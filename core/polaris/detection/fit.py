@@ -48,14 +48,20 @@ from scipy.ndimage import median_filter
 from locatk.core.errors import DegenerateError
 from locatk.core.least_squares import Indices, cauchy_loss, minimize
 from locatk.core.polaris.detection.field_model import MagnetOffsets
+from locatk.core.polaris.detection.motion import MOTION_GROUPS, BarPoses, Motion
 from locatk.core.polaris.detection.window import PassPriors, PassWindow, trend_basis
 from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE, robust_sigma
 
 Array = NDArray[np.float64]
 
-NUISANCES = ("crab", "tilt")
+BUILD_NUISANCES = ("crab", "tilt", "depth")
+NUISANCES = (*BUILD_NUISANCES, *MOTION_GROUPS)
 """Unknowns that are fixed at zero until the samples contradict that: a path that is oblique to the
-bar, and magnets that are not flat."""
+bar, magnets that are not flat or not of one height, and the groups of
+:mod:`locatk.core.polaris.detection.motion`."""
+
+COARSE_NUISANCES = ("curve", "attitude")
+"""Those that a coarse fit estimates: without them it takes the residual for further magnets."""
 
 GLOBAL_UNKNOWNS = ("height_m", "skew_periods", "crab_rad")
 """Attributes of :class:`PassState` that hold one number for the whole pass."""
@@ -86,9 +92,27 @@ OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
 """Residual beyond which a sample is an outlier, and the fraction of such samples from which they
 are reweighted: four times that of a normal distribution."""
 
-MIN_NUISANCE_GAIN = 9.0
-"""Decrease of the cost beyond one per unknown, in units of the noise, from which a nuisance is
-estimated: three standard deviations."""
+MIN_EVIDENCE, MIN_MOTION_EVIDENCE = 10.0, 18.4
+"""Twice the logarithm of the Bayes factor from which a nuisance is estimated: very strong evidence
+(Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2). A motion needs a factor of
+10,000, which leaves a hundred to one if one pass of a hundred has such a motion."""
+
+FIXED_WORK_UNKNOWNS = 110
+"""Unknowns that would take as much time as the part of an iteration that does not depend on their
+number; measured."""
+
+MAX_UNEXPLAINED_FRACTION = 0.3
+"""Fraction of the samples' squares that magnets leave unexplained up to which nuisances are
+estimated. A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
+
+MAX_COARSE_RESIDUAL_SQUARE = 1.7
+"""Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
+that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak
+sources would be added."""
+
+CLUSTER_HEIGHTS = 1.0
+"""Length of path within which the errors of a sensor's samples are correlated, in heights: half the
+width of a magnet's field."""
 
 COARSE_ITERATIONS, COARSE_GAIN_FRACTION = 20, 1e-3
 """Steps that a coarse fit tries, and the relative decrease of the cost that ends it."""
@@ -118,6 +142,12 @@ class PassState:
         Mean distance moved in a sample period.
     height_m, skew_periods, crab_rad : float
         See :class:`~locatk.core.polaris.detection.window.PassPriors`.
+    depth_m : (M,) ndarray or None
+        Of the magnets below their common height; None if they are of one height.
+    motion : Motion or None
+        Curve, attitude and height along the path; None if it is straight and level.
+    free : frozenset of str
+        :data:`NUISANCES` that are estimated.
     """
 
     position_m: Array
@@ -127,6 +157,16 @@ class PassState:
     height_m: float
     skew_periods: float = 0.0
     crab_rad: float = 0.0
+    depth_m: Array | None = None
+    motion: Motion | None = None
+    free: frozenset[str] = frozenset()
+
+    @property
+    def bar_poses(self) -> BarPoses | None:
+        """Poses of the bar at each sample; None if the path is straight and level."""
+        if self.motion is None or self.motion.is_straight:
+            return None
+        return self.motion.poses(self.path_m, self.crab_rad)
 
 
 @dataclass(frozen=True)
@@ -152,6 +192,8 @@ class PassFit:
     path_sigma_m : (n,) ndarray
         Of the path relative to the sample with the strongest field; 0 if the path is known.
     height_sigma_m : float
+    significance : (M,) ndarray
+        Square of each horizontal moment in standard deviations; ``inf`` after a coarse fit.
     converged : bool
     """
 
@@ -163,11 +205,15 @@ class PassFit:
     covariance: Array
     path_sigma_m: Array
     height_sigma_m: float
+    significance: Array
     converged: bool
 
 
 def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> PassFit:
-    """Improve an initial guess, without outlier rejection, nuisances and covariance.
+    """Improve an initial guess, without outlier rejection and covariance.
+
+    Of the nuisances, only :data:`COARSE_NUISANCES` are estimated, and only if the samples show
+    any.
 
     Raises
     ------
@@ -178,6 +224,11 @@ def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> Pass
     with _degenerate_on_numerical_errors():
         problem = PassProblem(window, priors, weight, start)
         equations, converged = _minimize(problem, start, COARSE_ITERATIONS, COARSE_GAIN_FRACTION)
+        size = np.abs(problem.residual(equations.projected))
+        if np.nanmean(size**2) > MAX_COARSE_RESIDUAL_SQUARE:
+            problem, equations, converged = _estimate_nuisances(
+                problem, equations, converged, COARSE_NUISANCES, COARSE_GAIN_FRACTION
+            )
         return _result(problem, equations.projected, weight, converged, reduced=None)
 
 
@@ -198,18 +249,59 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
         equations, converged = _minimize(problem, start, FINE_ITERATIONS, gain)
         if _has_outliers(problem.residual(equations.projected)):
             for _ in range(REWEIGHTING_ROUNDS):
-                factor = _student_weights(problem, equations.projected, weight)
-                problem = PassProblem(window, priors, weight * factor, start)
-                state = equations.projected.state
-                equations, converged = _minimize(problem, state, REWEIGHTED_ITERATIONS, gain)
-        while True:
-            projected = equations.projected
-            reduced = problem.with_free(frozenset(NUISANCES)).reduce(projected)
-            nuisance = _significant_nuisance(problem, reduced, len(start.position_m))
-            if nuisance is None:
-                return _result(problem, projected, weight, converged, reduced)
-            problem = problem.with_free(problem.free | {nuisance})
-            equations, converged = _minimize(problem, projected.state, NUISANCE_ITERATIONS, gain)
+                problem, equations, converged = _reweight(problem, equations, weight)
+        before = problem.free
+        problem, equations, converged = _estimate_nuisances(
+            problem, equations, converged, NUISANCES, gain
+        )
+        if problem.free != before:
+            # Samples that only a wrong motion had made outliers count again.
+            problem, equations, converged = _reweight(problem, equations, weight)
+        reduced = problem.with_free(problem.free | {*BUILD_NUISANCES}).reduce(equations.projected)
+        return _result(problem, equations.projected, weight, converged, reduced)
+
+
+def _reweight(
+    problem: PassProblem, equations: PassEquations, weight: Array
+) -> tuple[PassProblem, PassEquations, bool]:
+    """Fit again with samples weighted by their residuals; with equal weights without outliers."""
+    projected = equations.projected
+    if _has_outliers(problem.unweighted_residual(projected, weight)):
+        weight = weight * _student_weights(problem, projected, weight)
+    problem = PassProblem(problem.window, problem.priors, weight, projected.state)
+    equations, converged = _minimize(
+        problem, projected.state, REWEIGHTED_ITERATIONS, FINE_GAIN_FRACTION
+    )
+    return problem, equations, converged
+
+
+def _estimate_nuisances(
+    problem: PassProblem,
+    equations: PassEquations,
+    converged: bool,
+    allowed: tuple[str, ...],
+    min_gain: float,
+) -> tuple[PassProblem, PassEquations, bool]:
+    """Estimate nuisances one after the other, while the samples show another one.
+
+    None is estimated if the magnets explain too little of the samples: a fit from a wrong initial
+    guess would spend all effort on them.
+    """
+    unexplained = (equations.projected.residual**2).sum() / (problem.target**2).sum()
+    while unexplained < MAX_UNEXPLAINED_FRACTION:
+        projected = equations.projected
+        state = projected.state
+        if state.motion is None:
+            middle = float(state.position_m[:, 0].mean())
+            state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
+            projected = replace(projected, state=state)
+        nuisance = _significant_nuisance(problem, projected, allowed)
+        if nuisance is None:
+            return problem, equations, converged
+        problem = problem.with_free(problem.free | {nuisance})
+        state = replace(state, free=problem.free)
+        equations, converged = _minimize(problem, state, NUISANCE_ITERATIONS, min_gain)
+    return problem, equations, converged
 
 
 @contextmanager
@@ -232,7 +324,9 @@ def _minimize(
     problem: PassProblem, start: PassState, max_iterations: int, min_gain: float
 ) -> tuple[PassEquations, bool]:
     """Return the equations at the minimum near ``start``, and whether the fit converged."""
-    minimum = minimize(problem, start, max_iterations=max_iterations, min_gain=min_gain)
+    effort = problem.window.effort
+    iterations = min(max_iterations, effort.affordable_iterations(problem.work(start)))
+    minimum = minimize(problem, start, max_iterations=iterations, min_gain=min_gain)
     return minimum.equations, bool(minimum.converged[0])
 
 
@@ -246,6 +340,8 @@ class ProjectedState:
     Attributes
     ----------
     state : PassState
+    poses : BarPoses or None
+        None if the path is straight and level.
     offsets : MagnetOffsets
     unit_fields : (3 N, n, 3 M) ndarray
         Fields of unit moments in units of the noise.
@@ -258,6 +354,7 @@ class ProjectedState:
     """
 
     state: PassState
+    poses: BarPoses | None
     offsets: MagnetOffsets
     unit_fields: Array
     cross: Array
@@ -282,15 +379,33 @@ class ReducedEquations:
         The path's step is ``path - coupling @ x``; None if the path is known.
     band : (2, n) ndarray or None
         Tridiagonal block of the path.
+    inner, along, background : (C, n, k), (C, n), (C, n, D) ndarray
+        Derivatives of the samples, in units of their noise, by the unknowns before the mean step,
+        by the path, and by the backgrounds.
     """
 
     hessian: Array
     descent: Array
     first_moment: int
     full_diagonal: Array
+    inner: Array
+    along: Array
+    background: Array
     path: Array | None = None
     coupling: Array | None = None
     band: Array | None = None
+
+    def sample_changes(self, changes: Array) -> Array:
+        """Return the changes (C, n, k) of the samples by changes (q, k) of the unknowns.
+
+        The path changes with the unknowns as it does in the fit.
+        """
+        size, terms = self.inner.shape[2], self.background.shape[2]
+        levels = changes[size + 1 :].reshape(len(self.inner), terms, -1)
+        rows = self.inner @ changes[:size] + self.background @ levels
+        if self.coupling is not None:
+            rows -= self.along[:, :, None] * (self.coupling @ changes)
+        return np.asarray(rows)
 
 
 class PassEquations:
@@ -319,16 +434,17 @@ class PassEquations:
         limit = MAX_STEP_HEIGHTS * self.projected.state.height_m
         change *= min(1.0, limit / max(largest, 1e-12))
         if reduced.path is None or reduced.coupling is None:
-            return PassStep(change, None, 0.0)
+            return PassStep(change, reduced.first_moment, None, 0.0)
         path = reduced.path - reduced.coupling @ change
-        return PassStep(change, path, change[reduced.first_moment + 3 * m])
+        return PassStep(change, reduced.first_moment, path, change[reduced.first_moment + 3 * m])
 
 
 @dataclass(frozen=True)
 class PassStep:
-    """Step of the positions and global unknowns (first in ``change``), path and mean step."""
+    """Step of the unknowns before the moments (first in ``change``), path and mean step."""
 
     change: Array
+    first_moment: int
     path_m: Array | None
     mean_step_m: float
 
@@ -354,7 +470,7 @@ class PassProblem:
     ) -> None:
         self.window, self.priors = window, priors
         self.jitter_m = priors.jitter_fraction * abs(start.mean_step_m) + 1e-6
-        self.free: frozenset[str] = frozenset()
+        self.free = start.free
         self.gaps = np.diff(window.time_periods)
         n, sensors, _ = window.field_t.shape
         self.shape = (3 * sensors, n)
@@ -391,8 +507,14 @@ class PassProblem:
         problem.free = free
         return problem
 
+    def work(self, state: PassState) -> float:
+        """Return the work of an iteration, in samples times unknowns."""
+        unknowns = 6 * len(state.position_m) + len(self.motion_columns(state))
+        return float(np.prod(self.shape) * (unknowns + FIXED_WORK_UNKNOWNS))
+
     def linearize(self, state: PassState, problems: Indices) -> PassEquations:
         """Return the equations at a state."""
+        self.window.effort.spent += self.work(state)
         return PassEquations(self, self.project(state))
 
     def retract(self, state: PassState, step: PassStep) -> PassState:
@@ -404,8 +526,20 @@ class PassProblem:
         }
         low, high = (ratio * state.height_m for ratio in HEIGHT_STEP_RATIOS)
         values["height_m"] = float(np.clip(values["height_m"], low, high))
+        motion, columns = state.motion, self.motion_columns(state)
+        if motion is not None and len(columns):
+            change = np.zeros(len(motion.coefficients))
+            start = 2 * m + len(GLOBAL_UNKNOWNS)
+            change[columns] = step.change[start : start + len(columns)]
+            motion = motion.with_added(change)
+        depth = state.depth_m
+        if "depth" in self.free:
+            depth = np.zeros(m) if depth is None else depth
+            depth = depth + step.change[step.first_moment - m : step.first_moment]
         return replace(
             state,
+            depth_m=depth,
+            motion=motion,
             position_m=state.position_m + step.change[: 2 * m].reshape(2, m).T,
             path_m=state.path_m if step.path_m is None else state.path_m + step.path_m,
             mean_step_m=state.mean_step_m + step.mean_step_m,
@@ -452,18 +586,63 @@ class PassProblem:
         used = self.root.T.reshape(weight.shape)
         return self.residual(projected) * np.sqrt(weight) / np.where(used > 0, used, 1.0)
 
-    def magnet_offsets(self, state: PassState) -> MagnetOffsets:
+    def motion_columns(self, state: PassState) -> NDArray[np.intp]:
+        """Return the indices (k,) of the coefficients of the motion that are estimated."""
+        if state.motion is None:
+            return np.zeros(0, np.intp)
+        ranges = (part for name, part in state.motion.groups.items() if name in self.free)
+        return np.concatenate([np.zeros(0, np.intp), *(np.arange(r.start, r.stop) for r in ranges)])
+
+    def magnet_offsets(self, state: PassState, poses: BarPoses | None) -> MagnetOffsets:
         """Return the offsets from the magnets to the sensors at each sample."""
         sensors = self.window.sensors_m
         skew = np.outer(self.window.axis_order * state.skew_periods, self.local_step(state))
+        position = state.position_m
+        height = state.height_m if state.depth_m is None else state.height_m + state.depth_m
+        if poses is not None:
+            offset = np.empty((len(state.path_m), len(position), 3))
+            offset[..., :2] = poses.position_m[:, None, :2] - position
+            offset[..., 2] = poses.position_m[:, 2:] + height
+            x, y, z = np.moveaxis(offset @ poses.rotation, -1, 0)
+            # Sensors on the inside of a curve move less.
+            speed = 1 - poses.yaw_rate * sensors[:, 1, None]
+            along = skew * speed[:, None]
+            return MagnetOffsets.from_components(
+                along[..., None] + (sensors[:, 0, None, None] + x)[:, None],
+                (sensors[:, 1, None, None] + y)[:, None],
+                (sensors[:, 2, None, None] + z)[:, None],
+            )
         along = state.path_m + skew
         across = np.tan(state.crab_rad) * (state.path_m if state.crab_rad else np.zeros(1))
-        position = state.position_m
         return MagnetOffsets.from_components(
             along[:, :, None] + (sensors[:, 0, None] - position[:, 0])[:, None, None],
             across[:, None] + (sensors[:, 1, None] - position[:, 1])[:, None, None],
-            state.height_m,
+            height if isinstance(height, float) else height[None, None, None],
         )
+
+    def nuisance_sigmas(self, state: PassState) -> dict[str, Array]:
+        """Return the prior standard deviations of the unknowns of each nuisance."""
+        m, priors = len(state.position_m), self.priors
+        sigmas = {
+            "crab": np.array([priors.crab_sigma_rad]),
+            "tilt": np.full(m, priors.tilt_sigma * priors.moment_am2),
+            "depth": np.full(m, priors.depth_sigma_m),
+        }
+        if state.motion is not None:
+            of_motion = state.motion.sigmas
+            sigmas |= {name: of_motion[part] for name, part in state.motion.groups.items()}
+        return sigmas
+
+    def clusters(self, state: PassState) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return two partitions (C, n) of the samples, by the number of the cluster.
+
+        Samples of a cluster may have errors in common: a sensor over a stretch of the path (field
+        of a magnet), and a sensor over the whole path (its gains and axes).
+        """
+        length = CLUSTER_HEIGHTS * state.height_m
+        stretch = np.floor((state.path_m - state.path_m.min()) / length).astype(np.intp)
+        sensor = np.arange(self.shape[0])[:, None] // 3
+        return sensor * (int(stretch.max()) + 1) + stretch, sensor + 0 * stretch
 
     def local_step(self, state: PassState) -> Array:
         """Return the step (n,) of a sample period around each sample, by a running median."""
@@ -475,8 +654,12 @@ class PassProblem:
 
     def project(self, state: PassState) -> ProjectedState:
         """Solve for the moments and backgrounds, given all other unknowns."""
-        offsets = self.magnet_offsets(state)
+        poses = state.bar_poses
+        offsets = self.magnet_offsets(state, poses)
         fields = offsets.unit_fields(self.window.disc_correction_m2)
+        if poses is not None:
+            # Moments are constant in the axes of the floor.
+            fields = fields @ poses.rotation.transpose(0, 2, 1)[None, None]
         m = fields.shape[3]
         unit_fields = self.whiten(fields.reshape(*self.shape, 3 * m))
         transposed = self.background.transpose(0, 2, 1)
@@ -492,7 +675,7 @@ class PassProblem:
         state = replace(state, moment_am2=moments.reshape(m, 3))
         cost = (residual**2).sum() + self.moment_information(m) @ moments**2
         cost += self.prior_cost(state)
-        return ProjectedState(state, offsets, unit_fields, cross, residual, float(cost))
+        return ProjectedState(state, poses, offsets, unit_fields, cross, residual, float(cost))
 
     def moment_information(self, m: int) -> Array:
         """Return the prior inverse variances (3 M,) of the moments."""
@@ -516,6 +699,10 @@ class PassProblem:
         for name in GLOBAL_UNKNOWNS:
             mean, sigma = self.global_prior(name)
             cost += ((getattr(state, name) - mean) / sigma) ** 2
+        if state.motion is not None:
+            cost += float(((state.motion.coefficients / state.motion.sigmas) ** 2).sum())
+        if state.depth_m is not None:
+            cost += float((state.depth_m**2).sum()) / self.priors.depth_sigma_m**2
         if self.window.path_m is None:
             excess, scale = self.excess_steps(state)
             cost += 2 * float(np.log1p(excess**2 / scale**2).sum())
@@ -526,26 +713,72 @@ class PassProblem:
         excess = np.diff(state.path_m) - state.mean_step_m * self.gaps
         return excess, self.jitter_m * np.sqrt(self.gaps)
 
+    def _motion_fields(self, totals: Array, fields: Array, velocity: Array, rate: Array) -> Array:
+        """Return the derivatives (N, 3, n, k) of the fields by motions of the bar.
+
+        With the gradient G of the field f at a sensor s, a velocity v and a rotation w of the bar
+        change the field in its axes by ``G (v + w x s) - w x f``.
+
+        Parameters
+        ----------
+        totals : (N, 3, n, 3) ndarray
+            Gradients of the fields of all magnets.
+        fields : (N, 3, n) ndarray
+            Fields of all magnets.
+        velocity, rate : (n, 3, k) ndarray
+            In the axes of the bar.
+        """
+        lever = np.cross(rate[None], self.window.sensors_m[:, None, :, None], axis=2)
+        moved = np.einsum("sani,snik->sank", totals, velocity + lever)
+        turned = np.cross(rate[None], fields.transpose(0, 2, 1)[..., None], axis=2)
+        return np.asarray(moved - turned.transpose(0, 2, 1, 3))
+
     def reduce(self, projected: ProjectedState) -> ReducedEquations:
         """Return the normal equations at a state, from which the path is eliminated."""
         channels, n = self.shape
         state = projected.state
         m = len(state.position_m)
-        by_x, by_y, by_z = projected.offsets.gradients(state.moment_am2)
+        moments = state.moment_am2
+        if projected.poses is not None:
+            moments = moments @ projected.poses.rotation
+        by_x, by_y, by_z = projected.offsets.gradients(moments)
         # Sums over few magnets: a product takes a quarter of the time of a sum.
         total_x, total_y, total_z = (by @ np.ones(m) for by in (by_x, by_y, by_z))
         tangent = np.tan(state.crab_rad)
-        p = 2 * m + len(GLOBAL_UNKNOWNS)
+        columns_free = self.motion_columns(state)
+        g = 2 * m + len(GLOBAL_UNKNOWNS)
+        depth = slice(g + len(columns_free), g + len(columns_free) + m * ("depth" in self.free))
+        p = depth.stop
         columns = np.empty((*total_x.shape, p))
-        np.negative(by_x, out=columns[..., :m])
-        np.negative(by_y, out=columns[..., m : 2 * m])
-        columns[..., 2 * m] = total_z
-        columns[..., 2 * m + 1] = total_x * np.outer(self.window.axis_order, self.local_step(state))
-        columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
+        skewed = np.outer(self.window.axis_order, self.local_step(state))
+        if state.motion is None or (projected.poses is None and not len(columns_free)):
+            np.negative(by_x, out=columns[..., :m])
+            np.negative(by_y, out=columns[..., m : 2 * m])
+            columns[..., 2 * m] = total_z
+            columns[..., 2 * m + 1] = total_x * skewed
+            columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
+            along = total_x + tangent * total_y
+            columns[..., depth] = by_z[..., : depth.stop - depth.start]
+        else:
+            poses = projected.poses or state.motion.poses(state.path_m, state.crab_rad)
+            for axis, inside in enumerate((slice(m), slice(m, 2 * m))):
+                x, y, z = poses.rotation[:, axis].T[..., None]
+                columns[..., inside] = -(x * by_x + y * by_y + z * by_z)
+            totals = np.stack([total_x, total_y, total_z], axis=-1)
+            columns[..., 2 * m] = np.einsum("sani,ni->san", totals, poses.rotation[:, 2])
+            speed = 1 - poses.yaw_rate * self.window.sensors_m[:, 1, None]
+            columns[..., 2 * m + 1] = total_x * skewed * speed[:, None]
+            velocity, rate = state.motion.derivatives(state.path_m, state.crab_rad, columns_free)
+            moved = self._motion_fields(totals, projected.offsets.fields(moments), velocity, rate)
+            along = moved[..., 0]
+            columns[..., 2 * m + 2 : depth.start] = moved[..., 1:]
+            if depth.stop > depth.start:
+                x, y, z = poses.rotation[:, 2].T[..., None]
+                columns[..., depth] = x * by_x + y * by_y + z * by_z
         inner = np.concatenate(
             [self.whiten(columns.reshape(channels, n, p)), projected.unit_fields], axis=2
         )
-        along = self.whiten((total_x + tangent * total_y).reshape(channels, n))
+        along = self.whiten(along.reshape(channels, n))
         # Order: positions and globals (p), moments (up to q), the mean step, backgrounds.
         q = inner.shape[2]
         size = q + 1 + len(self.background_hessian)
@@ -563,12 +796,25 @@ class PassProblem:
             mean, sigma = self.global_prior(name)
             hessian[index, index] += 1 / sigma**2
             descent[index] -= (getattr(state, name) - mean) / sigma**2
-        moments = np.arange(p, q)
-        hessian[moments, moments] += self.moment_information(m)
+        if state.motion is not None and len(columns_free):
+            indices = np.arange(g, depth.start)
+            information = 1 / state.motion.sigmas[columns_free] ** 2
+            hessian[indices, indices] += information
+            descent[indices] -= information * state.motion.coefficients[columns_free]
+        if depth.stop > depth.start:
+            depth_information = 1 / self.priors.depth_sigma_m**2
+            indices = np.arange(depth.start, depth.stop)
+            hessian[indices, indices] += depth_information
+            if state.depth_m is not None:
+                descent[depth] -= depth_information * state.depth_m
+        indices = np.arange(p, q)
+        hessian[indices, indices] += self.moment_information(m)
         descent[p:q] -= self.moment_information(m) * state.moment_am2.ravel()
         if self.window.path_m is not None:
             hessian[q, q] += FIXING_WEIGHT
-            return ReducedEquations(hessian, descent, p, np.diag(hessian))
+            return ReducedEquations(
+                hessian, descent, p, np.diag(hessian), inner, along, self.background
+            )
         # The path: a tridiagonal block, coupled with all other unknowns.
         coupling = np.zeros((size, n))
         coupling[:q] = np.einsum("cn,cnq->qn", along, inner)
@@ -596,6 +842,9 @@ class PassProblem:
             descent=descent - coupling @ solved[:, -1],
             first_moment=p,
             full_diagonal=np.diag(hessian),
+            inner=inner,
+            along=along,
+            background=self.background,
             path=solved[:, -1],
             coupling=solved[:, :-1],
             band=band,
@@ -645,28 +894,94 @@ def _student_weights(problem: PassProblem, projected: ProjectedState, weight: Ar
 
 
 def _significant_nuisance(
-    problem: PassProblem, reduced: ReducedEquations, magnets: int
+    problem: PassProblem, projected: ProjectedState, allowed: tuple[str, ...]
 ) -> str | None:
     """Return the fixed nuisance that would explain the samples best; None if none is needed.
 
-    A score test: the decrease of the cost is predicted from normal equations in which all
-    nuisances are free.
+    A score test: the decrease of the cost is predicted from normal equations in which the nuisance
+    is free. Its unit is not the noise but the variance of the score among clusters of samples that
+    the nuisance leaves unexplained (White, Econometrica 50 (1982) 1, section 3), because errors of
+    gains and axes of the sensors would else look like any nuisance. Of several significant ones,
+    that of the least Bayesian information criterion is chosen, which counts their unknowns.
     """
+    fixed = [name for name in (*BUILD_NUISANCES, *MOTION_GROUPS) if name not in problem.free]
+    tested = [name for name in fixed if name in allowed]
+    if problem.window.path_m is not None:
+        # Errors of a path that was given would be taken for a curve.
+        tested = [name for name in tested if name != "curve"]
+    if not tested or projected.state.motion is None:
+        return None
+    reduced = problem.with_free(problem.free | frozenset(fixed)).reduce(projected)
+    sigmas = problem.nuisance_sigmas(projected.state)
+    indices = _nuisance_indices(problem, projected.state, reduced.first_moment, fixed)
+    clusters = problem.clusters(projected.state)
+    # A path that is oblique to the bar is the simplest motion, and is not taken for a curve.
+    stages = (
+        (("crab",), MIN_EVIDENCE),
+        (MOTION_GROUPS, MIN_MOTION_EVIDENCE),
+        (BUILD_NUISANCES, MIN_EVIDENCE),
+    )
+    for group, min_evidence in stages:
+        base = reduced.hessian.copy()
+        held = [name for name in fixed if group is not MOTION_GROUPS or name in MOTION_GROUPS]
+        every = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in held)])
+        base[every, every] *= FIXING_WEIGHT
+        without = float(reduced.descent @ solve_scaled(base, reduced.descent))
+        best, most = None, min_evidence
+        for name in (name for name in tested if name in group):
+            own = indices[name]
+            hessian = base.copy()
+            hessian[own, own] /= FIXING_WEIGHT
+            right = np.column_stack([reduced.descent, np.eye(len(hessian))[:, own]])
+            solved = solve_scaled(hessian, right)
+            gain = float(reduced.descent @ solved[:, 0]) - without
+            covariance = solved[own, 1:]
+            occam = 2 * np.log(sigmas[name]).sum() - np.linalg.slogdet(covariance)[1]
+            if gain < occam + min_evidence:
+                continue
+            # Unit variances and no correlations, if the residual was noise.
+            inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
+            changes = reduced.sample_changes(solved)
+            remaining = projected.residual - changes[..., 0]
+            rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
+            unit = max(
+                1.0,
+                *(float((cluster_sums(each, rows) ** 2).sum(axis=0).mean()) for each in clusters),
+            )
+            evidence = gain / unit - (occam - len(own) * np.log(unit))
+            if evidence > most:
+                best, most = name, evidence
+        if best is not None:
+            return best
+    return None
+
+
+def cluster_sums(clusters: NDArray[np.intp], rows: Array) -> Array:
+    """Return the sums (K, k) of rows (C, n, k) over the clusters (C, n) 0 to K - 1."""
+    flat = rows.reshape(clusters.size, -1)
+    sums = np.zeros((int(clusters.max()) + 1, flat.shape[1]))
+    np.add.at(sums, clusters.ravel(), flat)
+    return sums
+
+
+def _nuisance_indices(
+    problem: PassProblem, state: PassState, first_moment: int, names: list[str]
+) -> dict[str, NDArray[np.intp]]:
+    """Return the indices of the unknowns of each of the ``names`` in the normal equations."""
+    m = len(state.position_m)
     indices = {
-        "crab": [2 * magnets + GLOBAL_UNKNOWNS.index("crab_rad")],
-        "tilt": [reduced.first_moment + 3 * k + 2 for k in range(magnets)],
+        "depth": np.arange(first_moment - m, first_moment),
+        "crab": np.array([2 * m + GLOBAL_UNKNOWNS.index("crab_rad")]),
+        "tilt": first_moment + 3 * np.arange(m) + 2,
     }
-    fixed = [name for name in NUISANCES if name not in problem.free]
-    gains = {}
-    for name in fixed:
-        hessian = reduced.hessian.copy()
-        for other in fixed:
-            if other != name:
-                hessian[indices[other], indices[other]] *= FIXING_WEIGHT
-        gain = float(reduced.descent @ solve_scaled(hessian, reduced.descent))
-        gains[name] = gain - len(indices[name])
-    best = max(gains, key=gains.__getitem__, default=None)
-    return best if best is not None and gains[best] > MIN_NUISANCE_GAIN else None
+    if state.motion is not None:
+        start = 2 * m + len(GLOBAL_UNKNOWNS)
+        for name, part in state.motion.groups.items():
+            if name in problem.free or name in names:
+                size = part.stop - part.start
+                indices[name] = np.arange(start, start + size)
+                start += size
+    return {name: indices[name] for name in names}
 
 
 def _result(
@@ -686,9 +1001,11 @@ def _result(
         unknowns += n
     correction = float(np.sqrt(count / max(count - unknowns, 1)))
     covariance, path_sigma = np.full((3 * m, 3 * m), np.nan), np.full(n, np.nan)
-    height_sigma = np.nan
+    height_sigma, significance = np.nan, np.full(m, np.inf)
     if reduced is not None:
-        covariance, path_sigma, height_sigma = _covariances(reduced, state)
+        covariance, path_sigma, height_sigma, significance = _covariances(
+            reduced, state, projected.residual, problem.clusters(state)
+        )
     return PassFit(
         state=state,
         residual=residual,
@@ -698,12 +1015,23 @@ def _result(
         covariance=covariance,
         path_sigma_m=path_sigma,
         height_sigma_m=height_sigma,
+        significance=significance,
         converged=converged,
     )
 
 
-def _covariances(reduced: ReducedEquations, state: PassState) -> tuple[Array, Array, float]:
-    """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height."""
+def _covariances(
+    reduced: ReducedEquations,
+    state: PassState,
+    residual: Array,
+    clusters: tuple[NDArray[np.intp], ...],
+) -> tuple[Array, Array, float, Array]:
+    """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height.
+
+    Last come the squares of the horizontal moments in standard deviations. Where residuals are
+    correlated within clusters, the standard deviations are those of the sandwich estimator (Liang
+    and Zeger, Biometrika 73 (1986) 13), which are never taken smaller than those of the model.
+    """
     m = len(state.position_m)
     full = solve_scaled(reduced.hessian, np.eye(len(reduced.hessian)))
     # From x, y and moment to x, y and angle.
@@ -720,4 +1048,17 @@ def _covariances(reduced: ReducedEquations, state: PassState) -> tuple[Array, Ar
         coupled = np.einsum("nq,qr,nr->n", reduced.coupling, full, reduced.coupling, optimize=True)
         path = np.sqrt(np.maximum(np.diag(own) + coupled, 0.0))
     height = float(np.sqrt(full[2 * m, 2 * m]))
-    return jacobian @ full @ jacobian.T, path, height
+    horizontal = reduced.first_moment + 3 * np.arange(m)[:, None] + [0, 1]
+    of_moments = full[horizontal[:, :, None], horizontal[:, None, :]]
+    moments = state.moment_am2[:, :2, None]
+    significance = (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2))
+    covariance = jacobian @ full @ jacobian.T
+    # A residual that is larger everywhere scales the whole covariance later.
+    relative = residual / max(1.0, robust_sigma(residual))
+    rows = reduced.sample_changes(full @ jacobian.T) * relative[..., None]
+    variance = np.diag(covariance)
+    for each in clusters:
+        sums = cluster_sums(each, rows)
+        variance = np.maximum(variance, (sums**2).sum(axis=0))
+    inflation = np.sqrt(variance / np.diag(covariance))
+    return inflation[:, None] * covariance * inflation, path, height, significance

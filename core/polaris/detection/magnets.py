@@ -22,7 +22,9 @@ from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.field_model import MagnetOffsets
 from locatk.core.polaris.detection.fit import PassFit, PassState, fit_coarse, fit_pass
+from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
+    MAX_EFFORT,
     PassPriors,
     PassWindow,
     PreparedPass,
@@ -74,6 +76,9 @@ MAX_INITIAL_GUESSES = 4
 SEARCH_SHARED_FIELD_T = 3e-6
 """Standard deviation of a field that all sensors share (motors, rotation in the Earth's field) that
 is allowed for while magnets are searched for [T]."""
+
+FORWARD_EFFORT_FRACTION = 0.5
+"""Fraction of the effort after which no further guess of forward travel is tried."""
 
 MAX_GROWTH_ROUNDS = 4
 """Maximum number of searches of the residual for more magnets."""
@@ -130,6 +135,11 @@ MERGE_DISTANCE_HEIGHTS = 0.6
 INITIAL_SEPARATION_HEIGHTS = 1.2
 """Least distance of two initial magnets, in heights: a closer one only corrects the shape of the
 other's field."""
+
+HIDDEN_DEBRIS_ANGLE, HIDDEN_DEBRIS_POSITION = 1.0, 0.25
+"""Variances of a magnet's direction, and of its x and y in squared heights, by a layer of dipoles
+of any direction whose mean square moment on a squared height is that of the magnet. They are
+integrals of the least-squares solution for one magnet over the plane of the sensors."""
 
 DEFAULT_SKEW_PERIODS = 0.2
 """Initial skew if the expected one is half a sample period or more."""
@@ -202,10 +212,16 @@ def detect_magnets_at(
     """
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
+    # The grid of a dense tag is the last resort, and has effort of its own.
+    window.effort.limit = 2 * MAX_EFFORT
+    if window.effort.is_exhausted:
+        raise DegenerateError("the effort for this pass is spent")
     state = replace(
         hypothesis.fit.state,
-        position_m=positions_m + magnets.origin_m,
+        position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
         moment_am2=np.zeros((len(positions_m), 3)),
+        depth_m=None,
+        free=hypothesis.fit.state.free - {"depth"},
     )
     coarse = fit_coarse(window, state, priors)
     moment = _horizontal_moments(coarse.state)
@@ -432,6 +448,9 @@ def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
         ]
         guesses.sort(key=lambda pair: pair[1].remaining)
         for timed, guess in guesses[:MAX_INITIAL_GUESSES]:
+            effort = prepared.window.effort
+            if effort.spent > (FORWARD_EFFORT_FRACTION if direction > 0 else 1.0) * effort.limit:
+                break
             try:
                 fit = _grow_fit(timed, guess)
             except DegenerateError:
@@ -461,7 +480,7 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
     fit = fit_coarse(coarse, state, priors)
     for _ in range(MAX_GROWTH_ROUNDS):
         missed = _find_missed_sources(prepared, fit)
-        if not missed:
+        if not missed or window.effort.is_exhausted:
             break
         before = fit
         fit = fit_coarse(coarse, _with_sources(fit.state, missed), priors)
@@ -473,13 +492,19 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
     if coarse.common_t and fit.shared_square > max(MAX_SHARED_SQUARE, 2 * fit.rms_sigma**2):
         information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
         window = replace(window, common_t=float(np.sqrt((fit.shared_square - 1) / information)))
+    state = _without_spurious_sources(fit.state, prepared)
     while True:
-        state = _without_spurious_sources(fit.state, prepared)
         fit = fit_pass(window, state, priors)
         if _has_drift(window, fit):
             window = replace(window, trend_terms=DRIFT_TREND_TERMS)
             fit = fit_pass(window, fit.state, priors)
-        if len(_without_spurious_sources(fit.state, prepared).position_m) == len(state.position_m):
+        moment = _horizontal_moments(fit.state)
+        # Magnets of a dense tag are correlated, and need not be significant alone.
+        is_significant = fit.significance > MIN_MAGNET_ENERGY
+        is_significant |= moment > MIN_MOMENT_RATIO * moment.max()
+        state = _without_spurious_sources(_select_sources(fit.state, is_significant), prepared)
+        is_complete = len(state.position_m) == len(fit.state.position_m)
+        if is_complete or window.effort.is_exhausted:
             break
     if window.path_m is not None and fit.rms_sigma < WHITE_RESIDUAL_SIGMAS:
         # From the given path, a free one leads to the nearest path that the samples prefer.
@@ -522,12 +547,48 @@ def _find_missed_sources(prepared: PreparedPass, fit: PassFit) -> list[MagnetCan
     if fit.rms_sigma <= DEBRIS_RESIDUAL_SIGMAS:
         min_moment = 0.5 * MIN_MOMENT_RATIO * float(np.median(_horizontal_moments(state)))
     limit = MERGE_DISTANCE_HEIGHTS * state.height_m
+    candidates = [_in_floor_frame(candidate, state) for candidate in candidates]
     return [
         candidate
         for candidate in candidates
         if np.hypot(*candidate.moment_am2) > min_moment
         and np.all(np.linalg.norm(state.position_m - candidate.position_m, axis=1) > limit)
     ]
+
+
+def _in_floor_frame(candidate: MagnetCandidate, state: PassState) -> MagnetCandidate:
+    """Return a candidate whose position is along and across a path in the frame of the fit."""
+    if state.motion is None or state.motion.is_straight:
+        return candidate
+    along, across = candidate.position_m
+    poses = state.motion.poses(np.array([along]), state.crab_rad)
+    axes = poses.rotation[0, :2, :2]
+    return replace(
+        candidate,
+        position_m=poses.position_m[0, :2] + axes @ [0.0, across],
+        moment_am2=axes @ candidate.moment_am2,
+    )
+
+
+def _along_and_across(state: PassState) -> tuple[Array, Array]:
+    """Return the positions (M,), (M,) of the sources along the path, and across the bar there.
+
+    On a curve they belong to the sample at which the source was nearest to the bar.
+    """
+    poses = state.bar_poses
+    if poses is None:
+        return state.position_m[:, 0], state.position_m[:, 1]
+    offset = state.position_m[:, None] - poses.position_m[:, :2]
+    local = np.einsum("mni,nij->mnj", offset, poses.rotation[:, :2, :2])
+    nearest = np.abs(local[..., 0]).argmin(axis=1)
+    chosen = local[np.arange(len(local)), nearest]
+    return state.path_m[nearest] + chosen[:, 0], chosen[:, 1]
+
+
+def _rotation(angle_rad: float) -> Array:
+    """Return the matrix (2, 2) that turns row vectors into axes turned by the angle."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 def _has_drift(window: PassWindow, fit: PassFit) -> bool:
@@ -550,15 +611,22 @@ def _horizontal_moments(state: PassState) -> Array:
 
 def _select_sources(state: PassState, chosen: NDArray[np.bool_] | list[int]) -> PassState:
     """Return the state with some of the sources only."""
-    return replace(state, position_m=state.position_m[chosen], moment_am2=state.moment_am2[chosen])
+    return replace(
+        state,
+        position_m=state.position_m[chosen],
+        moment_am2=state.moment_am2[chosen],
+        depth_m=None if state.depth_m is None else state.depth_m[chosen],
+    )
 
 
 def _with_sources(state: PassState, candidates: list[MagnetCandidate]) -> PassState:
     """Return the state with further sources."""
     positions = [candidate.position_m for candidate in candidates]
     moments = [[*candidate.moment_am2, 0.0] for candidate in candidates]
+    depth = state.depth_m
     return replace(
         state,
+        depth_m=None if depth is None else np.append(depth, np.zeros(len(candidates))),
         position_m=np.vstack([state.position_m, positions]),
         moment_am2=np.vstack([state.moment_am2, moments]),
     )
@@ -577,10 +645,11 @@ def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassS
     """
     sensors, position = prepared.window.sensors_m, state.position_m
     margin = (SIDE_MARGIN_HEIGHTS + 0.5) * state.height_m
-    is_inside = position[:, 0] > state.path_m.min() + sensors[:, 0].min() - margin
-    is_inside &= position[:, 0] < state.path_m.max() + sensors[:, 0].max() + margin
-    is_inside &= position[:, 1] > sensors[:, 1].min() - margin
-    is_inside &= position[:, 1] < sensors[:, 1].max() + margin
+    along, across = _along_and_across(state)
+    is_inside = along > state.path_m.min() + sensors[:, 0].min() - margin
+    is_inside &= along < state.path_m.max() + sensors[:, 0].max() + margin
+    is_inside &= across > sensors[:, 1].min() - margin
+    is_inside &= across < sensors[:, 1].max() + margin
     moment = np.where(is_inside, _horizontal_moments(state), 0.0)
     by_strength = np.argsort(-moment)
     strongest = moment[by_strength[0]]
@@ -609,8 +678,9 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     """
     state, sensors = fit.state, prepared.window.sensors_m
     margin = SIDE_MARGIN_HEIGHTS * state.height_m
-    is_under_bar = state.position_m[:, 1] > sensors[:, 1].min() - margin
-    is_under_bar &= state.position_m[:, 1] < sensors[:, 1].max() + margin
+    _, across = _along_and_across(state)
+    is_under_bar = across > sensors[:, 1].min() - margin
+    is_under_bar &= across < sensors[:, 1].max() + margin
     moment = np.where(is_under_bar, _horizontal_moments(state), 0.0)
     expected = prepared.priors[0].moment_am2
     is_usual = moment > MIN_MOMENT_RATIO / 2 * expected
@@ -620,6 +690,25 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     if len(usual) == 0:
         raise DegenerateError("no magnet is left under the bar")
     return np.flatnonzero(moment > MIN_MOMENT_RATIO * np.median(usual))
+
+
+def _debris_covariance(prepared: PreparedPass, fit: PassFit, magnets: NDArray[np.intp]) -> Array:
+    """Return the covariance (3 M, 3 M) of magnets by debris that is hidden under them.
+
+    Debris that was detected between the magnets shows how much of it is on the floor. What is
+    closer to a magnet than :data:`INITIAL_SEPARATION_HEIGHTS` changes its field, and is taken for
+    another position and moment of the magnet.
+    """
+    state, sensors = fit.state, prepared.window.sensors_m
+    moment = _horizontal_moments(state)
+    debris = np.setdiff1d(np.arange(len(moment)), magnets)
+    debris = debris[moment[debris] < MIN_MOMENT_RATIO * np.median(moment[magnets])]
+    width = np.ptp(sensors[:, 1]) + 2 * SIDE_MARGIN_HEIGHTS * state.height_m
+    # Two of three components of a moment of any direction are horizontal.
+    density = 1.5 * (moment[debris] ** 2).sum() / (width * np.ptp(state.path_m))
+    angle = HIDDEN_DEBRIS_ANGLE * density * state.height_m**2 / moment[magnets] ** 2
+    place = HIDDEN_DEBRIS_POSITION * density * state.height_m**4 / moment[magnets] ** 2
+    return np.diag(np.column_stack([place, place, angle]).ravel())
 
 
 def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> DetectedMagnets:
@@ -634,29 +723,42 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     if prepared.path_m is not None and prepared.window.path_m is not None:
         path = prepared.path_m + (state.path_m[0] - prepared.window.path_m[0])
     path_sigma = np.interp(index, prepared.group_index, fit.path_sigma_m) * noise_factor
+    motion = state.motion or Motion.straight(path, 0.0, state.height_m)
+    poses = motion.poses(path, state.crab_rad)
+    yaw = np.arctan2(poses.rotation[:, 1, 0], poses.rotation[:, 0, 0])
     # Near the magnets' middle, but at a sample whose position is well determined: it is not if
     # the field is weak there or the sample was damaged.
-    distance = np.abs(median_filter(path, 5) - position.mean(axis=0)[0])
+    distance = np.abs(median_filter(poses.position_m[:, 0], 5) - position.mean(axis=0)[0])
     reference = int(np.argmin(distance + 3 * path_sigma))
     rows = (3 * chosen[:, None] + np.arange(3)).ravel()
-    origin = path[reference] * np.array([1.0, np.tan(state.crab_rad)])
+    origin, heading = poses.position_m[reference, :2], float(yaw[reference])
+    into_array = _rotation(heading)
+    jacobian = np.eye(3)
+    jacobian[:2, :2] = into_array.T
+    by_magnet = np.kron(np.eye(len(chosen)), jacobian)
+    covariance = by_magnet @ fit.covariance[np.ix_(rows, rows)] @ by_magnet.T
+    covariance = covariance * noise_factor**2 + _debris_covariance(prepared, fit, chosen)
     moment = state.moment_am2[chosen]
+    moment[:, :2] = moment[:, :2] @ into_array
+    forward, lateral = ((poses.position_m[:, :2] - origin) @ into_array).T
     return DetectedMagnets(
         time_ns=int(samples.time_ns[prepared.first + reference]),
         first=prepared.first,
         stop=prepared.first + prepared.sample_count,
-        path_m=path - path[reference],
-        position_m=position - origin,
+        path_m=forward,
+        lateral_m=lateral,
+        heading_rad=yaw - heading,
+        position_m=(position - origin) @ into_array,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),
-        covariance=fit.covariance[np.ix_(rows, rows)] * noise_factor**2,
+        covariance=covariance,
         path_sigma_m=path_sigma,
-        crab_rad=state.crab_rad,
         is_path_estimated=prepared.window.path_m is None,
         height_m=state.height_m,
         height_sigma_m=fit.height_sigma_m * noise_factor,
         residual_sigma=fit.rms_sigma,
         robust_residual_sigma=fit.robust_sigma,
         origin_m=origin,
+        origin_heading_rad=heading,
         other_sources=len(state.position_m) - len(chosen),
     )

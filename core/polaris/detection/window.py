@@ -8,7 +8,7 @@ rested, a second time axis without the rests is an alternative hypothesis.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,34 @@ MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
 
+MAX_EFFORT = 2e8
+"""Work that a pass may take, in samples times unknowns of all iterations: about two seconds of
+a processor. A hundred sources under a bar in a cluttered hall would take minutes."""
+
+
+@dataclass
+class Effort:
+    """Work spent on one pass; it limits the time by a count, so that results do not depend on it.
+
+    Attributes
+    ----------
+    spent, limit : float
+        In samples times unknowns.
+    """
+
+    spent: float = 0.0
+    limit: float = MAX_EFFORT
+
+    @property
+    def is_exhausted(self) -> bool:
+        """True if no fit should begin."""
+        return self.spent >= self.limit
+
+    def affordable_iterations(self, work: float) -> int:
+        """Return the number of iterations of the given work that are left; at least one."""
+        return max(1, int((self.limit - self.spent) / max(work, 1.0)))
+
+
 @dataclass(frozen=True)
 class PassWindow:
     """Averaged samples of one pass.
@@ -84,6 +112,8 @@ class PassWindow:
         Standard deviation, in one sample, of a field that all sensors share [T].
     trend_terms : int
         Terms of each sensor's background: 2 are a level and a slope.
+    effort : Effort
+        Shared by all fits of the pass.
     """
 
     field_t: Array
@@ -96,6 +126,7 @@ class PassWindow:
     disc_correction_m2: float = 0.0
     common_t: float = 0.0
     trend_terms: int = 2
+    effort: Effort = field(default_factory=Effort)
 
 
 @dataclass(frozen=True)
@@ -112,6 +143,8 @@ class PassPriors:
         Expected magnitude of a magnet's moment.
     tilt_sigma : float
         Vertical part of a magnet's moment, relative to its magnitude (standard deviation).
+    depth_sigma_m : float
+        Standard deviation of a magnet's height.
     crab_sigma_rad : float
         Standard deviation of the angle between the array's x axis and its path.
     jitter_fraction : float
@@ -122,6 +155,7 @@ class PassPriors:
     skew_periods: tuple[float, float] = (0.0, 0.5)
     moment_am2: float = 1.5e-3
     tilt_sigma: float = 0.05
+    depth_sigma_m: float = 2e-4
     crab_sigma_rad: float = 0.009
     jitter_fraction: float = 0.3
 
