@@ -44,6 +44,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.linalg.lapack import dposv
 from scipy.ndimage import median_filter
+from scipy.sparse import csr_array
 
 from locatk.core.errors import DegenerateError
 from locatk.core.least_squares import Indices, cauchy_loss, minimize
@@ -54,14 +55,17 @@ from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE, robust_sigma
 
 Array = NDArray[np.float64]
 
-BUILD_NUISANCES = ("crab", "tilt", "depth")
+BUILD_NUISANCES = ("crab", "tilt")
 NUISANCES = (*BUILD_NUISANCES, *MOTION_GROUPS)
 """Unknowns that are fixed at zero until the samples contradict that: a path that is oblique to the
-bar, magnets that are not flat or not of one height, and the groups of
-:mod:`locatk.core.polaris.detection.motion`."""
+bar, magnets that are not flat, and the groups of :mod:`locatk.core.polaris.detection.motion`."""
 
 COARSE_NUISANCES = ("curve", "attitude")
 """Those that a coarse fit estimates: without them it takes the residual for further magnets."""
+
+HEADING_NUISANCES = ("curve", "yaw")
+"""Those that change the residual little, but the heading of the bar much: the magnets, whose
+orientations are unknown, rotate with them."""
 
 GLOBAL_UNKNOWNS = ("height_m", "skew_periods", "crab_rad")
 """Attributes of :class:`PassState` that hold one number for the whole pass."""
@@ -92,10 +96,12 @@ OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
 """Residual beyond which a sample is an outlier, and the fraction of such samples from which they
 are reweighted: four times that of a normal distribution."""
 
-MIN_EVIDENCE, MIN_MOTION_EVIDENCE = 10.0, 18.4
-"""Twice the logarithm of the Bayes factor from which a nuisance is estimated: very strong evidence
-(Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2). A motion needs a factor of
-10,000, which leaves a hundred to one if one pass of a hundred has such a motion."""
+MIN_NUISANCE_GAIN = 9.0
+"""Decrease of the cost beyond the number of unknowns from which crab or tilt are estimated."""
+
+MIN_MOTION_EVIDENCE = 18.4
+"""Twice the logarithm of the Bayes factor from which a motion is estimated: a factor of 10,000,
+which leaves a hundred to one if one pass of a hundred has such a motion."""
 
 FIXED_WORK_UNKNOWNS = 110
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
@@ -105,10 +111,13 @@ MAX_UNEXPLAINED_FRACTION = 0.3
 """Fraction of the samples' squares that magnets leave unexplained up to which nuisances are
 estimated. A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
 
-MAX_COARSE_RESIDUAL_SQUARE = 1.7
-"""Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
-that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak
-sources would be added."""
+MAX_SENSOR_RESIDUAL_SIGMAS = 1.3
+"""Rms residual up to which the errors of real sensors (gains, axes) explain it; above it, attitude
+and height are estimated, and weak sources added. The published recordings reach 1.26."""
+
+MIN_WAVE_RESIDUAL_SIGMAS = 1.0
+"""Rms residual from which height and rocking are tested, which have many unknowns: below it, they
+have nothing to explain."""
 
 CLUSTER_HEIGHTS = 1.0
 """Length of path within which the errors of a sensor's samples are correlated, in heights: half the
@@ -122,6 +131,9 @@ FINE_ITERATIONS, FINE_GAIN_FRACTION = 45, 4e-5
 
 REWEIGHTED_ITERATIONS, NUISANCE_ITERATIONS = 8, 15
 """Steps tried by a fit that continues from a minimum: with new weights, with another nuisance."""
+
+MAX_LOG_ODDS = 60.0
+"""Bound of twice the logarithm of a Bayes factor, before it is exponentiated."""
 
 RELATIVE_RIDGE = 1e-13
 """Added to the unit diagonal of scaled normal equations."""
@@ -142,8 +154,6 @@ class PassState:
         Mean distance moved in a sample period.
     height_m, skew_periods, crab_rad : float
         See :class:`~locatk.core.polaris.detection.window.PassPriors`.
-    depth_m : (M,) ndarray or None
-        Of the magnets below their common height; None if they are of one height.
     motion : Motion or None
         Curve, attitude and height along the path; None if it is straight and level.
     free : frozenset of str
@@ -157,7 +167,6 @@ class PassState:
     height_m: float
     skew_periods: float = 0.0
     crab_rad: float = 0.0
-    depth_m: Array | None = None
     motion: Motion | None = None
     free: frozenset[str] = frozenset()
 
@@ -224,12 +233,11 @@ def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> Pass
     with _degenerate_on_numerical_errors():
         problem = PassProblem(window, priors, weight, start)
         equations, converged = _minimize(problem, start, COARSE_ITERATIONS, COARSE_GAIN_FRACTION)
-        size = np.abs(problem.residual(equations.projected))
-        if np.nanmean(size**2) > MAX_COARSE_RESIDUAL_SQUARE:
+        if problem.rms_residual(equations.projected) > MAX_SENSOR_RESIDUAL_SIGMAS:
             problem, equations, converged = _estimate_nuisances(
                 problem, equations, converged, COARSE_NUISANCES, COARSE_GAIN_FRACTION
             )
-        return _result(problem, equations.projected, weight, converged, reduced=None)
+        return _result(problem, equations.projected, weight, converged, tests=None)
 
 
 def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFit:
@@ -254,11 +262,11 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
         problem, equations, converged = _estimate_nuisances(
             problem, equations, converged, NUISANCES, gain
         )
-        if problem.free != before:
+        if (problem.free - before) & {*MOTION_GROUPS}:
             # Samples that only a wrong motion had made outliers count again.
             problem, equations, converged = _reweight(problem, equations, weight)
-        reduced = problem.with_free(problem.free | {*BUILD_NUISANCES}).reduce(equations.projected)
-        return _result(problem, equations.projected, weight, converged, reduced)
+        tests = _test_nuisances(problem, equations.projected, NUISANCES)
+        return _result(problem, equations.projected, weight, converged, tests)
 
 
 def _reweight(
@@ -289,17 +297,11 @@ def _estimate_nuisances(
     """
     unexplained = (equations.projected.residual**2).sum() / (problem.target**2).sum()
     while unexplained < MAX_UNEXPLAINED_FRACTION:
-        projected = equations.projected
-        state = projected.state
-        if state.motion is None:
-            middle = float(state.position_m[:, 0].mean())
-            state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
-            projected = replace(projected, state=state)
-        nuisance = _significant_nuisance(problem, projected, allowed)
-        if nuisance is None:
-            return problem, equations, converged
-        problem = problem.with_free(problem.free | {nuisance})
-        state = replace(state, free=problem.free)
+        tests = _test_nuisances(problem, equations.projected, allowed)
+        if tests.significant is None:
+            break
+        problem = problem.with_free(problem.free | {tests.significant})
+        state = replace(tests.state, free=problem.free)
         equations, converged = _minimize(problem, state, NUISANCE_ITERATIONS, min_gain)
     return problem, equations, converged
 
@@ -532,13 +534,8 @@ class PassProblem:
             start = 2 * m + len(GLOBAL_UNKNOWNS)
             change[columns] = step.change[start : start + len(columns)]
             motion = motion.with_added(change)
-        depth = state.depth_m
-        if "depth" in self.free:
-            depth = np.zeros(m) if depth is None else depth
-            depth = depth + step.change[step.first_moment - m : step.first_moment]
         return replace(
             state,
-            depth_m=depth,
             motion=motion,
             position_m=state.position_m + step.change[: 2 * m].reshape(2, m).T,
             path_m=state.path_m if step.path_m is None else state.path_m + step.path_m,
@@ -576,6 +573,11 @@ class PassProblem:
         is_observed = information > 0
         return float((square[is_observed] / information[is_observed]).mean())
 
+    def rms_residual(self, projected: ProjectedState) -> float:
+        """Return the rms of the residual in units of the noise, outliers included."""
+        residual = self.unweighted_residual(projected, sample_weights(self.window))
+        return float(np.sqrt(np.nanmean(residual**2)))
+
     def residual(self, projected: ProjectedState) -> Array:
         """Return the weighted residual (n, N, 3), ``nan`` if there is no sample."""
         observed = np.where(self.root > 0, projected.residual, np.nan)
@@ -598,11 +600,10 @@ class PassProblem:
         sensors = self.window.sensors_m
         skew = np.outer(self.window.axis_order * state.skew_periods, self.local_step(state))
         position = state.position_m
-        height = state.height_m if state.depth_m is None else state.height_m + state.depth_m
         if poses is not None:
             offset = np.empty((len(state.path_m), len(position), 3))
             offset[..., :2] = poses.position_m[:, None, :2] - position
-            offset[..., 2] = poses.position_m[:, 2:] + height
+            offset[..., 2] = poses.position_m[:, 2:] + state.height_m
             x, y, z = np.moveaxis(offset @ poses.rotation, -1, 0)
             # Sensors on the inside of a curve move less.
             speed = 1 - poses.yaw_rate * sensors[:, 1, None]
@@ -617,21 +618,8 @@ class PassProblem:
         return MagnetOffsets.from_components(
             along[:, :, None] + (sensors[:, 0, None] - position[:, 0])[:, None, None],
             across[:, None] + (sensors[:, 1, None] - position[:, 1])[:, None, None],
-            height if isinstance(height, float) else height[None, None, None],
+            state.height_m,
         )
-
-    def nuisance_sigmas(self, state: PassState) -> dict[str, Array]:
-        """Return the prior standard deviations of the unknowns of each nuisance."""
-        m, priors = len(state.position_m), self.priors
-        sigmas = {
-            "crab": np.array([priors.crab_sigma_rad]),
-            "tilt": np.full(m, priors.tilt_sigma * priors.moment_am2),
-            "depth": np.full(m, priors.depth_sigma_m),
-        }
-        if state.motion is not None:
-            of_motion = state.motion.sigmas
-            sigmas |= {name: of_motion[part] for name, part in state.motion.groups.items()}
-        return sigmas
 
     def clusters(self, state: PassState) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return two partitions (C, n) of the samples, by the number of the cluster.
@@ -701,8 +689,6 @@ class PassProblem:
             cost += ((getattr(state, name) - mean) / sigma) ** 2
         if state.motion is not None:
             cost += float(((state.motion.coefficients / state.motion.sigmas) ** 2).sum())
-        if state.depth_m is not None:
-            cost += float((state.depth_m**2).sum()) / self.priors.depth_sigma_m**2
         if self.window.path_m is None:
             excess, scale = self.excess_steps(state)
             cost += 2 * float(np.log1p(excess**2 / scale**2).sum())
@@ -747,8 +733,7 @@ class PassProblem:
         tangent = np.tan(state.crab_rad)
         columns_free = self.motion_columns(state)
         g = 2 * m + len(GLOBAL_UNKNOWNS)
-        depth = slice(g + len(columns_free), g + len(columns_free) + m * ("depth" in self.free))
-        p = depth.stop
+        p = g + len(columns_free)
         columns = np.empty((*total_x.shape, p))
         skewed = np.outer(self.window.axis_order, self.local_step(state))
         if state.motion is None or (projected.poses is None and not len(columns_free)):
@@ -758,7 +743,6 @@ class PassProblem:
             columns[..., 2 * m + 1] = total_x * skewed
             columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
             along = total_x + tangent * total_y
-            columns[..., depth] = by_z[..., : depth.stop - depth.start]
         else:
             poses = projected.poses or state.motion.poses(state.path_m, state.crab_rad)
             for axis, inside in enumerate((slice(m), slice(m, 2 * m))):
@@ -771,10 +755,7 @@ class PassProblem:
             velocity, rate = state.motion.derivatives(state.path_m, state.crab_rad, columns_free)
             moved = self._motion_fields(totals, projected.offsets.fields(moments), velocity, rate)
             along = moved[..., 0]
-            columns[..., 2 * m + 2 : depth.start] = moved[..., 1:]
-            if depth.stop > depth.start:
-                x, y, z = poses.rotation[:, 2].T[..., None]
-                columns[..., depth] = x * by_x + y * by_y + z * by_z
+            columns[..., 2 * m + 2 :] = moved[..., 1:]
         inner = np.concatenate(
             [self.whiten(columns.reshape(channels, n, p)), projected.unit_fields], axis=2
         )
@@ -797,16 +778,10 @@ class PassProblem:
             hessian[index, index] += 1 / sigma**2
             descent[index] -= (getattr(state, name) - mean) / sigma**2
         if state.motion is not None and len(columns_free):
-            indices = np.arange(g, depth.start)
+            indices = np.arange(g, p)
             information = 1 / state.motion.sigmas[columns_free] ** 2
             hessian[indices, indices] += information
             descent[indices] -= information * state.motion.coefficients[columns_free]
-        if depth.stop > depth.start:
-            depth_information = 1 / self.priors.depth_sigma_m**2
-            indices = np.arange(depth.start, depth.stop)
-            hessian[indices, indices] += depth_information
-            if state.depth_m is not None:
-                descent[depth] -= depth_information * state.depth_m
         indices = np.arange(p, q)
         hessian[indices, indices] += self.moment_information(m)
         descent[p:q] -= self.moment_information(m) * state.moment_am2.ravel()
@@ -893,75 +868,146 @@ def _student_weights(problem: PassProblem, projected: ProjectedState, weight: Ar
     return (STUDENT_FREEDOM + 1) / STUDENT_FREEDOM * factor
 
 
-def _significant_nuisance(
-    problem: PassProblem, projected: ProjectedState, allowed: tuple[str, ...]
-) -> str | None:
-    """Return the fixed nuisance that would explain the samples best; None if none is needed.
+@dataclass(frozen=True)
+class NuisanceTests:
+    """Score tests of the nuisances that are fixed at zero.
 
-    A score test: the decrease of the cost is predicted from normal equations in which the nuisance
-    is free. Its unit is not the noise but the variance of the score among clusters of samples that
-    the nuisance leaves unexplained (White, Econometrica 50 (1982) 1, section 3), because errors of
-    gains and axes of the sensors would else look like any nuisance. Of several significant ones,
-    that of the least Bayesian information criterion is chosen, which counts their unknowns.
+    Attributes
+    ----------
+    state : PassState
+        Its motion has coefficients, all of them zero if it is straight.
+    reduced : ReducedEquations
+        Crab and tilt are free, and motions that are not estimated are fixed.
+    changes : (q, k) ndarray
+        Changes of the unknowns if one of k motions was estimated.
+    evidence : (k,) ndarray
+        Twice the logarithms of the Bayes factors for these motions.
+    significant : str or None
+        Nuisance to estimate next.
     """
-    fixed = [name for name in (*BUILD_NUISANCES, *MOTION_GROUPS) if name not in problem.free]
-    tested = [name for name in fixed if name in allowed]
+
+    state: PassState
+    reduced: ReducedEquations
+    changes: Array
+    evidence: Array
+    significant: str | None
+
+    def likely_changes(self) -> Array:
+        """Return the changes times the square roots of the probabilities of their motions.
+
+        A motion that is fixed at zero, but is no less likely than none, would change the unknowns
+        (Bayesian model averaging; Hoeting et al., Stat. Sci. 14 (1999) 382, Eq. 3).
+        """
+        odds = np.exp(np.minimum(self.evidence, MAX_LOG_ODDS) / 2)
+        return np.asarray(self.changes * np.sqrt(odds / (1 + odds.sum())))
+
+
+def _test_nuisances(
+    problem: PassProblem, projected: ProjectedState, allowed: tuple[str, ...]
+) -> NuisanceTests:
+    """Predict the decrease of the cost by each nuisance from the equations in which it is free.
+
+    An oblique path is the simplest motion, and is not taken for a curve. Vertical moments come
+    last, because an attitude of the bar would look like them.
+    """
+    state = projected.state
+    if state.motion is None:
+        middle = float(state.position_m[:, 0].mean())
+        state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
+        projected = replace(projected, state=state)
+    fixed = [name for name in BUILD_NUISANCES if name not in problem.free]
+    motions = [name for name in MOTION_GROUPS if name in allowed and name not in problem.free]
     if problem.window.path_m is not None:
         # Errors of a path that was given would be taken for a curve.
-        tested = [name for name in tested if name != "curve"]
-    if not tested or projected.state.motion is None:
-        return None
-    reduced = problem.with_free(problem.free | frozenset(fixed)).reduce(projected)
-    sigmas = problem.nuisance_sigmas(projected.state)
-    indices = _nuisance_indices(problem, projected.state, reduced.first_moment, fixed)
-    clusters = problem.clusters(projected.state)
-    # A path that is oblique to the bar is the simplest motion, and is not taken for a curve.
-    stages = (
-        (("crab",), MIN_EVIDENCE),
-        (MOTION_GROUPS, MIN_MOTION_EVIDENCE),
-        (BUILD_NUISANCES, MIN_EVIDENCE),
-    )
-    for group, min_evidence in stages:
-        base = reduced.hessian.copy()
-        held = [name for name in fixed if group is not MOTION_GROUPS or name in MOTION_GROUPS]
-        every = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in held)])
-        base[every, every] *= FIXING_WEIGHT
-        without = float(reduced.descent @ solve_scaled(base, reduced.descent))
-        best, most = None, min_evidence
-        for name in (name for name in tested if name in group):
-            own = indices[name]
-            hessian = base.copy()
-            hessian[own, own] /= FIXING_WEIGHT
-            right = np.column_stack([reduced.descent, np.eye(len(hessian))[:, own]])
-            solved = solve_scaled(hessian, right)
-            gain = float(reduced.descent @ solved[:, 0]) - without
-            covariance = solved[own, 1:]
-            occam = 2 * np.log(sigmas[name]).sum() - np.linalg.slogdet(covariance)[1]
-            if gain < occam + min_evidence:
-                continue
-            # Unit variances and no correlations, if the residual was noise.
-            inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
-            changes = reduced.sample_changes(solved)
-            remaining = projected.residual - changes[..., 0]
-            rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
-            unit = max(
-                1.0,
-                *(float((cluster_sums(each, rows) ** 2).sum(axis=0).mean()) for each in clusters),
-            )
-            evidence = gain / unit - (occam - len(own) * np.log(unit))
-            if evidence > most:
-                best, most = name, evidence
-        if best is not None:
-            return best
-    return None
+        motions = [name for name in motions if name != "curve"]
+    rms = problem.rms_residual(projected)
+    if rms < MIN_WAVE_RESIDUAL_SIGMAS:
+        motions = [name for name in motions if name not in ("height", "rocking")]
+    reduced = problem.with_free(problem.free.union(fixed, motions)).reduce(projected)
+    indices = _nuisance_indices(problem, state, reduced.first_moment, [*fixed, *motions])
+    held = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in motions)])
+    reduced.hessian[held, held] *= FIXING_WEIGHT
+    gains = {
+        name: _predict_gain(
+            reduced,
+            np.concatenate([indices[other] for other in fixed if other != name] or [held[:0]]),
+        )
+        - len(indices[name])
+        for name in fixed
+        if name in allowed
+    }
+    tests = [
+        _test_motion(problem, projected, reduced, indices[name], state.motion.group_sigmas[name])
+        for name in motions
+    ]
+    evidence = np.array([each[0] for each in tests])
+    changes = np.reshape([each[1] for each in tests], (len(tests), len(reduced.hessian))).T
+    best = int(np.argmax(evidence)) if motions else None
+    significant = None
+    if gains.get("crab", 0.0) > MIN_NUISANCE_GAIN:
+        significant = "crab"
+    elif (
+        best is not None
+        and evidence[best] > MIN_MOTION_EVIDENCE
+        and (motions[best] in HEADING_NUISANCES or rms > MAX_SENSOR_RESIDUAL_SIGMAS)
+    ):
+        significant = motions[best]
+    elif gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN:
+        significant = "tilt"
+    return NuisanceTests(state, reduced, changes, evidence, significant)
+
+
+def _predict_gain(reduced: ReducedEquations, fixed: NDArray[np.intp]) -> float:
+    """Return the decrease of the cost by one step while some of the unknowns are fixed."""
+    hessian = reduced.hessian.copy()
+    hessian[fixed, fixed] *= FIXING_WEIGHT
+    return float(reduced.descent @ solve_scaled(hessian, reduced.descent))
+
+
+def _test_motion(
+    problem: PassProblem,
+    projected: ProjectedState,
+    reduced: ReducedEquations,
+    own: NDArray[np.intp],
+    sigmas: Array,
+) -> tuple[float, Array]:
+    """Return the evidence for a motion, and the change (q,) of the unknowns by it.
+
+    The unit of the gain is not the noise but the variance of the score among clusters of samples
+    that the motion leaves unexplained (White, Econometrica 50 (1982) 1, section 3), because errors
+    of gains and axes of the sensors would else look like a motion.
+    """
+    base = solve_scaled(reduced.hessian, reduced.descent)
+    hessian = reduced.hessian.copy()
+    hessian[own, own] /= FIXING_WEIGHT
+    right = np.column_stack([reduced.descent, np.eye(len(hessian))[:, own]])
+    solved = solve_scaled(hessian, right)
+    gain = float(reduced.descent @ (solved[:, 0] - base))
+    covariance = solved[own, 1:]
+    occam = 2 * np.log(sigmas).sum() - np.linalg.slogdet(covariance)[1]
+    evidence = gain - occam
+    if evidence > 0:
+        # Unit variances and no correlations, if the residual was noise.
+        inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
+        changes = reduced.sample_changes(solved)
+        remaining = projected.residual - changes[..., 0]
+        rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
+        unit = max(
+            1.0,
+            *(
+                float((cluster_sums(each, rows) ** 2).sum(axis=0).mean())
+                for each in problem.clusters(projected.state)
+            ),
+        )
+        evidence = gain / unit - (occam - len(own) * np.log(unit))
+    return evidence, solved[:, 0] - base
 
 
 def cluster_sums(clusters: NDArray[np.intp], rows: Array) -> Array:
     """Return the sums (K, k) of rows (C, n, k) over the clusters (C, n) 0 to K - 1."""
-    flat = rows.reshape(clusters.size, -1)
-    sums = np.zeros((int(clusters.max()) + 1, flat.shape[1]))
-    np.add.at(sums, clusters.ravel(), flat)
-    return sums
+    index = clusters.ravel()
+    members = csr_array((np.ones(len(index)), (index, np.arange(len(index)))))
+    return np.asarray(members @ rows.reshape(len(index), -1))
 
 
 def _nuisance_indices(
@@ -970,7 +1016,6 @@ def _nuisance_indices(
     """Return the indices of the unknowns of each of the ``names`` in the normal equations."""
     m = len(state.position_m)
     indices = {
-        "depth": np.arange(first_moment - m, first_moment),
         "crab": np.array([2 * m + GLOBAL_UNKNOWNS.index("crab_rad")]),
         "tilt": first_moment + 3 * np.arange(m) + 2,
     }
@@ -989,9 +1034,9 @@ def _result(
     projected: ProjectedState,
     weight: Array,
     converged: bool,
-    reduced: ReducedEquations | None,
+    tests: NuisanceTests | None,
 ) -> PassFit:
-    """Collect the result of a fit; without ``reduced`` there are no covariances."""
+    """Collect the result of a fit; without ``tests`` there are no covariances."""
     window, state = problem.window, projected.state
     m, n = len(state.position_m), len(window.time_periods)
     residual = problem.unweighted_residual(projected, weight)
@@ -1002,9 +1047,9 @@ def _result(
     correction = float(np.sqrt(count / max(count - unknowns, 1)))
     covariance, path_sigma = np.full((3 * m, 3 * m), np.nan), np.full(n, np.nan)
     height_sigma, significance = np.nan, np.full(m, np.inf)
-    if reduced is not None:
+    if tests is not None:
         covariance, path_sigma, height_sigma, significance = _covariances(
-            reduced, state, projected.residual, problem.clusters(state)
+            tests, state, projected.residual, problem.clusters(state)
         )
     return PassFit(
         state=state,
@@ -1021,7 +1066,7 @@ def _result(
 
 
 def _covariances(
-    reduced: ReducedEquations,
+    tests: NuisanceTests,
     state: PassState,
     residual: Array,
     clusters: tuple[NDArray[np.intp], ...],
@@ -1033,6 +1078,7 @@ def _covariances(
     and Zeger, Biometrika 73 (1986) 13), which are never taken smaller than those of the model.
     """
     m = len(state.position_m)
+    reduced = tests.reduced
     full = solve_scaled(reduced.hessian, np.eye(len(reduced.hessian)))
     # From x, y and moment to x, y and angle.
     jacobian = np.zeros((3 * m, len(full)))
@@ -1061,4 +1107,6 @@ def _covariances(
         sums = cluster_sums(each, rows)
         variance = np.maximum(variance, (sums**2).sum(axis=0))
     inflation = np.sqrt(variance / np.diag(covariance))
-    return inflation[:, None] * covariance * inflation, path, height, significance
+    changes = jacobian @ tests.likely_changes()
+    covariance = inflation[:, None] * covariance * inflation + changes @ changes.T
+    return covariance, path, height, significance

@@ -220,8 +220,6 @@ def detect_magnets_at(
         hypothesis.fit.state,
         position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
         moment_am2=np.zeros((len(positions_m), 3)),
-        depth_m=None,
-        free=hypothesis.fit.state.free - {"depth"},
     )
     coarse = fit_coarse(window, state, priors)
     moment = _horizontal_moments(coarse.state)
@@ -615,7 +613,6 @@ def _select_sources(state: PassState, chosen: NDArray[np.bool_] | list[int]) -> 
         state,
         position_m=state.position_m[chosen],
         moment_am2=state.moment_am2[chosen],
-        depth_m=None if state.depth_m is None else state.depth_m[chosen],
     )
 
 
@@ -623,10 +620,8 @@ def _with_sources(state: PassState, candidates: list[MagnetCandidate]) -> PassSt
     """Return the state with further sources."""
     positions = [candidate.position_m for candidate in candidates]
     moments = [[*candidate.moment_am2, 0.0] for candidate in candidates]
-    depth = state.depth_m
     return replace(
         state,
-        depth_m=None if depth is None else np.append(depth, np.zeros(len(candidates))),
         position_m=np.vstack([state.position_m, positions]),
         moment_am2=np.vstack([state.moment_am2, moments]),
     )

@@ -143,8 +143,6 @@ class PassPriors:
         Expected magnitude of a magnet's moment.
     tilt_sigma : float
         Vertical part of a magnet's moment, relative to its magnitude (standard deviation).
-    depth_sigma_m : float
-        Standard deviation of a magnet's height.
     crab_sigma_rad : float
         Standard deviation of the angle between the array's x axis and its path.
     jitter_fraction : float
@@ -155,7 +153,6 @@ class PassPriors:
     skew_periods: tuple[float, float] = (0.0, 0.5)
     moment_am2: float = 1.5e-3
     tilt_sigma: float = 0.05
-    depth_sigma_m: float = 2e-4
     crab_sigma_rad: float = 0.009
     jitter_fraction: float = 0.3
 
