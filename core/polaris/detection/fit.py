@@ -234,7 +234,7 @@ def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> Pass
         problem = PassProblem(window, priors, weight, start)
         equations, converged = _minimize(problem, start, COARSE_ITERATIONS, COARSE_GAIN_FRACTION)
         if problem.rms_residual(equations.projected) > MAX_SENSOR_RESIDUAL_SIGMAS:
-            problem, equations, converged = _estimate_nuisances(
+            problem, equations, converged, _ = _estimate_nuisances(
                 problem, equations, converged, COARSE_NUISANCES, COARSE_GAIN_FRACTION
             )
         return _result(problem, equations.projected, weight, converged, tests=None)
@@ -259,13 +259,13 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
             for _ in range(REWEIGHTING_ROUNDS):
                 problem, equations, converged = _reweight(problem, equations, weight)
         before = problem.free
-        problem, equations, converged = _estimate_nuisances(
+        problem, equations, converged, tests = _estimate_nuisances(
             problem, equations, converged, NUISANCES, gain
         )
         if (problem.free - before) & {*MOTION_GROUPS}:
             # Samples that only a wrong motion had made outliers count again.
             problem, equations, converged = _reweight(problem, equations, weight)
-        tests = _test_nuisances(problem, equations.projected, NUISANCES)
+            tests = _test_nuisances(problem, equations.projected, NUISANCES)
         return _result(problem, equations.projected, weight, converged, tests)
 
 
@@ -289,21 +289,20 @@ def _estimate_nuisances(
     converged: bool,
     allowed: tuple[str, ...],
     min_gain: float,
-) -> tuple[PassProblem, PassEquations, bool]:
+) -> tuple[PassProblem, PassEquations, bool, NuisanceTests]:
     """Estimate nuisances one after the other, while the samples show another one.
 
     None is estimated if the magnets explain too little of the samples: a fit from a wrong initial
     guess would spend all effort on them.
     """
     unexplained = (equations.projected.residual**2).sum() / (problem.target**2).sum()
-    while unexplained < MAX_UNEXPLAINED_FRACTION:
+    while True:
         tests = _test_nuisances(problem, equations.projected, allowed)
-        if tests.significant is None:
-            break
+        if tests.significant is None or unexplained > MAX_UNEXPLAINED_FRACTION:
+            return problem, equations, converged, tests
         problem = problem.with_free(problem.free | {tests.significant})
         state = replace(tests.state, free=problem.free)
         equations, converged = _minimize(problem, state, NUISANCE_ITERATIONS, min_gain)
-    return problem, equations, converged
 
 
 @contextmanager
@@ -714,10 +713,28 @@ class PassProblem:
         velocity, rate : (n, 3, k) ndarray
             In the axes of the bar.
         """
-        lever = np.cross(rate[None], self.window.sensors_m[:, None, :, None], axis=2)
-        moved = np.einsum("sani,snik->sank", totals, velocity + lever)
-        turned = np.cross(rate[None], fields.transpose(0, 2, 1)[..., None], axis=2)
-        return np.asarray(moved - turned.transpose(0, 2, 1, 3))
+        by_x, by_y, by_z = np.moveaxis(totals, -1, 0)
+        s_x, s_y, s_z = self.window.sensors_m.T[:, :, None, None]
+        # Rotations about the axes of the bar: w x s, and -w x f.
+        by_rotation = np.stack(
+            [
+                by_z * s_y - by_y * s_z,
+                by_x * s_z - by_z * s_x,
+                by_y * s_x - by_x * s_y,
+            ],
+            axis=-1,
+        )
+        f_x, f_y, f_z = fields.swapaxes(0, 1)
+        by_rotation[:, 1, :, 0] += f_z
+        by_rotation[:, 2, :, 0] -= f_y
+        by_rotation[:, 0, :, 1] -= f_z
+        by_rotation[:, 2, :, 1] += f_x
+        by_rotation[:, 0, :, 2] += f_y
+        by_rotation[:, 1, :, 2] -= f_x
+        sensors, axes, n, _ = totals.shape
+        both = np.concatenate([totals, by_rotation], axis=-1).reshape(-1, n, 6).swapaxes(0, 1)
+        changes = both @ np.concatenate([velocity, rate], axis=1)
+        return np.asarray(changes.swapaxes(0, 1).reshape(sensors, axes, n, -1))
 
     def reduce(self, projected: ProjectedState) -> ReducedEquations:
         """Return the normal equations at a state, from which the path is eliminated."""
@@ -936,8 +953,11 @@ def _test_nuisances(
         for name in fixed
         if name in allowed
     }
+    base = solve_scaled(reduced.hessian, reduced.descent)
     tests = [
-        _test_motion(problem, projected, reduced, indices[name], state.motion.group_sigmas[name])
+        _test_motion(
+            problem, projected, reduced, base, indices[name], state.motion.group_sigmas[name]
+        )
         for name in motions
     ]
     evidence = np.array([each[0] for each in tests])
@@ -968,16 +988,18 @@ def _test_motion(
     problem: PassProblem,
     projected: ProjectedState,
     reduced: ReducedEquations,
+    base: Array,
     own: NDArray[np.intp],
     sigmas: Array,
 ) -> tuple[float, Array]:
     """Return the evidence for a motion, and the change (q,) of the unknowns by it.
 
+    ``base`` (q,) is the step without it, ``own`` are its indices, and ``sigmas`` its priors.
+
     The unit of the gain is not the noise but the variance of the score among clusters of samples
     that the motion leaves unexplained (White, Econometrica 50 (1982) 1, section 3), because errors
     of gains and axes of the sensors would else look like a motion.
     """
-    base = solve_scaled(reduced.hessian, reduced.descent)
     hessian = reduced.hessian.copy()
     hessian[own, own] /= FIXING_WEIGHT
     right = np.column_stack([reduced.descent, np.eye(len(hessian))[:, own]])
