@@ -38,6 +38,7 @@ import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,7 +198,9 @@ class PassFit:
     covariance : (3 M, 3 M) ndarray
         Of x, y and angle of each magnet, in m and rad, for the noise as stated. It includes the
         prior uncertainty of crab and tilt, also while they are fixed at zero. ``nan`` after a
-        coarse fit, like the next two.
+        coarse fit, like the next three.
+    motion_covariance : (1 + K, 1 + K) ndarray
+        Of crab and the coefficients of the motion.
     path_sigma_m : (n,) ndarray
         Of the path relative to the sample with the strongest field; 0 if the path is known.
     height_sigma_m : float
@@ -212,6 +215,7 @@ class PassFit:
     robust_sigma: float
     shared_square: float
     covariance: Array
+    motion_covariance: Array
     path_sigma_m: Array
     height_sigma_m: float
     significance: Array
@@ -893,6 +897,8 @@ class NuisanceTests:
     ----------
     state : PassState
         Its motion has coefficients, all of them zero if it is straight.
+    motion_columns : (k,) ndarray
+        Coefficients of the motion that are unknowns.
     reduced : ReducedEquations
         Crab and tilt are free, and motions that are not estimated are fixed.
     changes : (q, k) ndarray
@@ -904,6 +910,7 @@ class NuisanceTests:
     """
 
     state: PassState
+    motion_columns: NDArray[np.intp]
     reduced: ReducedEquations
     changes: Array
     evidence: Array
@@ -940,7 +947,8 @@ def _test_nuisances(
     rms = problem.rms_residual(projected)
     if rms < MIN_WAVE_RESIDUAL_SIGMAS:
         motions = [name for name in motions if name not in ("height", "rocking")]
-    reduced = problem.with_free(problem.free.union(fixed, motions)).reduce(projected)
+    tested = problem.with_free(problem.free.union(fixed, motions))
+    reduced = tested.reduce(projected)
     indices = _nuisance_indices(problem, state, reduced.first_moment, [*fixed, *motions])
     held = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in motions)])
     reduced.hessian[held, held] *= FIXING_WEIGHT
@@ -974,7 +982,8 @@ def _test_nuisances(
         significant = motions[best]
     elif gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN:
         significant = "tilt"
-    return NuisanceTests(state, reduced, changes, evidence, significant)
+    columns = tested.motion_columns(state)
+    return NuisanceTests(state, columns, reduced, changes, evidence, significant)
 
 
 def _predict_gain(reduced: ReducedEquations, fixed: NDArray[np.intp]) -> float:
@@ -1067,68 +1076,84 @@ def _result(
     if window.path_m is None:
         unknowns += n
     correction = float(np.sqrt(count / max(count - unknowns, 1)))
-    covariance, path_sigma = np.full((3 * m, 3 * m), np.nan), np.full(n, np.nan)
-    height_sigma, significance = np.nan, np.full(m, np.inf)
+    covariances: dict[str, Any] = {
+        "covariance": np.full((3 * m, 3 * m), np.nan),
+        "motion_covariance": np.full((1, 1), np.nan),
+        "path_sigma_m": np.full(n, np.nan),
+        "height_sigma_m": np.nan,
+        "significance": np.full(m, np.inf),
+    }
     if tests is not None:
-        covariance, path_sigma, height_sigma, significance = _covariances(
-            tests, state, projected.residual, problem.clusters(state)
-        )
+        state = tests.state
+        covariances = _covariances(tests, projected.residual, problem.clusters(state))
     return PassFit(
         state=state,
         residual=residual,
         rms_sigma=float(np.sqrt(np.nansum(residual**2) / max(count, 1))) * correction,
         robust_sigma=robust_sigma(residual) * correction,
         shared_square=problem.shared_square(projected),
-        covariance=covariance,
-        path_sigma_m=path_sigma,
-        height_sigma_m=height_sigma,
-        significance=significance,
         converged=converged,
+        **covariances,
     )
 
 
 def _covariances(
-    tests: NuisanceTests,
-    state: PassState,
-    residual: Array,
-    clusters: tuple[NDArray[np.intp], ...],
-) -> tuple[Array, Array, float, Array]:
-    """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height.
+    tests: NuisanceTests, residual: Array, clusters: tuple[NDArray[np.intp], ...]
+) -> dict[str, Any]:
+    """Return the attributes of :class:`PassFit` that describe the accuracy.
 
-    Last come the squares of the horizontal moments in standard deviations. Where residuals are
-    correlated within clusters, the standard deviations are those of the sandwich estimator (Liang
-    and Zeger, Biometrika 73 (1986) 13), which are never taken smaller than those of the model.
+    Where residuals are correlated within clusters, the standard deviations are those of the
+    sandwich estimator (Liang and Zeger, Biometrika 73 (1986) 13), which are never taken smaller
+    than those of the model.
     """
+    state, reduced = tests.state, tests.reduced
     m = len(state.position_m)
-    reduced = tests.reduced
     full = solve_scaled(reduced.hessian, np.eye(len(reduced.hessian)))
-    # From x, y and moment to x, y and angle.
-    jacobian = np.zeros((3 * m, len(full)))
-    square = (state.moment_am2[:, :2] ** 2).sum(axis=1)
-    for k in range(m):
-        jacobian[3 * k, k] = jacobian[3 * k + 1, m + k] = 1.0
-        moment = reduced.first_moment + 3 * k
-        jacobian[3 * k + 2, moment] = -state.moment_am2[k, 1] / square[k]
-        jacobian[3 * k + 2, moment + 1] = state.moment_am2[k, 0] / square[k]
-    path = np.zeros(len(state.path_m))
-    if reduced.band is not None and reduced.coupling is not None:
-        own = solveh_banded(reduced.band, np.eye(len(path)), check_finite=False)
-        coupled = np.einsum("nq,qr,nr->n", reduced.coupling, full, reduced.coupling, optimize=True)
-        path = np.sqrt(np.maximum(np.diag(own) + coupled, 0.0))
-    height = float(np.sqrt(full[2 * m, 2 * m]))
-    horizontal = reduced.first_moment + 3 * np.arange(m)[:, None] + [0, 1]
-    of_moments = full[horizontal[:, :, None], horizontal[:, None, :]]
-    moments = state.moment_am2[:, :2, None]
-    significance = (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2))
+    jacobian = _outputs_jacobian(state, reduced)
     covariance = jacobian @ full @ jacobian.T
     # A residual that is larger everywhere scales the whole covariance later.
     relative = residual / max(1.0, robust_sigma(residual))
     rows = reduced.sample_changes(full @ jacobian.T) * relative[..., None]
     variance = np.diag(covariance)
     for each in clusters:
-        sums = cluster_sums(each, rows)
-        variance = np.maximum(variance, (sums**2).sum(axis=0))
+        variance = np.maximum(variance, (cluster_sums(each, rows) ** 2).sum(axis=0))
     inflation = np.sqrt(variance / np.diag(covariance))
     changes = jacobian @ tests.likely_changes()
     covariance = inflation[:, None] * covariance * inflation + changes @ changes.T
-    return covariance, path, height, significance
+    assert state.motion is not None
+    motion = np.zeros((1 + len(state.motion.coefficients),) * 2)
+    estimated = np.append(0, 1 + tests.motion_columns)
+    motion[np.ix_(estimated, estimated)] = covariance[3 * m :, 3 * m :]
+    horizontal = reduced.first_moment + 3 * np.arange(m)[:, None] + [0, 1]
+    of_moments = full[horizontal[:, :, None], horizontal[:, None, :]]
+    moments = state.moment_am2[:, :2, None]
+    return {
+        "covariance": covariance[: 3 * m, : 3 * m],
+        "motion_covariance": motion,
+        "path_sigma_m": _path_sigma(state, reduced, full),
+        "height_sigma_m": float(np.sqrt(full[2 * m, 2 * m])),
+        "significance": (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2)),
+    }
+
+
+def _outputs_jacobian(state: PassState, reduced: ReducedEquations) -> Array:
+    """Return the derivatives of x, y and angle of each magnet, of crab, and of the motion."""
+    m, crab = len(state.position_m), 2 * len(state.position_m) + GLOBAL_UNKNOWNS.index("crab_rad")
+    jacobian = np.zeros((3 * m + reduced.first_moment - crab, len(reduced.hessian)))
+    square = (state.moment_am2[:, :2] ** 2).sum(axis=1)
+    for k in range(m):
+        jacobian[3 * k, k] = jacobian[3 * k + 1, m + k] = 1.0
+        moment = reduced.first_moment + 3 * k
+        jacobian[3 * k + 2, moment] = -state.moment_am2[k, 1] / square[k]
+        jacobian[3 * k + 2, moment + 1] = state.moment_am2[k, 0] / square[k]
+    jacobian[3 * m :, crab : reduced.first_moment] = np.eye(reduced.first_moment - crab)
+    return jacobian
+
+
+def _path_sigma(state: PassState, reduced: ReducedEquations, full: Array) -> Array:
+    """Return the standard deviations (n,) of the path; 0 if it is known."""
+    if reduced.band is None or reduced.coupling is None:
+        return np.zeros(len(state.path_m))
+    own = solveh_banded(reduced.band, np.eye(len(state.path_m)), check_finite=False)
+    coupled = np.einsum("nq,qr,nr->n", reduced.coupling, full, reduced.coupling, optimize=True)
+    return np.sqrt(np.maximum(np.diag(own) + coupled, 0.0))

@@ -735,6 +735,11 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     covariance = covariance * noise_factor**2 + _debris_covariance(prepared, fit, chosen)
     moment = state.moment_am2[chosen]
     moment[:, :2] = moment[:, :2] @ into_array
+    # Deviations from the pose at the reference sample.
+    planar = motion.planar_derivatives(path, state.crab_rad)
+    planar = planar - planar[reference]
+    planar[:, :2] = into_array.T @ planar[:, :2]
+    motion_covariance = planar @ fit.motion_covariance @ planar.swapaxes(1, 2) * noise_factor**2
     forward, lateral = ((poses.position_m[:, :2] - origin) @ into_array).T
     return DetectedMagnets(
         time_ns=int(samples.time_ns[prepared.first + reference]),
@@ -743,6 +748,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
         path_m=forward,
         lateral_m=lateral,
         heading_rad=yaw - heading,
+        motion_covariance=motion_covariance,
         position_m=(position - origin) @ into_array,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),

@@ -171,6 +171,20 @@ class Motion:
         chosen = np.concatenate([[0, 1], 2 + columns])
         return np.einsum("nji,njk->nik", rotation, velocity[..., chosen]), rate[..., chosen]
 
+    def planar_derivatives(self, path_m: Array, crab_rad: float) -> Array:
+        """Return the derivatives (n, 3, 1 + K) of x, y and heading on the floor.
+
+        They are derivatives by the crab angle and by the coefficients.
+        """
+        path, angles, groups = self._path(path_m, crab_rad), self._angles(path_m), self.groups
+        derivatives = np.zeros((len(path_m), 3, 1 + len(self.coefficients)))
+        derivatives[:, :2, 0] = path.by_crab[:, :2]
+        by_coefficient = derivatives[..., 1:]
+        by_coefficient[:, :2, groups["curve"]] = path.by_curve
+        by_coefficient[:, 2, groups["curve"]] = path.basis
+        by_coefficient[:, 2, groups["yaw"]] = angles.yaw_wave
+        return derivatives
+
     def _path(self, path_m: Array, crab_rad: float) -> _Path:
         bend, tangent = self.coefficients[self.groups["curve"]], np.tan(crab_rad)
         unit = (path_m - self.middle_m) / self.half_length_m
