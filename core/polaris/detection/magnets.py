@@ -70,15 +70,19 @@ TRIED_STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
 MAX_PASS_LENGTH_M = 2.0
 """Maximum length of a pass [m]."""
 
+LAST_RESORT_EFFORT_RATIO = 1.5
+"""Effort up to which a grid of magnets is fitted, relative to that of the other fits."""
+
 MAX_INITIAL_GUESSES = 4
-"""Number of initial guesses that are refined, per direction of travel."""
+"""Number of initial guesses that are refined."""
+
+MAX_FORWARD_REMAINING = 0.5
+"""Fraction of the samples' squares that the first magnets leave unexplained, from which the array
+may have moved backward."""
 
 SEARCH_SHARED_FIELD_T = 3e-6
 """Standard deviation of a field that all sensors share (motors, rotation in the Earth's field) that
 is allowed for while magnets are searched for [T]."""
-
-FORWARD_EFFORT_FRACTION = 0.5
-"""Fraction of the effort after which no further guess of forward travel is tried."""
 
 MAX_GROWTH_ROUNDS = 4
 """Maximum number of searches of the residual for more magnets."""
@@ -213,7 +217,7 @@ def detect_magnets_at(
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
     # The grid of a dense tag is the last resort, and has effort of its own.
-    window.effort.limit = 2 * MAX_EFFORT
+    window.effort.limit = LAST_RESORT_EFFORT_RATIO * MAX_EFFORT
     if window.effort.is_exhausted:
         raise DegenerateError("the effort for this pass is spent")
     state = replace(
@@ -434,32 +438,37 @@ def _initial_state(
 def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
     """Yield fits of a pass, one per initial guess; nothing if the pass holds no magnet.
 
-    The speeds, heights and time axes that explain the samples best come first. An array that moves
-    backward is considered last, and only if nothing else describes the samples.
+    The speeds, heights and time axes that explain the samples best come first.
     """
     least = np.inf
-    for direction in (1.0, -1.0):
-        guesses = [
-            (timed, guess)
-            for timed in time_hypotheses(prepared)
-            for guess in _initial_guesses(timed, direction)
-        ]
-        guesses.sort(key=lambda pair: pair[1].remaining)
-        for timed, guess in guesses[:MAX_INITIAL_GUESSES]:
-            effort = prepared.window.effort
-            if effort.spent > (FORWARD_EFFORT_FRACTION if direction > 0 else 1.0) * effort.limit:
-                break
-            try:
-                fit = _grow_fit(timed, guess)
-            except DegenerateError:
-                continue
-            yield fit
-            is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
-            if is_residual_moderate and fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * least:
-                return  # Another initial guess does not reduce the residual.
-            least = min(least, fit.rms_sigma)
-        if prepared.window.path_m is not None or least < UNRELATED_RESIDUAL_SIGMAS:
+    for timed, guess in _timed_guesses(prepared)[:MAX_INITIAL_GUESSES]:
+        if prepared.window.effort.is_exhausted:
             return
+        try:
+            fit = _grow_fit(timed, guess)
+        except DegenerateError:
+            continue
+        yield fit
+        is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
+        if is_residual_moderate and fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * least:
+            return  # Another initial guess does not reduce the residual.
+        least = min(least, fit.rms_sigma)
+
+
+def _timed_guesses(prepared: PreparedPass) -> list[tuple[PreparedPass, _InitialGuess]]:
+    """Return the initial guesses for each time axis, those that leave least unexplained first.
+
+    An array that moves backward is considered only if forward travel explains little: no magnets
+    have the field of magnets that are passed in the other direction.
+    """
+    guesses: list[tuple[PreparedPass, _InitialGuess]] = []
+    for direction in (1.0, -1.0) if prepared.window.path_m is None else (1.0,):
+        for timed in time_hypotheses(prepared):
+            guesses += [(timed, guess) for guess in _initial_guesses(timed, direction)]
+        guesses.sort(key=lambda pair: pair[1].remaining)
+        if guesses and guesses[0][1].remaining < MAX_FORWARD_REMAINING:
+            break
+    return guesses
 
 
 # ---- growing a fit
