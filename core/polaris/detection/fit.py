@@ -104,9 +104,9 @@ MIN_MOTION_EVIDENCE = 18.4
 """Twice the logarithm of the Bayes factor from which a motion is estimated: a factor of 10,000,
 which leaves a hundred to one if one pass of a hundred has such a motion."""
 
-FIXED_WORK_UNKNOWNS = 110
+FIXED_WORK_UNKNOWNS, MOTION_WORK_UNKNOWNS = 110, 4
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
-number; measured."""
+number, and as a coefficient of the motion; measured."""
 
 MAX_UNEXPLAINED_FRACTION = 0.3
 """Fraction of the samples' squares that magnets leave unexplained up to which nuisances are
@@ -514,7 +514,8 @@ class PassProblem:
 
     def work(self, state: PassState) -> float:
         """Return the work of an iteration, in samples times unknowns."""
-        unknowns = 6 * len(state.position_m) + len(self.motion_columns(state))
+        columns = MOTION_WORK_UNKNOWNS * len(self.motion_columns(state))
+        unknowns = 6 * len(state.position_m) + columns
         return float(np.prod(self.shape) * (unknowns + FIXED_WORK_UNKNOWNS))
 
     def linearize(self, state: PassState, problems: Indices) -> PassEquations:

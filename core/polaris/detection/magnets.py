@@ -70,7 +70,7 @@ TRIED_STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
 MAX_PASS_LENGTH_M = 2.0
 """Maximum length of a pass [m]."""
 
-LAST_RESORT_EFFORT_RATIO = 1.5
+LAST_RESORT_EFFORT_RATIO = 1.25
 """Effort up to which a grid of magnets is fitted, relative to that of the other fits."""
 
 MAX_INITIAL_GUESSES = 4

@@ -58,7 +58,7 @@ MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
 
-MAX_EFFORT = 6e7
+MAX_EFFORT = 5e7
 """Work that a pass may take, in samples times unknowns of all iterations: less than a second of a
 processor. A hundred sources under a bar in a cluttered hall would take minutes."""
 
