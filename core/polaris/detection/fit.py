@@ -244,10 +244,15 @@ def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> Pass
         return _result(problem, equations.projected, weight, converged, tests=None)
 
 
-def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFit:
+def fit_pass(
+    window: PassWindow,
+    start: PassState,
+    priors: PassPriors,
+    nuisances: tuple[str, ...] = NUISANCES,
+) -> PassFit:
     """Return the most likely state near an initial guess, with its covariance.
 
-    Outliers are down-weighted, and nuisances are estimated if the samples show any.
+    Outliers are down-weighted, and ``nuisances`` are estimated if the samples show any.
 
     Raises
     ------
@@ -264,12 +269,12 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
                 problem, equations, converged = _reweight(problem, equations, weight)
         before = problem.free
         problem, equations, converged, tests = _estimate_nuisances(
-            problem, equations, converged, NUISANCES, gain
+            problem, equations, converged, nuisances, gain
         )
         if (problem.free - before) & {*MOTION_GROUPS}:
             # Samples that only a wrong motion had made outliers count again.
             problem, equations, converged = _reweight(problem, equations, weight)
-            tests = _test_nuisances(problem, equations.projected, NUISANCES)
+            tests = _test_nuisances(problem, equations.projected, nuisances)
         return _result(problem, equations.projected, weight, converged, tests)
 
 
@@ -978,10 +983,10 @@ def _test_nuisances(
     elif (
         best is not None
         and evidence[best] > MIN_MOTION_EVIDENCE
-        and (motions[best] in HEADING_NUISANCES or rms > MAX_SENSOR_RESIDUAL_SIGMAS)
+        and (motions[best] in (*HEADING_NUISANCES,"attitude") or rms > MAX_SENSOR_RESIDUAL_SIGMAS)
     ):
         significant = motions[best]
-    elif gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN:
+    elif gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN and "attitude" not in problem.free:
         significant = "tilt"
     columns = tested.motion_columns(state)
     return NuisanceTests(state, columns, reduced, changes, evidence, significant)

@@ -21,7 +21,13 @@ from scipy.ndimage import median_filter
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.field_model import MagnetOffsets
-from locatk.core.polaris.detection.fit import PassFit, PassState, fit_coarse, fit_pass
+from locatk.core.polaris.detection.fit import (
+    BUILD_NUISANCES,
+    PassFit,
+    PassState,
+    fit_coarse,
+    fit_pass,
+)
 from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
     MAX_EFFORT,
@@ -500,6 +506,8 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
         information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
         window = replace(window, common_t=float(np.sqrt((fit.shared_square - 1) / information)))
     state = _without_spurious_sources(fit.state, prepared)
+    if window.path_m is not None and _is_path_contradicted(window, state, priors):
+        raise DegenerateError("the samples contradict the given path")
     while True:
         fit = fit_pass(window, state, priors)
         if _has_drift(window, fit):
@@ -513,12 +521,18 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
         is_complete = len(state.position_m) == len(fit.state.position_m)
         if is_complete or window.effort.is_exhausted:
             break
-    if window.path_m is not None and fit.rms_sigma < WHITE_RESIDUAL_SIGMAS:
-        # From the given path, a free one leads to the nearest path that the samples prefer.
-        free = fit_pass(replace(window, path_m=None), fit.state, priors)
-        if fit.rms_sigma > MAX_GIVEN_PATH_RESIDUAL_RATIO * free.rms_sigma:
-            raise DegenerateError("the samples contradict the given path")
     return fit
+
+
+def _is_path_contradicted(window: PassWindow, state: PassState, priors: PassPriors) -> bool:
+    """Return whether a free path explains the samples better than the given one.
+
+    Motions of the bar would explain a wrong path as well, and are left out of the comparison.
+    """
+    given = fit_pass(window, state, priors, BUILD_NUISANCES)
+    # From the given path, a free one leads to the nearest path that the samples prefer.
+    free = fit_pass(replace(window, path_m=None), given.state, priors, BUILD_NUISANCES)
+    return given.rms_sigma > MAX_GIVEN_PATH_RESIDUAL_RATIO * free.rms_sigma
 
 
 def _separate_candidates(
