@@ -108,9 +108,13 @@ FIXED_WORK_UNKNOWNS, MOTION_WORK_UNKNOWNS = 110, 4
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
 number, and as a coefficient of the motion; measured."""
 
-MAX_UNEXPLAINED_FRACTION = 0.3
+MAX_UNEXPLAINED_FRACTION = 0.1
 """Fraction of the samples' squares that magnets leave unexplained up to which nuisances are
 estimated. A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
+
+MIN_EXPLAINED_FRACTION = 0.1
+"""Fraction of the squares beyond the noise that a motion explains at least: one that leaves more
+than nine tenths is not their cause, magnets are missing."""
 
 MAX_SENSOR_RESIDUAL_SIGMAS = 1.3
 """Rms residual up to which the errors of real sensors (gains, axes) explain it; above it, attitude
@@ -1023,6 +1027,9 @@ def _test_motion(
     covariance = solved[own, 1:]
     occam = 2 * np.log(sigmas).sum() - np.linalg.slogdet(covariance)[1]
     evidence = gain - occam
+    excess = float((projected.residual**2).sum() - (problem.root > 0).sum())
+    if gain < MIN_EXPLAINED_FRACTION * excess:
+        evidence = -np.inf
     if evidence > 0:
         # Unit variances and no correlations, if the residual was noise.
         inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))

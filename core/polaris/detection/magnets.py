@@ -226,10 +226,14 @@ def detect_magnets_at(
     window.effort.limit = LAST_RESORT_EFFORT_RATIO * MAX_EFFORT
     if window.effort.is_exhausted:
         raise DegenerateError("the effort for this pass is spent")
+    # Nuisances of a fit without some of the magnets may have replaced them.
     state = replace(
         hypothesis.fit.state,
         position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
         moment_am2=np.zeros((len(positions_m), 3)),
+        crab_rad=0.0,
+        motion=None,
+        free=frozenset(),
     )
     coarse = fit_coarse(window, state, priors)
     moment = _horizontal_moments(coarse.state)
