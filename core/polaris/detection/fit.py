@@ -108,10 +108,6 @@ FIXED_WORK_UNKNOWNS, MOTION_WORK_UNKNOWNS = 110, 4
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
 number, and as a coefficient of the motion; measured."""
 
-MAX_UNEXPLAINED_FRACTION = 0.1
-"""Fraction of the samples' squares that magnets leave unexplained up to which nuisances are
-estimated. A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
-
 MIN_EXPLAINED_FRACTION = 0.1
 """Fraction of the squares beyond the noise that a motion explains at least: one that leaves more
 than nine tenths is not their cause, magnets are missing."""
@@ -305,17 +301,20 @@ def _estimate_nuisances(
 ) -> tuple[PassProblem, PassEquations, bool, NuisanceTests]:
     """Estimate nuisances one after the other, while the samples show another one.
 
-    None is estimated if the magnets explain too little of the samples: a fit from a wrong initial
-    guess would spend all effort on them.
+    A motion that explains little of the residual is dropped: a fit from a wrong initial guess would
+    spend all effort on them.
     """
-    unexplained = (equations.projected.residual**2).sum() / (problem.target**2).sum()
     while True:
         tests = _test_nuisances(problem, equations.projected, allowed)
-        if tests.significant is None or unexplained > MAX_UNEXPLAINED_FRACTION:
+        if tests.significant is None:
             return problem, equations, converged, tests
-        problem = problem.with_free(problem.free | {tests.significant})
-        state = replace(tests.state, free=problem.free)
-        equations, converged = _minimize(problem, state, NUISANCE_ITERATIONS, min_gain)
+        extended = problem.with_free(problem.free | {tests.significant})
+        state = replace(tests.state, free=extended.free)
+        fitted, has_converged = _minimize(extended, state, NUISANCE_ITERATIONS, min_gain)
+        gain = equations.projected.cost - fitted.projected.cost
+        if tests.significant in MOTION_GROUPS and gain < tests.min_motion_gain:
+            return problem, equations, converged, tests
+        problem, equations, converged = extended, fitted, has_converged
 
 
 @contextmanager
@@ -917,6 +916,8 @@ class NuisanceTests:
         Twice the logarithms of the Bayes factors for these motions.
     significant : str or None
         Nuisance to estimate next.
+    min_motion_gain : float
+        Decrease of the cost by a motion that is one.
     """
 
     state: PassState
@@ -925,6 +926,7 @@ class NuisanceTests:
     changes: Array
     evidence: Array
     significant: str | None
+    min_motion_gain: float
 
     def likely_changes(self) -> Array:
         """Return the changes times the square roots of the probabilities of their motions.
@@ -972,10 +974,11 @@ def _test_nuisances(
         if name in allowed
     }
     base = solve_scaled(reduced.hessian, reduced.descent)
+    sigmas = state.motion.group_sigmas
+    excess = float((projected.residual**2).sum() - (problem.root > 0).sum())
+    min_gain = MIN_EXPLAINED_FRACTION * max(excess, 0.0)
     tests = [
-        _test_motion(
-            problem, projected, reduced, base, indices[name], state.motion.group_sigmas[name]
-        )
+        _test_motion(problem, projected, reduced, base, indices[name], sigmas[name], min_gain)
         for name in motions
     ]
     evidence = np.array([each[0] for each in tests])
@@ -987,13 +990,13 @@ def _test_nuisances(
     elif (
         best is not None
         and evidence[best] > MIN_MOTION_EVIDENCE
-        and (motions[best] in (*HEADING_NUISANCES,"attitude") or rms > MAX_SENSOR_RESIDUAL_SIGMAS)
+        and (motions[best] in (*HEADING_NUISANCES, "attitude") or rms > MAX_SENSOR_RESIDUAL_SIGMAS)
     ):
         significant = motions[best]
     elif gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN and "attitude" not in problem.free:
         significant = "tilt"
     columns = tested.motion_columns(state)
-    return NuisanceTests(state, columns, reduced, changes, evidence, significant)
+    return NuisanceTests(state, columns, reduced, changes, evidence, significant, min_gain)
 
 
 def _predict_gain(reduced: ReducedEquations, fixed: NDArray[np.intp]) -> float:
@@ -1010,6 +1013,7 @@ def _test_motion(
     base: Array,
     own: NDArray[np.intp],
     sigmas: Array,
+    min_gain: float,
 ) -> tuple[float, Array]:
     """Return the evidence for a motion, and the change (q,) of the unknowns by it.
 
@@ -1027,8 +1031,7 @@ def _test_motion(
     covariance = solved[own, 1:]
     occam = 2 * np.log(sigmas).sum() - np.linalg.slogdet(covariance)[1]
     evidence = gain - occam
-    excess = float((projected.residual**2).sum() - (problem.root > 0).sum())
-    if gain < MIN_EXPLAINED_FRACTION * excess:
+    if gain < min_gain:
         evidence = -np.inf
     if evidence > 0:
         # Unit variances and no correlations, if the residual was noise.

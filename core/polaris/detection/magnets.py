@@ -30,7 +30,7 @@ from locatk.core.polaris.detection.fit import (
 )
 from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
-    MAX_EFFORT,
+    EFFORT_PER_SOURCE,
     PassPriors,
     PassWindow,
     PreparedPass,
@@ -76,8 +76,8 @@ TRIED_STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
 MAX_PASS_LENGTH_M = 2.0
 """Maximum length of a pass [m]."""
 
-LAST_RESORT_EFFORT_RATIO = 1.25
-"""Effort up to which a grid of magnets is fitted, relative to that of the other fits."""
+LAST_RESORT_EFFORT = EFFORT_PER_SOURCE / 4
+"""Work that the fit of a grid of magnets may take, for each source that the pass may hold."""
 
 MAX_INITIAL_GUESSES = 4
 """Number of initial guesses that are refined."""
@@ -223,9 +223,7 @@ def detect_magnets_at(
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
     # The grid of a dense tag is the last resort, and has effort of its own.
-    window.effort.limit = LAST_RESORT_EFFORT_RATIO * MAX_EFFORT
-    if window.effort.is_exhausted:
-        raise DegenerateError("the effort for this pass is spent")
+    window.effort.limit = window.effort.spent + LAST_RESORT_EFFORT * prepared.max_sources
     # Nuisances of a fit without some of the magnets may have replaced them.
     state = replace(
         hypothesis.fit.state,

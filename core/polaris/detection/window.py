@@ -58,9 +58,10 @@ MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
 
-MAX_EFFORT = 5e7
-"""Work that a pass may take, in samples times unknowns of all iterations: less than a second of a
-processor. A hundred sources under a bar in a cluttered hall would take minutes."""
+EFFORT_PER_SOURCE = 3.5e6
+"""Work that a pass may take for each source that it may hold, in samples times unknowns of all
+iterations: less than a second of a processor for a tag of five magnets. A hundred sources under a
+bar in a cluttered hall would take minutes."""
 
 
 @dataclass
@@ -74,7 +75,7 @@ class Effort:
     """
 
     spent: float = 0.0
-    limit: float = MAX_EFFORT
+    limit: float = EFFORT_PER_SOURCE * MAX_SOURCES_WITHOUT_TAG
 
     @property
     def is_exhausted(self) -> bool:
@@ -232,6 +233,8 @@ def prepare_pass(
     delay = samples.array.delay_s
     middle, half = (delay.max() + delay.min()) / 2, np.ptp(delay) / 2
     magnet = None if tags is None else tags.magnet
+    # Twice the magnets of a tag (two tags in one pass), and some iron.
+    max_sources = MAX_SOURCES_WITHOUT_TAG if tags is None else 2 * tags.magnets + 4
     window = PassWindow(
         field_t=means,
         sensors_m=samples.array.position_m,
@@ -241,6 +244,7 @@ def prepare_pass(
         axis_order=(delay - middle) / half if half > 0 else np.zeros(3),
         path_m=None if path_m is None else group_means(path_m[rows]),
         disc_correction_m2=disc_correction(magnet),
+        effort=Effort(limit=EFFORT_PER_SOURCE * max_sources),
     )
     heights = DEFAULT_HEIGHTS_M if tags is None else (tags.clearance_m,)
     priors = tuple(
@@ -261,8 +265,7 @@ def prepare_pass(
         sample_count=len(field),
         path_m=None if path_m is None else path_m[rows],
         min_separation_m=MIN_SEPARATION_FRACTION * length,
-        # Twice the magnets of a tag (two tags in one pass), and some iron.
-        max_sources=MAX_SOURCES_WITHOUT_TAG if tags is None else 2 * tags.magnets + 4,
+        max_sources=max_sources,
     )
 
 
