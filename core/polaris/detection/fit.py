@@ -108,9 +108,9 @@ FIXED_WORK_UNKNOWNS, MOTION_WORK_UNKNOWNS = 110, 4
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
 number, and as a coefficient of the motion; measured."""
 
-MIN_EXPLAINED_FRACTION = 0.1
+MIN_EXPLAINED_FRACTION = 0.15
 """Fraction of the squares beyond the noise that a motion explains at least: one that leaves more
-than nine tenths is not their cause, magnets are missing."""
+than the rest is not their cause: magnets are missing."""
 
 MAX_SENSOR_RESIDUAL_SIGMAS = 1.3
 """Rms residual up to which the errors of real sensors (gains, axes) explain it; above it, attitude
@@ -948,7 +948,7 @@ def _test_nuisances(
     """
     state = projected.state
     if state.motion is None:
-        middle = float(state.position_m[:, 0].mean())
+        middle = float(np.median(state.position_m[:, 0]))
         state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
         projected = replace(projected, state=state)
     fixed = [name for name in BUILD_NUISANCES if name not in problem.free]

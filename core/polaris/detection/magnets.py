@@ -652,6 +652,17 @@ def _with_sources(state: PassState, candidates: list[MagnetCandidate]) -> PassSt
     )
 
 
+def _is_passed(state: PassState, sensors_m: Array, margin_heights: float) -> NDArray[np.bool_]:
+    """Return which sources (M,) the array passed, up to a margin around its sensors."""
+    margin = margin_heights * state.height_m
+    along, across = _along_and_across(state)
+    is_passed = along > state.path_m.min() + sensors_m[:, 0].min() - margin
+    is_passed &= along < state.path_m.max() + sensors_m[:, 0].max() + margin
+    is_passed &= across > sensors_m[:, 1].min() - margin
+    is_passed &= across < sensors_m[:, 1].max() + margin
+    return is_passed
+
+
 def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassState:
     """Remove sources outside of the area passed, very weak ones, and duplicates of stronger ones.
 
@@ -663,14 +674,9 @@ def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassS
     DegenerateError
         No source remains.
     """
-    sensors, position = prepared.window.sensors_m, state.position_m
-    margin = (SIDE_MARGIN_HEIGHTS + 0.5) * state.height_m
-    along, across = _along_and_across(state)
-    is_inside = along > state.path_m.min() + sensors[:, 0].min() - margin
-    is_inside &= along < state.path_m.max() + sensors[:, 0].max() + margin
-    is_inside &= across > sensors[:, 1].min() - margin
-    is_inside &= across < sensors[:, 1].max() + margin
-    moment = np.where(is_inside, _horizontal_moments(state), 0.0)
+    position = state.position_m
+    is_passed = _is_passed(state, prepared.window.sensors_m, SIDE_MARGIN_HEIGHTS + 0.5)
+    moment = np.where(is_passed, _horizontal_moments(state), 0.0)
     by_strength = np.argsort(-moment)
     strongest = moment[by_strength[0]]
     kept: list[int] = []
@@ -696,11 +702,8 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     DegenerateError
         None is.
     """
-    state, sensors = fit.state, prepared.window.sensors_m
-    margin = SIDE_MARGIN_HEIGHTS * state.height_m
-    _, across = _along_and_across(state)
-    is_under_bar = across > sensors[:, 1].min() - margin
-    is_under_bar &= across < sensors[:, 1].max() + margin
+    state = fit.state
+    is_under_bar = _is_passed(state, prepared.window.sensors_m, SIDE_MARGIN_HEIGHTS)
     moment = np.where(is_under_bar, _horizontal_moments(state), 0.0)
     expected = prepared.priors[0].moment_am2
     is_usual = moment > MIN_MOMENT_RATIO / 2 * expected
