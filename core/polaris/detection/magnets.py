@@ -41,6 +41,7 @@ from locatk.core.polaris.detection.window import (
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import PassRange, PreprocessedSamples
 from locatk.core.polaris.tag import Tags
+from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE
 
 Array = NDArray[np.float64]
 
@@ -734,6 +735,19 @@ def _debris_covariance(prepared: PreparedPass, fit: PassFit, magnets: NDArray[np
     return np.diag(np.column_stack([place, place, angle]).ravel())
 
 
+def _path_sigma(fit: PassFit, noise_factor: float) -> Array:
+    """Return the standard deviations (n,) of the path, by the residual of each sample.
+
+    A sample that the magnets do not explain (of another time, or disturbed) has no position.
+    """
+    size = np.abs(fit.residual).reshape(len(fit.residual), -1)
+    is_empty = ~np.isfinite(size).any(axis=1)
+    size[is_empty] = 0.0
+    residual = SIGMA_PER_MEDIAN_ABSOLUTE * np.nanmedian(size, axis=1)
+    sigma = fit.path_sigma_m * np.maximum(residual, noise_factor)
+    return np.where(residual > UNRELATED_RESIDUAL_SIGMAS, MAX_PASS_LENGTH_M, sigma)
+
+
 def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> DetectedMagnets:
     """Return the magnets of a fit, in the array's frame at a sample near their middle."""
     state = fit.state
@@ -745,7 +759,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     path = np.interp(index, prepared.group_index, state.path_m)
     if prepared.path_m is not None and prepared.window.path_m is not None:
         path = prepared.path_m + (state.path_m[0] - prepared.window.path_m[0])
-    path_sigma = np.interp(index, prepared.group_index, fit.path_sigma_m) * noise_factor
+    path_sigma = np.interp(index, prepared.group_index, _path_sigma(fit, noise_factor))
     motion = state.motion or Motion.straight(path, 0.0, state.height_m)
     poses = motion.poses(path, state.crab_rad)
     yaw = np.arctan2(poses.rotation[:, 1, 0], poses.rotation[:, 0, 0])
