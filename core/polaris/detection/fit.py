@@ -116,6 +116,10 @@ MAX_SENSOR_RESIDUAL_SIGMAS = 1.3
 """Rms residual up to which the errors of real sensors (gains, axes) explain it; above it, attitude
 and height are estimated, and weak sources added. The published recordings reach 1.26."""
 
+MAX_MOTION_RESIDUAL_SIGMAS = 2.0
+"""Rms residual up to which a motion is believed, that from which a tag is refused: above it, the
+samples have another cause, which a motion would only hide."""
+
 MIN_WAVE_RESIDUAL_SIGMAS = 1.0
 """Rms residual from which height and rocking are tested, which have many unknowns: below it, they
 have nothing to explain."""
@@ -267,14 +271,18 @@ def fit_pass(
         if _has_outliers(problem.residual(equations.projected)):
             for _ in range(REWEIGHTING_ROUNDS):
                 problem, equations, converged = _reweight(problem, equations, weight)
-        before = problem.free
+        straight, straight_equations, straight_converged = problem, equations, converged
         problem, equations, converged, tests = _estimate_nuisances(
             problem, equations, converged, nuisances, gain
         )
-        if (problem.free - before) & {*MOTION_GROUPS}:
+        if (problem.free - straight.free) & {*MOTION_GROUPS}:
             # Samples that only a wrong motion had made outliers count again.
             problem, equations, converged = _reweight(problem, equations, weight)
             tests = _test_nuisances(problem, equations.projected, nuisances)
+            if problem.rms_residual(equations.projected) > MAX_MOTION_RESIDUAL_SIGMAS:
+                problem, equations, converged, tests = _estimate_nuisances(
+                    straight, straight_equations, straight_converged, BUILD_NUISANCES, gain
+                )
         return _result(problem, equations.projected, weight, converged, tests)
 
 
