@@ -30,7 +30,6 @@ from locatk.core.polaris.detection.fit import (
 )
 from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
-    EFFORT_PER_SOURCE,
     PassPriors,
     PassWindow,
     PreparedPass,
@@ -77,8 +76,8 @@ TRIED_STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
 MAX_PASS_LENGTH_M = 2.0
 """Maximum length of a pass [m]."""
 
-LAST_RESORT_EFFORT = EFFORT_PER_SOURCE / 4
-"""Work that the fit of a grid of magnets may take, for each source that the pass may hold."""
+LAST_RESORT_EFFORT_FRACTION = 0.25
+"""Work that the fit of a grid of magnets may take, relative to that of all other fits."""
 
 MAX_INITIAL_GUESSES = 4
 """Number of initial guesses that are refined."""
@@ -224,7 +223,7 @@ def detect_magnets_at(
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
     # The grid of a dense tag is the last resort, and has effort of its own.
-    window.effort.limit = window.effort.spent + LAST_RESORT_EFFORT * prepared.max_sources
+    window.effort.limit = window.effort.spent + LAST_RESORT_EFFORT_FRACTION * window.effort.limit
     # Nuisances of a fit without some of the magnets may have replaced them.
     state = replace(
         hypothesis.fit.state,

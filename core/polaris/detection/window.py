@@ -58,10 +58,11 @@ MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
 
-EFFORT_PER_SOURCE = 3.5e6
-"""Work that a pass may take for each source that it may hold, in samples times unknowns of all
-iterations: less than a second of a processor for a tag of five magnets. A hundred sources under a
-bar in a cluttered hall would take minutes."""
+EFFORT_PER_SOURCE_SQUARE = 2.5e5
+"""Work that a pass may take, in samples times unknowns of all iterations, by the square of the
+number of sources that it may hold: an iteration takes longer with each source, and each is searched
+for. It is less than a second of a processor for a tag of five magnets, and three for thirteen. A
+hundred sources under a bar in a cluttered hall would take minutes."""
 
 
 @dataclass
@@ -75,7 +76,7 @@ class Effort:
     """
 
     spent: float = 0.0
-    limit: float = EFFORT_PER_SOURCE * MAX_SOURCES_WITHOUT_TAG
+    limit: float = EFFORT_PER_SOURCE_SQUARE * MAX_SOURCES_WITHOUT_TAG**2
 
     @property
     def is_exhausted(self) -> bool:
@@ -244,7 +245,7 @@ def prepare_pass(
         axis_order=(delay - middle) / half if half > 0 else np.zeros(3),
         path_m=None if path_m is None else group_means(path_m[rows]),
         disc_correction_m2=disc_correction(magnet),
-        effort=Effort(limit=EFFORT_PER_SOURCE * max_sources),
+        effort=Effort(limit=EFFORT_PER_SOURCE_SQUARE * max_sources**2),
     )
     heights = DEFAULT_HEIGHTS_M if tags is None else (tags.clearance_m,)
     priors = tuple(
