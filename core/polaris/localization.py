@@ -142,14 +142,17 @@ def _poses_over_tag(
     is_over &= magnets.path_m <= along.max() + POSE_MARGIN_M
     path_sigma_m = _path_sigma(magnets, along.min(), along.max())
     is_over &= path_sigma_m < MAX_PATH_SIGMA_M
-    path = magnets.path_m[is_over]
-    n = len(path)
+    count, n = len(is_over), int(is_over.sum())
+    lateral = np.zeros(count) if magnets.lateral_m is None else magnets.lateral_m
+    rotated = np.zeros(count) if magnets.heading_rad is None else magnets.heading_rad
+    path = np.column_stack([magnets.path_m, lateral])[is_over]
     heading = tag_pose.heading_rad - match.heading_rad
     cos, sin = np.cos(heading), np.sin(heading)
     rotation = np.array([[cos, -sin], [sin, cos]])
     by_heading = np.array([[-sin, -cos], [cos, -sin]])
-    direction = np.array([1.0, np.tan(magnets.crab_rad)])
-    offset = path[:, None] * direction - [match.x_m, match.y_m]
+    offset = path - [match.x_m, match.y_m]
+    # The array moves along its x axis, but for a crab of a few degrees.
+    direction = np.column_stack([np.cos(rotated), np.sin(rotated)])[is_over]
     position = np.empty((n, 3))
     position[:, :2] = offset @ rotation.T + [tag_pose.x_m, tag_pose.y_m]
     position[:, 2] = magnets.height_m
@@ -157,7 +160,7 @@ def _poses_over_tag(
     jacobian = np.zeros((n, 3, 4))
     jacobian[:, :2, :2] = -rotation
     jacobian[:, :2, 2] = -offset @ by_heading.T
-    jacobian[:, :2, 3] = rotation @ direction
+    jacobian[:, :2, 3] = direction @ rotation.T
     jacobian[:, 2, 2] = -1.0
     inner = np.zeros((n, 4, 4))
     inner[:, :3, :3] = match.covariance
@@ -166,12 +169,18 @@ def _poses_over_tag(
     covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] = (
         jacobian @ inner @ jacobian.transpose(0, 2, 1)
     )
+    if magnets.motion_covariance is not None:
+        by_motion = np.eye(3)
+        by_motion[:2, :2] = rotation
+        covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] += (
+            by_motion @ magnets.motion_covariance[is_over] @ by_motion.T
+        )
     covariance[:, 2, :], covariance[:, :, 2] = 0.0, 0.0
     covariance[:, 2, 3:5] = covariance[:, 3:5, 2] = np.nan
     scale_sigma_m = HEIGHT_SCALE_SIGMA * magnets.height_m
     covariance[:, 2, 2] = magnets.height_sigma_m**2 + scale_sigma_m**2
     time = samples.time_ns[magnets.first : magnets.stop][is_over]
-    return _PlanarPoses(time, position, np.full(n, heading), covariance)
+    return _PlanarPoses(time, position, heading + rotated[is_over], covariance)
 
 
 def _path_sigma(magnets: DetectedMagnets, first_m: float, last_m: float) -> Array:

@@ -16,8 +16,7 @@ Array = NDArray[np.float64]
 class DetectedMagnets:
     """Magnets of one pass, before and after they are identified as a tag.
 
-    Positions are in the array's frame at ``time_ns``; during a pass the array is assumed to move
-    straight, without rotation.
+    Positions are in the array's frame at ``time_ns``.
 
     Attributes
     ----------
@@ -37,8 +36,11 @@ class DetectedMagnets:
         does not estimate it.
     path_sigma_m : (stop - first,) ndarray
         Standard deviation of ``path_m``; ``nan`` likewise.
-    crab_rad : float
-        Direction of the path, counter-clockwise from the array's x.
+    lateral_m, heading_rad : (stop - first,) ndarray or None
+        Distance along y, and rotation, since ``time_ns``; None if the path is straight.
+    motion_covariance : (stop - first, 3, 3) ndarray or None
+        Of the change of x, y and heading of the array since ``time_ns``, except for the errors of
+        ``path_m``; None likewise.
     is_path_estimated : bool
         True if ``path_m`` was estimated from the field alone, without speed or odometry.
     height_m, height_sigma_m : float
@@ -48,8 +50,8 @@ class DetectedMagnets:
         no model of the samples.
     robust_residual_sigma : float
         The same from the median, which outliers do not change.
-    origin_m : (2,) ndarray
-        Position of the array at ``time_ns`` in the coordinates of the fit.
+    origin_m, origin_heading_rad : (2,) ndarray, float
+        Pose of the array at ``time_ns`` in the coordinates of the fit.
     other_sources : int
         Number of further sources that are no magnets of a tag (debris).
     warnings : tuple of SolverWarning
@@ -65,13 +67,16 @@ class DetectedMagnets:
     moment_am2: Array
     covariance: Array
     path_sigma_m: Array
-    crab_rad: float = 0.0
+    lateral_m: Array | None = None
+    heading_rad: Array | None = None
+    motion_covariance: Array | None = None
     is_path_estimated: bool = False
     height_m: float = np.nan
     height_sigma_m: float = np.nan
     residual_sigma: float = np.nan
     robust_residual_sigma: float = np.nan
     origin_m: Array = field(default_factory=lambda: np.zeros(2))
+    origin_heading_rad: float = 0.0
     other_sources: int = 0
     warnings: tuple[SolverWarning, ...] = ()
 

@@ -41,7 +41,7 @@ class MagnetOffsets:
         Along the track, for each axis of the field.
     y : (N, 1, n or 1, M) ndarray
         Across it.
-    z : float
+    z : float or (N, 1, n, M) ndarray
         Upward.
     inverse_square : (N, 3, n, M) ndarray
         Inverse of the squared distance.
@@ -51,22 +51,27 @@ class MagnetOffsets:
 
     x: Array
     y: Array
-    z: float
+    z: float | Array
     inverse_square: Array
     scale: Array
 
     @classmethod
-    def from_components(cls, x: Array, y: Array, z: float) -> MagnetOffsets:
+    def from_components(cls, x: Array, y: Array, z: float | Array) -> MagnetOffsets:
         """Create the offsets from ``x`` (N, 3, n, M), ``y`` (N, 1, n or 1, M) and ``z``."""
         inverse = 1.0 / (x * x + (y * y + z * z))
         return cls(x, y, z, inverse, MU0_4PI * inverse * inverse * np.sqrt(inverse))
+
+    @property
+    def upward(self) -> float | Array:
+        """Component along z for the z axis of the field: a number, or (N, n, M)."""
+        return self.z if isinstance(self.z, float) else self.z[:, 0]
 
     def along_field_axes(self) -> Array:
         """Return the component (N, 3, n, M) of the offset along each axis of the field."""
         component = np.empty_like(self.x)
         component[:, 0] = self.x[:, 0]
         component[:, 1] = self.y[:, 0]
-        component[:, 2] = self.z
+        component[:, 2] = self.upward
         return component
 
     def unit_fields(self, correction_m2: float = 0.0) -> Array:
@@ -92,23 +97,36 @@ class MagnetOffsets:
             fields[..., 2] -= upward * component
             fields[:, 2, ..., 0] -= upward[:, 2] * self.x[:, 2]
             fields[:, 2, ..., 1] -= upward[:, 2] * self.y[:, 0]
-            fields[:, 2, ..., 2] -= upward[:, 2] * self.z
+            fields[:, 2, ..., 2] -= upward[:, 2] * self.upward
             fields[:, 2, ..., 2] += 6.0 * correction_m2 * self.scale[:, 2]
         for axis in range(3):
             fields[:, axis, ..., axis] += diagonal[:, axis]
         return fields
 
+    def fields(self, moments: Array) -> Array:
+        """Return the field (N, 3, n) of all magnets as point dipoles [T].
+
+        ``moments`` is (M, 3) or (n, M, 3) in A m^2.
+        """
+        by_axis = np.moveaxis(moments if moments.ndim == 3 else moments[None], -1, 0)
+        mx, my, mz = by_axis
+        product = 3.0 * self.inverse_square * (self.x * mx + (self.y * my + self.z * mz))
+        field = self.scale / self.inverse_square * (self.along_field_axes() * product - by_axis)
+        return np.asarray(field.sum(axis=3))
+
     def gradients(self, moments: Array) -> tuple[Array, Array, Array]:
         """Return the derivatives of the magnets' fields along x, y and z [T/m].
 
-        Each is (N, 3, n, M); ``moments`` is (M, 3) in A m^2. They are those of point dipoles: the
+        Each is (N, 3, n, M); ``moments`` is (M, 3) or (n, M, 3) in A m^2. They are those
+        of point dipoles: the
         disc correction would change a step of the fit by a hundredth, and not its minimum.
         """
-        mx, my, mz = moments.T
+        by_axis = np.moveaxis(moments if moments.ndim == 3 else moments[None], -1, 0)
+        mx, my, mz = by_axis
         component = self.along_field_axes()
         scale = 3.0 * self.scale
         product = self.x * mx + (self.y * my + self.z * mz)
-        parallel = moments.T[:, None] - 5.0 * component * product * self.inverse_square
+        parallel = by_axis - 5.0 * component * product * self.inverse_square
         gradients = []
         for axis, (offset, moment) in enumerate(((self.x, mx), (self.y, my), (self.z, mz))):
             gradient = offset * parallel + component * moment

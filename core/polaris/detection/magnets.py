@@ -21,7 +21,15 @@ from scipy.ndimage import median_filter
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.field_model import MagnetOffsets
-from locatk.core.polaris.detection.fit import PassFit, PassState, fit_coarse, fit_pass
+from locatk.core.polaris.detection.fit import (
+    BUILD_NUISANCES,
+    MAX_MOTION_RESIDUAL_SIGMAS,
+    PassFit,
+    PassState,
+    fit_coarse,
+    fit_pass,
+)
+from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
     PassPriors,
     PassWindow,
@@ -33,6 +41,8 @@ from locatk.core.polaris.detection.window import (
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import PassRange, PreprocessedSamples
 from locatk.core.polaris.tag import Tags
+from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -68,8 +78,15 @@ TRIED_STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
 MAX_PASS_LENGTH_M = 2.0
 """Maximum length of a pass [m]."""
 
+LAST_RESORT_EFFORT_FRACTION = 0.25
+"""Work that the fit of a grid of magnets may take, relative to that of all other fits."""
+
 MAX_INITIAL_GUESSES = 4
-"""Number of initial guesses that are refined, per direction of travel."""
+"""Number of initial guesses that are refined."""
+
+MAX_FORWARD_REMAINING = 0.5
+"""Fraction of the samples' squares that the first magnets leave unexplained, from which the array
+may have moved backward."""
 
 SEARCH_SHARED_FIELD_T = 3e-6
 """Standard deviation of a field that all sensors share (motors, rotation in the Earth's field) that
@@ -130,6 +147,20 @@ MERGE_DISTANCE_HEIGHTS = 0.6
 INITIAL_SEPARATION_HEIGHTS = 1.2
 """Least distance of two initial magnets, in heights: a closer one only corrects the shape of the
 other's field."""
+
+HIDDEN_DEBRIS_ANGLE, HIDDEN_DEBRIS_POSITION = 1.0, 0.25
+"""Variances of a magnet's direction, and of its x and y in squared heights, by a layer of dipoles
+of any direction whose mean square moment on a squared height is that of the magnet. They are
+integrals of the least-squares solution for one magnet over the plane of the sensors."""
+
+MAX_PATH_STEP_HEIGHTS = 3.0
+"""Largest deviation of a step from the mean one between two samples over the magnets, in heights:
+samples that are farther apart have no field in common. The published recordings lose samples over
+up to 1.1 heights."""
+
+MIN_RADIUS_M, MAX_ATTITUDE_RAD = 0.08, np.radians(5.0)
+"""Least radius of the path, and largest attitude of the array, at which simulated tags of five
+magnets and a spacing of 40 mm are read: none at 70 mm, and few from 6 degrees on."""
 
 DEFAULT_SKEW_PERIODS = 0.2
 """Initial skew if the expected one is half a sample period or more."""
@@ -202,10 +233,16 @@ def detect_magnets_at(
     """
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
+    # The grid of a dense tag is the last resort, and has effort of its own.
+    window.effort.limit = window.effort.spent + LAST_RESORT_EFFORT_FRACTION * window.effort.limit
+    # Nuisances of a fit without some of the magnets may have replaced them.
     state = replace(
         hypothesis.fit.state,
-        position_m=positions_m + magnets.origin_m,
+        position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
         moment_am2=np.zeros((len(positions_m), 3)),
+        crab_rad=0.0,
+        motion=None,
+        free=frozenset(),
     )
     coarse = fit_coarse(window, state, priors)
     moment = _horizontal_moments(coarse.state)
@@ -420,29 +457,37 @@ def _initial_state(
 def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
     """Yield fits of a pass, one per initial guess; nothing if the pass holds no magnet.
 
-    The speeds, heights and time axes that explain the samples best come first. An array that moves
-    backward is considered last, and only if nothing else describes the samples.
+    The speeds, heights and time axes that explain the samples best come first.
     """
     least = np.inf
-    for direction in (1.0, -1.0):
-        guesses = [
-            (timed, guess)
-            for timed in time_hypotheses(prepared)
-            for guess in _initial_guesses(timed, direction)
-        ]
-        guesses.sort(key=lambda pair: pair[1].remaining)
-        for timed, guess in guesses[:MAX_INITIAL_GUESSES]:
-            try:
-                fit = _grow_fit(timed, guess)
-            except DegenerateError:
-                continue
-            yield fit
-            is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
-            if is_residual_moderate and fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * least:
-                return  # Another initial guess does not reduce the residual.
-            least = min(least, fit.rms_sigma)
-        if prepared.window.path_m is not None or least < UNRELATED_RESIDUAL_SIGMAS:
+    for timed, guess in _timed_guesses(prepared)[:MAX_INITIAL_GUESSES]:
+        if prepared.window.effort.is_exhausted:
             return
+        try:
+            fit = _grow_fit(timed, guess)
+        except DegenerateError:
+            continue
+        yield fit
+        is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
+        if is_residual_moderate and fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * least:
+            return  # Another initial guess does not reduce the residual.
+        least = min(least, fit.rms_sigma)
+
+
+def _timed_guesses(prepared: PreparedPass) -> list[tuple[PreparedPass, _InitialGuess]]:
+    """Return the initial guesses for each time axis, those that leave least unexplained first.
+
+    An array that moves backward is considered only if forward travel explains little: no magnets
+    have the field of magnets that are passed in the other direction.
+    """
+    guesses: list[tuple[PreparedPass, _InitialGuess]] = []
+    for direction in (1.0, -1.0) if prepared.window.path_m is None else (1.0,):
+        for timed in time_hypotheses(prepared):
+            guesses += [(timed, guess) for guess in _initial_guesses(timed, direction)]
+        guesses.sort(key=lambda pair: pair[1].remaining)
+        if guesses and guesses[0][1].remaining < MAX_FORWARD_REMAINING:
+            break
+    return guesses
 
 
 # ---- growing a fit
@@ -461,7 +506,7 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
     fit = fit_coarse(coarse, state, priors)
     for _ in range(MAX_GROWTH_ROUNDS):
         missed = _find_missed_sources(prepared, fit)
-        if not missed:
+        if not missed or window.effort.is_exhausted:
             break
         before = fit
         fit = fit_coarse(coarse, _with_sources(fit.state, missed), priors)
@@ -473,20 +518,34 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
     if coarse.common_t and fit.shared_square > max(MAX_SHARED_SQUARE, 2 * fit.rms_sigma**2):
         information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
         window = replace(window, common_t=float(np.sqrt((fit.shared_square - 1) / information)))
+    state = _without_spurious_sources(fit.state, prepared)
+    if window.path_m is not None and _is_path_contradicted(window, state, priors):
+        raise DegenerateError("the samples contradict the given path")
     while True:
-        state = _without_spurious_sources(fit.state, prepared)
         fit = fit_pass(window, state, priors)
         if _has_drift(window, fit):
             window = replace(window, trend_terms=DRIFT_TREND_TERMS)
             fit = fit_pass(window, fit.state, priors)
-        if len(_without_spurious_sources(fit.state, prepared).position_m) == len(state.position_m):
+        moment = _horizontal_moments(fit.state)
+        # Magnets of a dense tag are correlated, and need not be significant alone.
+        is_significant = fit.significance > MIN_MAGNET_ENERGY
+        is_significant |= moment > MIN_MOMENT_RATIO * moment.max()
+        state = _without_spurious_sources(_select_sources(fit.state, is_significant), prepared)
+        is_complete = len(state.position_m) == len(fit.state.position_m)
+        if is_complete or window.effort.is_exhausted:
             break
-    if window.path_m is not None and fit.rms_sigma < WHITE_RESIDUAL_SIGMAS:
-        # From the given path, a free one leads to the nearest path that the samples prefer.
-        free = fit_pass(replace(window, path_m=None), fit.state, priors)
-        if fit.rms_sigma > MAX_GIVEN_PATH_RESIDUAL_RATIO * free.rms_sigma:
-            raise DegenerateError("the samples contradict the given path")
     return fit
+
+
+def _is_path_contradicted(window: PassWindow, state: PassState, priors: PassPriors) -> bool:
+    """Return whether a free path explains the samples better than the given one.
+
+    Motions of the bar would explain a wrong path as well, and are left out of the comparison.
+    """
+    given = fit_pass(window, state, priors, BUILD_NUISANCES)
+    # From the given path, a free one leads to the nearest path that the samples prefer.
+    free = fit_pass(replace(window, path_m=None), given.state, priors, BUILD_NUISANCES)
+    return given.rms_sigma > MAX_GIVEN_PATH_RESIDUAL_RATIO * free.rms_sigma
 
 
 def _separate_candidates(
@@ -522,12 +581,48 @@ def _find_missed_sources(prepared: PreparedPass, fit: PassFit) -> list[MagnetCan
     if fit.rms_sigma <= DEBRIS_RESIDUAL_SIGMAS:
         min_moment = 0.5 * MIN_MOMENT_RATIO * float(np.median(_horizontal_moments(state)))
     limit = MERGE_DISTANCE_HEIGHTS * state.height_m
+    candidates = [_in_floor_frame(candidate, state) for candidate in candidates]
     return [
         candidate
         for candidate in candidates
         if np.hypot(*candidate.moment_am2) > min_moment
         and np.all(np.linalg.norm(state.position_m - candidate.position_m, axis=1) > limit)
     ]
+
+
+def _in_floor_frame(candidate: MagnetCandidate, state: PassState) -> MagnetCandidate:
+    """Return a candidate whose position is along and across a path in the frame of the fit."""
+    if state.motion is None or state.motion.is_straight:
+        return candidate
+    along, across = candidate.position_m
+    poses = state.motion.poses(np.array([along]), state.crab_rad)
+    axes = poses.rotation[0, :2, :2]
+    return replace(
+        candidate,
+        position_m=poses.position_m[0, :2] + axes @ [0.0, across],
+        moment_am2=axes @ candidate.moment_am2,
+    )
+
+
+def _along_and_across(state: PassState) -> tuple[Array, Array]:
+    """Return the positions (M,), (M,) of the sources along the path, and across the bar there.
+
+    On a curve they belong to the sample at which the source was nearest to the bar.
+    """
+    poses = state.bar_poses
+    if poses is None:
+        return state.position_m[:, 0], state.position_m[:, 1]
+    offset = state.position_m[:, None] - poses.position_m[:, :2]
+    local = np.einsum("mni,nij->mnj", offset, poses.rotation[:, :2, :2])
+    nearest = np.abs(local[..., 0]).argmin(axis=1)
+    chosen = local[np.arange(len(local)), nearest]
+    return state.path_m[nearest] + chosen[:, 0], chosen[:, 1]
+
+
+def _rotation(angle_rad: float) -> Array:
+    """Return the matrix (2, 2) that turns row vectors into axes turned by the angle."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 def _has_drift(window: PassWindow, fit: PassFit) -> bool:
@@ -550,7 +645,11 @@ def _horizontal_moments(state: PassState) -> Array:
 
 def _select_sources(state: PassState, chosen: NDArray[np.bool_] | list[int]) -> PassState:
     """Return the state with some of the sources only."""
-    return replace(state, position_m=state.position_m[chosen], moment_am2=state.moment_am2[chosen])
+    return replace(
+        state,
+        position_m=state.position_m[chosen],
+        moment_am2=state.moment_am2[chosen],
+    )
 
 
 def _with_sources(state: PassState, candidates: list[MagnetCandidate]) -> PassState:
@@ -564,6 +663,17 @@ def _with_sources(state: PassState, candidates: list[MagnetCandidate]) -> PassSt
     )
 
 
+def _is_passed(state: PassState, sensors_m: Array, margin_heights: float) -> NDArray[np.bool_]:
+    """Return which sources (M,) the array passed, up to a margin around its sensors."""
+    margin = margin_heights * state.height_m
+    along, across = _along_and_across(state)
+    is_passed = along > state.path_m.min() + sensors_m[:, 0].min() - margin
+    is_passed &= along < state.path_m.max() + sensors_m[:, 0].max() + margin
+    is_passed &= across > sensors_m[:, 1].min() - margin
+    is_passed &= across < sensors_m[:, 1].max() + margin
+    return is_passed
+
+
 def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassState:
     """Remove sources outside of the area passed, very weak ones, and duplicates of stronger ones.
 
@@ -575,13 +685,9 @@ def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassS
     DegenerateError
         No source remains.
     """
-    sensors, position = prepared.window.sensors_m, state.position_m
-    margin = (SIDE_MARGIN_HEIGHTS + 0.5) * state.height_m
-    is_inside = position[:, 0] > state.path_m.min() + sensors[:, 0].min() - margin
-    is_inside &= position[:, 0] < state.path_m.max() + sensors[:, 0].max() + margin
-    is_inside &= position[:, 1] > sensors[:, 1].min() - margin
-    is_inside &= position[:, 1] < sensors[:, 1].max() + margin
-    moment = np.where(is_inside, _horizontal_moments(state), 0.0)
+    position = state.position_m
+    is_passed = _is_passed(state, prepared.window.sensors_m, SIDE_MARGIN_HEIGHTS + 0.5)
+    moment = np.where(is_passed, _horizontal_moments(state), 0.0)
     by_strength = np.argsort(-moment)
     strongest = moment[by_strength[0]]
     kept: list[int] = []
@@ -607,10 +713,8 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     DegenerateError
         None is.
     """
-    state, sensors = fit.state, prepared.window.sensors_m
-    margin = SIDE_MARGIN_HEIGHTS * state.height_m
-    is_under_bar = state.position_m[:, 1] > sensors[:, 1].min() - margin
-    is_under_bar &= state.position_m[:, 1] < sensors[:, 1].max() + margin
+    state = fit.state
+    is_under_bar = _is_passed(state, prepared.window.sensors_m, SIDE_MARGIN_HEIGHTS)
     moment = np.where(is_under_bar, _horizontal_moments(state), 0.0)
     expected = prepared.priors[0].moment_am2
     is_usual = moment > MIN_MOMENT_RATIO / 2 * expected
@@ -622,41 +726,144 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     return np.flatnonzero(moment > MIN_MOMENT_RATIO * np.median(usual))
 
 
+def _debris_covariance(prepared: PreparedPass, fit: PassFit, magnets: NDArray[np.intp]) -> Array:
+    """Return the covariance (3 M, 3 M) of magnets by debris that is hidden under them.
+
+    Debris that was detected between the magnets shows how much of it is on the floor. What is
+    closer to a magnet than :data:`INITIAL_SEPARATION_HEIGHTS` changes its field, and is taken for
+    another position and moment of the magnet.
+    """
+    state, sensors = fit.state, prepared.window.sensors_m
+    moment = _horizontal_moments(state)
+    debris = np.setdiff1d(np.arange(len(moment)), magnets)
+    debris = debris[moment[debris] < MIN_MOMENT_RATIO * np.median(moment[magnets])]
+    width = np.ptp(sensors[:, 1]) + 2 * SIDE_MARGIN_HEIGHTS * state.height_m
+    # Two of three components of a moment of any direction are horizontal.
+    density = 1.5 * (moment[debris] ** 2).sum() / (width * np.ptp(state.path_m))
+    angle = HIDDEN_DEBRIS_ANGLE * density * state.height_m**2 / moment[magnets] ** 2
+    place = HIDDEN_DEBRIS_POSITION * density * state.height_m**4 / moment[magnets] ** 2
+    return np.diag(np.column_stack([place, place, angle]).ravel())
+
+
+def _require_continuous_path(
+    prepared: PreparedPass, state: PassState, chosen: NDArray[np.intp]
+) -> None:
+    """Check that the path over the magnets has no step that no field bridges.
+
+    Raises
+    ------
+    DegenerateError
+        The magnets before and after such a step have no common frame.
+    """
+    along = _along_and_across(state)[0][chosen]
+    # Without single samples that were disturbed.
+    path = median_filter(state.path_m, 5)
+    excess = np.diff(path) - state.mean_step_m * np.diff(prepared.window.time_periods)
+    margin = MAX_PATH_STEP_HEIGHTS * state.height_m
+    low, high = np.minimum(path[1:], path[:-1]), np.maximum(path[1:], path[:-1])
+    is_over = (low > along.min() - margin) & (high < along.max() + margin)
+    if prepared.window.path_m is None and np.any(np.abs(excess[is_over]) > margin):
+        raise DegenerateError("the path over the magnets is interrupted")
+
+
+def _path_sigma(fit: PassFit, noise_factor: float) -> Array:
+    """Return the standard deviations (n,) of the path, by the residual of each sample.
+
+    A sample that the magnets do not explain (of another time, or disturbed) has no position.
+    """
+    size = np.abs(fit.residual).reshape(len(fit.residual), -1)
+    is_empty = ~np.isfinite(size).any(axis=1)
+    size[is_empty] = 0.0
+    residual = SIGMA_PER_MEDIAN_ABSOLUTE * np.nanmedian(size, axis=1)
+    sigma = fit.path_sigma_m * np.maximum(residual, noise_factor)
+    return np.where(residual > UNRELATED_RESIDUAL_SIGMAS, MAX_PASS_LENGTH_M, sigma)
+
+
 def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> DetectedMagnets:
     """Return the magnets of a fit, in the array's frame at a sample near their middle."""
     state = fit.state
     # Errors of the model show in the residual.
     noise_factor = max(1.0, fit.robust_sigma)
     chosen = _magnet_indices(prepared, fit)
+    _require_continuous_path(prepared, state, chosen)
     position = state.position_m[chosen]
     index = np.arange(prepared.sample_count)
     path = np.interp(index, prepared.group_index, state.path_m)
     if prepared.path_m is not None and prepared.window.path_m is not None:
         path = prepared.path_m + (state.path_m[0] - prepared.window.path_m[0])
-    path_sigma = np.interp(index, prepared.group_index, fit.path_sigma_m) * noise_factor
+    path_sigma = np.interp(index, prepared.group_index, _path_sigma(fit, noise_factor))
+    if prepared.window.path_m is None:
+        # Within a group the array may have moved evenly, or have rested.
+        at_rest = np.repeat(state.path_m, prepared.window.counts.astype(int))
+        path_sigma = np.hypot(path_sigma, path - at_rest)
+    motion = state.motion or Motion.straight(path, 0.0, state.height_m)
+    poses = motion.poses(path, state.crab_rad)
+    yaw = np.arctan2(poses.rotation[:, 1, 0], poses.rotation[:, 0, 0])
     # Near the magnets' middle, but at a sample whose position is well determined: it is not if
     # the field is weak there or the sample was damaged.
-    distance = np.abs(median_filter(path, 5) - position.mean(axis=0)[0])
+    distance = np.abs(median_filter(poses.position_m[:, 0], 5) - position.mean(axis=0)[0])
     reference = int(np.argmin(distance + 3 * path_sigma))
     rows = (3 * chosen[:, None] + np.arange(3)).ravel()
-    origin = path[reference] * np.array([1.0, np.tan(state.crab_rad)])
+    origin, heading = poses.position_m[reference, :2], float(yaw[reference])
+    into_array = _rotation(heading)
+    jacobian = np.eye(3)
+    jacobian[:2, :2] = into_array.T
+    by_magnet = np.kron(np.eye(len(chosen)), jacobian)
+    covariance = by_magnet @ fit.covariance[np.ix_(rows, rows)] @ by_magnet.T
+    covariance = covariance * noise_factor**2 + _debris_covariance(prepared, fit, chosen)
     moment = state.moment_am2[chosen]
+    moment[:, :2] = moment[:, :2] @ into_array
+    # Deviations from the pose at the reference sample.
+    planar = motion.planar_derivatives(path, state.crab_rad)
+    planar = planar - planar[reference]
+    planar[:, :2] = into_array.T @ planar[:, :2]
+    motion_covariance = planar @ fit.motion_covariance @ planar.swapaxes(1, 2) * noise_factor**2
+    forward, lateral = ((poses.position_m[:, :2] - origin) @ into_array).T
     return DetectedMagnets(
         time_ns=int(samples.time_ns[prepared.first + reference]),
         first=prepared.first,
         stop=prepared.first + prepared.sample_count,
-        path_m=path - path[reference],
-        position_m=position - origin,
+        path_m=forward,
+        lateral_m=lateral,
+        heading_rad=yaw - heading,
+        motion_covariance=motion_covariance,
+        position_m=(position - origin) @ into_array,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),
-        covariance=fit.covariance[np.ix_(rows, rows)] * noise_factor**2,
+        covariance=covariance,
         path_sigma_m=path_sigma,
-        crab_rad=state.crab_rad,
         is_path_estimated=prepared.window.path_m is None,
         height_m=state.height_m,
         height_sigma_m=fit.height_sigma_m * noise_factor,
         residual_sigma=fit.rms_sigma,
         robust_residual_sigma=fit.robust_sigma,
         origin_m=origin,
+        origin_heading_rad=heading,
         other_sources=len(state.position_m) - len(chosen),
+        warnings=tuple(each.about(samples.device) for each in _motion_warnings(fit, path)),
     )
+
+
+def _motion_warnings(fit: PassFit, path_m: Array) -> Iterator[SolverWarning]:
+    """Yield a warning if the bar moved on a narrower curve, or was more tilted, than is read."""
+    state = fit.state
+    if state.motion is None or fit.rms_sigma > MAX_MOTION_RESIDUAL_SIGMAS:
+        return
+    along, _ = _along_and_across(state)
+    is_over = (path_m > along.min()) & (path_m < along.max())
+    if "curve" in state.free and is_over.any():
+        radius = 1 / np.abs(state.motion.curvature(path_m[is_over])).max()
+        if radius < MIN_RADIUS_M:
+            yield SolverWarning(
+                "curved_path",
+                f"the path over the magnets has a radius of {radius * 1e3:.0f} mm; tags are read "
+                f"from {MIN_RADIUS_M * 1e3:.0f} mm on",
+            )
+    attitude = state.motion.coefficients[state.motion.groups["attitude"]]
+    tilt = float(np.hypot(*attitude))
+    if tilt > MAX_ATTITUDE_RAD:
+        yield SolverWarning(
+            "tilted_array",
+            f"the array is tilted by {np.degrees(tilt):.1f} degrees; tags are read up to "
+            f"{np.degrees(MAX_ATTITUDE_RAD):.0f}",
+        )

@@ -8,7 +8,7 @@ rested, a second time axis without the rests is an alternative hypothesis.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,36 @@ MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
 
+EFFORT_PER_SOURCE_SQUARE = 2.5e5
+"""Work that a pass may take, in samples times unknowns of all iterations, by the square of the
+number of sources that it may hold: an iteration takes longer with each source, and each is searched
+for. It is less than a second of a processor for a tag of five magnets, and three for thirteen. A
+hundred sources under a bar in a cluttered hall would take minutes."""
+
+
+@dataclass
+class Effort:
+    """Work spent on one pass; it limits the time by a count, so that results do not depend on it.
+
+    Attributes
+    ----------
+    spent, limit : float
+        In samples times unknowns.
+    """
+
+    spent: float = 0.0
+    limit: float = EFFORT_PER_SOURCE_SQUARE * MAX_SOURCES_WITHOUT_TAG**2
+
+    @property
+    def is_exhausted(self) -> bool:
+        """True if no fit should begin."""
+        return self.spent >= self.limit
+
+    def affordable_iterations(self, work: float) -> int:
+        """Return the number of iterations of the given work that are left; at least one."""
+        return max(1, int((self.limit - self.spent) / max(work, 1.0)))
+
+
 @dataclass(frozen=True)
 class PassWindow:
     """Averaged samples of one pass.
@@ -84,6 +114,8 @@ class PassWindow:
         Standard deviation, in one sample, of a field that all sensors share [T].
     trend_terms : int
         Terms of each sensor's background: 2 are a level and a slope.
+    effort : Effort
+        Shared by all fits of the pass.
     """
 
     field_t: Array
@@ -96,6 +128,7 @@ class PassWindow:
     disc_correction_m2: float = 0.0
     common_t: float = 0.0
     trend_terms: int = 2
+    effort: Effort = field(default_factory=Effort)
 
 
 @dataclass(frozen=True)
@@ -201,6 +234,8 @@ def prepare_pass(
     delay = samples.array.delay_s
     middle, half = (delay.max() + delay.min()) / 2, np.ptp(delay) / 2
     magnet = None if tags is None else tags.magnet
+    # Twice the magnets of a tag (two tags in one pass), and some iron.
+    max_sources = MAX_SOURCES_WITHOUT_TAG if tags is None else 2 * tags.magnets + 4
     window = PassWindow(
         field_t=means,
         sensors_m=samples.array.position_m,
@@ -210,6 +245,7 @@ def prepare_pass(
         axis_order=(delay - middle) / half if half > 0 else np.zeros(3),
         path_m=None if path_m is None else group_means(path_m[rows]),
         disc_correction_m2=disc_correction(magnet),
+        effort=Effort(limit=EFFORT_PER_SOURCE_SQUARE * max_sources**2),
     )
     heights = DEFAULT_HEIGHTS_M if tags is None else (tags.clearance_m,)
     priors = tuple(
@@ -230,8 +266,7 @@ def prepare_pass(
         sample_count=len(field),
         path_m=None if path_m is None else path_m[rows],
         min_separation_m=MIN_SEPARATION_FRACTION * length,
-        # Twice the magnets of a tag (two tags in one pass), and some iron.
-        max_sources=MAX_SOURCES_WITHOUT_TAG if tags is None else 2 * tags.magnets + 4,
+        max_sources=max_sources,
     )
 
 

@@ -37,6 +37,7 @@ from locatk.core.polaris.solver import SolveOptions, solve
 from locatk.core.polaris.tag import cell_positions, symbol_angles
 from locatk.formats.benchmarks.figures import Duration, Figure
 from locatk.formats.benchmarks.polaris.designs import design_figures
+from locatk.formats.benchmarks.polaris.disturbances import disturbance_figures
 from locatk.formats.benchmarks.polaris.given_speeds import given_speed_figures
 from locatk.formats.benchmarks.polaris.passes import pass_figures
 from locatk.formats.benchmarks.polaris.speed import speed_figures
@@ -82,6 +83,7 @@ def figures(data: Path) -> list[Figure]:
         *published_figures(data / "polaris"),
         *pass_figures(),
         *design_figures(),
+        *disturbance_figures(),
         *given_speed_figures(),
         *speed_figures(),
     ]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.detection.field_model import disc_correction
-from locatk.core.polaris.detection.fit import PassProblem, PassState, fit_pass
+from locatk.core.polaris.detection.fit import PassProblem, PassState, fit_pass, sample_weights
+from locatk.core.polaris.detection.motion import MOTION_GROUPS, Motion
 from locatk.core.polaris.detection.window import PassPriors, PassWindow
 from locatk.core.polaris.tag import Magnet
 
@@ -95,6 +96,27 @@ def test_side_of_the_normal_equations_is_the_slope_of_the_cost(world: Any) -> No
         value = getattr(trial.state, name)
         slope = (cost(**{name: value + step}) - cost(**{name: value - step})) / (2 * step)
         assert side[2 * m + position] == pytest.approx(-slope / 2, rel=2e-3)
+
+
+def test_descent_of_a_motion_is_the_slope_of_the_cost(world: Any) -> None:
+    window, truth, _ = posed(world, known=True)
+    window = replace(window, disc_correction_m2=0.0)
+    motion = Motion.straight(truth.path_m, 0.0, truth.height_m)
+    rng = np.random.default_rng(1)
+    motion = motion.with_added(motion.sigmas * rng.normal(size=len(motion.sigmas)))
+    free = frozenset(MOTION_GROUPS)
+    start = replace(perturbed(truth), motion=motion, free=free)
+    problem = PassProblem(window, PassPriors(), sample_weights(window), start)
+    trial = problem.project(start)
+    descent = problem.reduce(trial).descent[2 * len(truth.position_m) + 3 :]
+
+    def cost(change: Array) -> float:
+        return problem.project(replace(trial.state, motion=motion.with_added(change))).cost
+
+    scale = motion.sigmas * 1e-4
+    for k, step in enumerate(np.diag(scale)):
+        slope = (cost(step) - cost(-step)) / (2 * scale[k])
+        assert descent[k] == pytest.approx(-slope / 2, rel=2e-3)
 
 
 @pytest.mark.parametrize("known", [True, False])
