@@ -142,8 +142,8 @@ def _poses_over_tag(
     rotation = np.array([[cos, -sin], [sin, cos]])
     by_heading = np.array([[-sin, -cos], [cos, -sin]])
     offset = path - [match.x_m, match.y_m]
-    direction = np.gradient(path, axis=0) if n > 1 else np.array([[1.0, 0.0]])
-    direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+    # The array moves along its x axis, but for a crab of a few degrees.
+    direction = np.column_stack([np.cos(rotated), np.sin(rotated)])[is_over]
     position = np.empty((n, 3))
     position[:, :2] = offset @ rotation.T + [tag_pose.x_m, tag_pose.y_m]
     position[:, 2] = magnets.height_m
@@ -160,6 +160,12 @@ def _poses_over_tag(
     covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] = (
         jacobian @ inner @ jacobian.transpose(0, 2, 1)
     )
+    if magnets.motion_covariance is not None:
+        by_motion = np.eye(3)
+        by_motion[:2, :2] = rotation
+        covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] += (
+            by_motion @ magnets.motion_covariance[is_over] @ by_motion.T
+        )
     covariance[:, 2, :], covariance[:, :, 2] = 0.0, 0.0
     covariance[:, 2, 3:5] = covariance[:, 3:5, 2] = np.nan
     scale_sigma_m = HEIGHT_SCALE_SIGMA * magnets.height_m

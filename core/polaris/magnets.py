@@ -38,6 +38,9 @@ class DetectedMagnets:
         Standard deviation of ``path_m``; ``nan`` likewise.
     lateral_m, heading_rad : (stop - first,) ndarray or None
         Distance along y, and rotation, since ``time_ns``; None if the path is straight.
+    motion_covariance : (stop - first, 3, 3) ndarray or None
+        Of the change of x, y and heading of the array since ``time_ns``, except for the errors of
+        ``path_m``; None likewise.
     is_path_estimated : bool
         True if ``path_m`` was estimated from the field alone, without speed or odometry.
     height_m, height_sigma_m : float
@@ -66,6 +69,7 @@ class DetectedMagnets:
     path_sigma_m: Array
     lateral_m: Array | None = None
     heading_rad: Array | None = None
+    motion_covariance: Array | None = None
     is_path_estimated: bool = False
     height_m: float = np.nan
     height_sigma_m: float = np.nan

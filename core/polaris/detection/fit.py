@@ -38,12 +38,14 @@ import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.linalg.lapack import dposv
 from scipy.ndimage import median_filter
+from scipy.sparse import csr_array
 
 from locatk.core.errors import DegenerateError
 from locatk.core.least_squares import Indices, cauchy_loss, minimize
@@ -54,14 +56,17 @@ from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE, robust_sigma
 
 Array = NDArray[np.float64]
 
-BUILD_NUISANCES = ("crab", "tilt", "depth")
+BUILD_NUISANCES = ("crab", "tilt")
 NUISANCES = (*BUILD_NUISANCES, *MOTION_GROUPS)
 """Unknowns that are fixed at zero until the samples contradict that: a path that is oblique to the
-bar, magnets that are not flat or not of one height, and the groups of
-:mod:`locatk.core.polaris.detection.motion`."""
+bar, magnets that are not flat, and the groups of :mod:`locatk.core.polaris.detection.motion`."""
 
 COARSE_NUISANCES = ("curve", "attitude")
 """Those that a coarse fit estimates: without them it takes the residual for further magnets."""
+
+HEADING_NUISANCES = ("curve", "yaw")
+"""Those that change the residual little, but the heading of the bar much: the magnets, whose
+orientations are unknown, rotate with them."""
 
 GLOBAL_UNKNOWNS = ("height_m", "skew_periods", "crab_rad")
 """Attributes of :class:`PassState` that hold one number for the whole pass."""
@@ -92,23 +97,32 @@ OUTLIER_SIGMAS, MAX_OUTLIER_FRACTION = 3.5, 0.002
 """Residual beyond which a sample is an outlier, and the fraction of such samples from which they
 are reweighted: four times that of a normal distribution."""
 
-MIN_EVIDENCE, MIN_MOTION_EVIDENCE = 10.0, 18.4
-"""Twice the logarithm of the Bayes factor from which a nuisance is estimated: very strong evidence
-(Kass and Raftery, J. Am. Stat. Assoc. 90 (1995) 773, section 3.2). A motion needs a factor of
-10,000, which leaves a hundred to one if one pass of a hundred has such a motion."""
+MIN_NUISANCE_GAIN = 9.0
+"""Decrease of the cost beyond the number of unknowns from which crab or tilt are estimated."""
 
-FIXED_WORK_UNKNOWNS = 110
+MIN_MOTION_EVIDENCE = 18.4
+"""Twice the logarithm of the Bayes factor from which a motion is estimated: a factor of 10,000,
+which leaves a hundred to one if one pass of a hundred has such a motion."""
+
+FIXED_WORK_UNKNOWNS, MOTION_WORK_UNKNOWNS = 110, 4
 """Unknowns that would take as much time as the part of an iteration that does not depend on their
-number; measured."""
+number, and as a coefficient of the motion; measured."""
 
-MAX_UNEXPLAINED_FRACTION = 0.3
-"""Fraction of the samples' squares that magnets leave unexplained up to which nuisances are
-estimated. A height that is wrong by a tenth changes the field by a third, a tenth of its square."""
+MIN_EXPLAINED_FRACTION = 0.15
+"""Fraction of the squares beyond the noise that a motion explains at least: one that leaves more
+than the rest is not their cause: magnets are missing."""
 
-MAX_COARSE_RESIDUAL_SQUARE = 1.7
-"""Mean square of a coarse fit's residual, in units of the noise, from which it estimates nuisances:
-that of :data:`~locatk.core.polaris.detection.magnets.DEBRIS_RESIDUAL_SIGMAS`, from which weak
-sources would be added."""
+MAX_SENSOR_RESIDUAL_SIGMAS = 1.3
+"""Rms residual up to which the errors of real sensors (gains, axes) explain it; above it, attitude
+and height are estimated, and weak sources added. The published recordings reach 1.26."""
+
+MAX_MOTION_RESIDUAL_SIGMAS = 2.0
+"""Rms residual up to which a motion is believed, that from which a tag is refused: above it, the
+samples have another cause, which a motion would only hide."""
+
+MIN_WAVE_RESIDUAL_SIGMAS = 1.0
+"""Rms residual from which height and rocking are tested, which have many unknowns: below it, they
+have nothing to explain."""
 
 CLUSTER_HEIGHTS = 1.0
 """Length of path within which the errors of a sensor's samples are correlated, in heights: half the
@@ -122,6 +136,9 @@ FINE_ITERATIONS, FINE_GAIN_FRACTION = 45, 4e-5
 
 REWEIGHTED_ITERATIONS, NUISANCE_ITERATIONS = 8, 15
 """Steps tried by a fit that continues from a minimum: with new weights, with another nuisance."""
+
+MAX_LOG_ODDS = 60.0
+"""Bound of twice the logarithm of a Bayes factor, before it is exponentiated."""
 
 RELATIVE_RIDGE = 1e-13
 """Added to the unit diagonal of scaled normal equations."""
@@ -142,8 +159,6 @@ class PassState:
         Mean distance moved in a sample period.
     height_m, skew_periods, crab_rad : float
         See :class:`~locatk.core.polaris.detection.window.PassPriors`.
-    depth_m : (M,) ndarray or None
-        Of the magnets below their common height; None if they are of one height.
     motion : Motion or None
         Curve, attitude and height along the path; None if it is straight and level.
     free : frozenset of str
@@ -157,7 +172,6 @@ class PassState:
     height_m: float
     skew_periods: float = 0.0
     crab_rad: float = 0.0
-    depth_m: Array | None = None
     motion: Motion | None = None
     free: frozenset[str] = frozenset()
 
@@ -188,7 +202,9 @@ class PassFit:
     covariance : (3 M, 3 M) ndarray
         Of x, y and angle of each magnet, in m and rad, for the noise as stated. It includes the
         prior uncertainty of crab and tilt, also while they are fixed at zero. ``nan`` after a
-        coarse fit, like the next two.
+        coarse fit, like the next three.
+    motion_covariance : (1 + K, 1 + K) ndarray
+        Of crab and the coefficients of the motion.
     path_sigma_m : (n,) ndarray
         Of the path relative to the sample with the strongest field; 0 if the path is known.
     height_sigma_m : float
@@ -203,6 +219,7 @@ class PassFit:
     robust_sigma: float
     shared_square: float
     covariance: Array
+    motion_covariance: Array
     path_sigma_m: Array
     height_sigma_m: float
     significance: Array
@@ -224,18 +241,22 @@ def fit_coarse(window: PassWindow, start: PassState, priors: PassPriors) -> Pass
     with _degenerate_on_numerical_errors():
         problem = PassProblem(window, priors, weight, start)
         equations, converged = _minimize(problem, start, COARSE_ITERATIONS, COARSE_GAIN_FRACTION)
-        size = np.abs(problem.residual(equations.projected))
-        if np.nanmean(size**2) > MAX_COARSE_RESIDUAL_SQUARE:
-            problem, equations, converged = _estimate_nuisances(
+        if problem.rms_residual(equations.projected) > MAX_SENSOR_RESIDUAL_SIGMAS:
+            problem, equations, converged, _ = _estimate_nuisances(
                 problem, equations, converged, COARSE_NUISANCES, COARSE_GAIN_FRACTION
             )
-        return _result(problem, equations.projected, weight, converged, reduced=None)
+        return _result(problem, equations.projected, weight, converged, tests=None)
 
 
-def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFit:
+def fit_pass(
+    window: PassWindow,
+    start: PassState,
+    priors: PassPriors,
+    nuisances: tuple[str, ...] = NUISANCES,
+) -> PassFit:
     """Return the most likely state near an initial guess, with its covariance.
 
-    Outliers are down-weighted, and nuisances are estimated if the samples show any.
+    Outliers are down-weighted, and ``nuisances`` are estimated if the samples show any.
 
     Raises
     ------
@@ -250,15 +271,19 @@ def fit_pass(window: PassWindow, start: PassState, priors: PassPriors) -> PassFi
         if _has_outliers(problem.residual(equations.projected)):
             for _ in range(REWEIGHTING_ROUNDS):
                 problem, equations, converged = _reweight(problem, equations, weight)
-        before = problem.free
-        problem, equations, converged = _estimate_nuisances(
-            problem, equations, converged, NUISANCES, gain
+        straight, straight_equations, straight_converged = problem, equations, converged
+        problem, equations, converged, tests = _estimate_nuisances(
+            problem, equations, converged, nuisances, gain
         )
-        if problem.free != before:
+        if (problem.free - straight.free) & {*MOTION_GROUPS}:
             # Samples that only a wrong motion had made outliers count again.
             problem, equations, converged = _reweight(problem, equations, weight)
-        reduced = problem.with_free(problem.free | {*BUILD_NUISANCES}).reduce(equations.projected)
-        return _result(problem, equations.projected, weight, converged, reduced)
+            tests = _test_nuisances(problem, equations.projected, nuisances)
+            if problem.rms_residual(equations.projected) > MAX_MOTION_RESIDUAL_SIGMAS:
+                problem, equations, converged, tests = _estimate_nuisances(
+                    straight, straight_equations, straight_converged, BUILD_NUISANCES, gain
+                )
+        return _result(problem, equations.projected, weight, converged, tests)
 
 
 def _reweight(
@@ -281,27 +306,23 @@ def _estimate_nuisances(
     converged: bool,
     allowed: tuple[str, ...],
     min_gain: float,
-) -> tuple[PassProblem, PassEquations, bool]:
+) -> tuple[PassProblem, PassEquations, bool, NuisanceTests]:
     """Estimate nuisances one after the other, while the samples show another one.
 
-    None is estimated if the magnets explain too little of the samples: a fit from a wrong initial
-    guess would spend all effort on them.
+    A motion that explains little of the residual is dropped: a fit from a wrong initial guess would
+    spend all effort on them.
     """
-    unexplained = (equations.projected.residual**2).sum() / (problem.target**2).sum()
-    while unexplained < MAX_UNEXPLAINED_FRACTION:
-        projected = equations.projected
-        state = projected.state
-        if state.motion is None:
-            middle = float(state.position_m[:, 0].mean())
-            state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
-            projected = replace(projected, state=state)
-        nuisance = _significant_nuisance(problem, projected, allowed)
-        if nuisance is None:
-            return problem, equations, converged
-        problem = problem.with_free(problem.free | {nuisance})
-        state = replace(state, free=problem.free)
-        equations, converged = _minimize(problem, state, NUISANCE_ITERATIONS, min_gain)
-    return problem, equations, converged
+    while True:
+        tests = _test_nuisances(problem, equations.projected, allowed)
+        if tests.significant is None:
+            return problem, equations, converged, tests
+        extended = problem.with_free(problem.free | {tests.significant})
+        state = replace(tests.state, free=extended.free)
+        fitted, has_converged = _minimize(extended, state, NUISANCE_ITERATIONS, min_gain)
+        gain = equations.projected.cost - fitted.projected.cost
+        if tests.significant in MOTION_GROUPS and gain < tests.min_motion_gain:
+            return problem, equations, converged, tests
+        problem, equations, converged = extended, fitted, has_converged
 
 
 @contextmanager
@@ -509,7 +530,8 @@ class PassProblem:
 
     def work(self, state: PassState) -> float:
         """Return the work of an iteration, in samples times unknowns."""
-        unknowns = 6 * len(state.position_m) + len(self.motion_columns(state))
+        columns = MOTION_WORK_UNKNOWNS * len(self.motion_columns(state))
+        unknowns = 6 * len(state.position_m) + columns
         return float(np.prod(self.shape) * (unknowns + FIXED_WORK_UNKNOWNS))
 
     def linearize(self, state: PassState, problems: Indices) -> PassEquations:
@@ -532,13 +554,8 @@ class PassProblem:
             start = 2 * m + len(GLOBAL_UNKNOWNS)
             change[columns] = step.change[start : start + len(columns)]
             motion = motion.with_added(change)
-        depth = state.depth_m
-        if "depth" in self.free:
-            depth = np.zeros(m) if depth is None else depth
-            depth = depth + step.change[step.first_moment - m : step.first_moment]
         return replace(
             state,
-            depth_m=depth,
             motion=motion,
             position_m=state.position_m + step.change[: 2 * m].reshape(2, m).T,
             path_m=state.path_m if step.path_m is None else state.path_m + step.path_m,
@@ -576,6 +593,11 @@ class PassProblem:
         is_observed = information > 0
         return float((square[is_observed] / information[is_observed]).mean())
 
+    def rms_residual(self, projected: ProjectedState) -> float:
+        """Return the rms of the residual in units of the noise, outliers included."""
+        residual = self.unweighted_residual(projected, sample_weights(self.window))
+        return float(np.sqrt(np.nanmean(residual**2)))
+
     def residual(self, projected: ProjectedState) -> Array:
         """Return the weighted residual (n, N, 3), ``nan`` if there is no sample."""
         observed = np.where(self.root > 0, projected.residual, np.nan)
@@ -598,11 +620,10 @@ class PassProblem:
         sensors = self.window.sensors_m
         skew = np.outer(self.window.axis_order * state.skew_periods, self.local_step(state))
         position = state.position_m
-        height = state.height_m if state.depth_m is None else state.height_m + state.depth_m
         if poses is not None:
             offset = np.empty((len(state.path_m), len(position), 3))
             offset[..., :2] = poses.position_m[:, None, :2] - position
-            offset[..., 2] = poses.position_m[:, 2:] + height
+            offset[..., 2] = poses.position_m[:, 2:] + state.height_m
             x, y, z = np.moveaxis(offset @ poses.rotation, -1, 0)
             # Sensors on the inside of a curve move less.
             speed = 1 - poses.yaw_rate * sensors[:, 1, None]
@@ -617,21 +638,8 @@ class PassProblem:
         return MagnetOffsets.from_components(
             along[:, :, None] + (sensors[:, 0, None] - position[:, 0])[:, None, None],
             across[:, None] + (sensors[:, 1, None] - position[:, 1])[:, None, None],
-            height if isinstance(height, float) else height[None, None, None],
+            state.height_m,
         )
-
-    def nuisance_sigmas(self, state: PassState) -> dict[str, Array]:
-        """Return the prior standard deviations of the unknowns of each nuisance."""
-        m, priors = len(state.position_m), self.priors
-        sigmas = {
-            "crab": np.array([priors.crab_sigma_rad]),
-            "tilt": np.full(m, priors.tilt_sigma * priors.moment_am2),
-            "depth": np.full(m, priors.depth_sigma_m),
-        }
-        if state.motion is not None:
-            of_motion = state.motion.sigmas
-            sigmas |= {name: of_motion[part] for name, part in state.motion.groups.items()}
-        return sigmas
 
     def clusters(self, state: PassState) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return two partitions (C, n) of the samples, by the number of the cluster.
@@ -701,8 +709,6 @@ class PassProblem:
             cost += ((getattr(state, name) - mean) / sigma) ** 2
         if state.motion is not None:
             cost += float(((state.motion.coefficients / state.motion.sigmas) ** 2).sum())
-        if state.depth_m is not None:
-            cost += float((state.depth_m**2).sum()) / self.priors.depth_sigma_m**2
         if self.window.path_m is None:
             excess, scale = self.excess_steps(state)
             cost += 2 * float(np.log1p(excess**2 / scale**2).sum())
@@ -728,10 +734,28 @@ class PassProblem:
         velocity, rate : (n, 3, k) ndarray
             In the axes of the bar.
         """
-        lever = np.cross(rate[None], self.window.sensors_m[:, None, :, None], axis=2)
-        moved = np.einsum("sani,snik->sank", totals, velocity + lever)
-        turned = np.cross(rate[None], fields.transpose(0, 2, 1)[..., None], axis=2)
-        return np.asarray(moved - turned.transpose(0, 2, 1, 3))
+        by_x, by_y, by_z = np.moveaxis(totals, -1, 0)
+        s_x, s_y, s_z = self.window.sensors_m.T[:, :, None, None]
+        # Rotations about the axes of the bar: w x s, and -w x f.
+        by_rotation = np.stack(
+            [
+                by_z * s_y - by_y * s_z,
+                by_x * s_z - by_z * s_x,
+                by_y * s_x - by_x * s_y,
+            ],
+            axis=-1,
+        )
+        f_x, f_y, f_z = fields.swapaxes(0, 1)
+        by_rotation[:, 1, :, 0] += f_z
+        by_rotation[:, 2, :, 0] -= f_y
+        by_rotation[:, 0, :, 1] -= f_z
+        by_rotation[:, 2, :, 1] += f_x
+        by_rotation[:, 0, :, 2] += f_y
+        by_rotation[:, 1, :, 2] -= f_x
+        sensors, axes, n, _ = totals.shape
+        both = np.concatenate([totals, by_rotation], axis=-1).reshape(-1, n, 6).swapaxes(0, 1)
+        changes = both @ np.concatenate([velocity, rate], axis=1)
+        return np.asarray(changes.swapaxes(0, 1).reshape(sensors, axes, n, -1))
 
     def reduce(self, projected: ProjectedState) -> ReducedEquations:
         """Return the normal equations at a state, from which the path is eliminated."""
@@ -747,8 +771,7 @@ class PassProblem:
         tangent = np.tan(state.crab_rad)
         columns_free = self.motion_columns(state)
         g = 2 * m + len(GLOBAL_UNKNOWNS)
-        depth = slice(g + len(columns_free), g + len(columns_free) + m * ("depth" in self.free))
-        p = depth.stop
+        p = g + len(columns_free)
         columns = np.empty((*total_x.shape, p))
         skewed = np.outer(self.window.axis_order, self.local_step(state))
         if state.motion is None or (projected.poses is None and not len(columns_free)):
@@ -758,7 +781,6 @@ class PassProblem:
             columns[..., 2 * m + 1] = total_x * skewed
             columns[..., 2 * m + 2] = total_y * (state.path_m * (1 + tangent**2))
             along = total_x + tangent * total_y
-            columns[..., depth] = by_z[..., : depth.stop - depth.start]
         else:
             poses = projected.poses or state.motion.poses(state.path_m, state.crab_rad)
             for axis, inside in enumerate((slice(m), slice(m, 2 * m))):
@@ -771,10 +793,7 @@ class PassProblem:
             velocity, rate = state.motion.derivatives(state.path_m, state.crab_rad, columns_free)
             moved = self._motion_fields(totals, projected.offsets.fields(moments), velocity, rate)
             along = moved[..., 0]
-            columns[..., 2 * m + 2 : depth.start] = moved[..., 1:]
-            if depth.stop > depth.start:
-                x, y, z = poses.rotation[:, 2].T[..., None]
-                columns[..., depth] = x * by_x + y * by_y + z * by_z
+            columns[..., 2 * m + 2 :] = moved[..., 1:]
         inner = np.concatenate(
             [self.whiten(columns.reshape(channels, n, p)), projected.unit_fields], axis=2
         )
@@ -797,16 +816,10 @@ class PassProblem:
             hessian[index, index] += 1 / sigma**2
             descent[index] -= (getattr(state, name) - mean) / sigma**2
         if state.motion is not None and len(columns_free):
-            indices = np.arange(g, depth.start)
+            indices = np.arange(g, p)
             information = 1 / state.motion.sigmas[columns_free] ** 2
             hessian[indices, indices] += information
             descent[indices] -= information * state.motion.coefficients[columns_free]
-        if depth.stop > depth.start:
-            depth_information = 1 / self.priors.depth_sigma_m**2
-            indices = np.arange(depth.start, depth.stop)
-            hessian[indices, indices] += depth_information
-            if state.depth_m is not None:
-                descent[depth] -= depth_information * state.depth_m
         indices = np.arange(p, q)
         hessian[indices, indices] += self.moment_information(m)
         descent[p:q] -= self.moment_information(m) * state.moment_am2.ravel()
@@ -893,75 +906,163 @@ def _student_weights(problem: PassProblem, projected: ProjectedState, weight: Ar
     return (STUDENT_FREEDOM + 1) / STUDENT_FREEDOM * factor
 
 
-def _significant_nuisance(
-    problem: PassProblem, projected: ProjectedState, allowed: tuple[str, ...]
-) -> str | None:
-    """Return the fixed nuisance that would explain the samples best; None if none is needed.
+@dataclass(frozen=True)
+class NuisanceTests:
+    """Score tests of the nuisances that are fixed at zero.
 
-    A score test: the decrease of the cost is predicted from normal equations in which the nuisance
-    is free. Its unit is not the noise but the variance of the score among clusters of samples that
-    the nuisance leaves unexplained (White, Econometrica 50 (1982) 1, section 3), because errors of
-    gains and axes of the sensors would else look like any nuisance. Of several significant ones,
-    that of the least Bayesian information criterion is chosen, which counts their unknowns.
+    Attributes
+    ----------
+    state : PassState
+        Its motion has coefficients, all of them zero if it is straight.
+    motion_columns : (k,) ndarray
+        Coefficients of the motion that are unknowns.
+    reduced : ReducedEquations
+        Crab and tilt are free, and motions that are not estimated are fixed.
+    changes : (q, k) ndarray
+        Changes of the unknowns if one of k motions was estimated.
+    evidence : (k,) ndarray
+        Twice the logarithms of the Bayes factors for these motions.
+    significant : str or None
+        Nuisance to estimate next.
+    min_motion_gain : float
+        Decrease of the cost by a motion that is one.
     """
-    fixed = [name for name in (*BUILD_NUISANCES, *MOTION_GROUPS) if name not in problem.free]
-    tested = [name for name in fixed if name in allowed]
+
+    state: PassState
+    motion_columns: NDArray[np.intp]
+    reduced: ReducedEquations
+    changes: Array
+    evidence: Array
+    significant: str | None
+    min_motion_gain: float
+
+    def likely_changes(self) -> Array:
+        """Return the changes times the square roots of the probabilities of their motions.
+
+        A motion that is fixed at zero, but is no less likely than none, would change the unknowns
+        (Bayesian model averaging; Hoeting et al., Stat. Sci. 14 (1999) 382, Eq. 3).
+        """
+        odds = np.exp(np.minimum(self.evidence, MAX_LOG_ODDS) / 2)
+        return np.asarray(self.changes * np.sqrt(odds / (1 + odds.sum())))
+
+
+def _test_nuisances(
+    problem: PassProblem, projected: ProjectedState, allowed: tuple[str, ...]
+) -> NuisanceTests:
+    """Predict the decrease of the cost by each nuisance from the equations in which it is free.
+
+    An oblique path is the simplest motion, and is not taken for a curve. Vertical moments come
+    last, because an attitude of the bar would look like them.
+    """
+    state = projected.state
+    if state.motion is None:
+        middle = float(np.median(state.position_m[:, 0]))
+        state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
+        projected = replace(projected, state=state)
+    fixed = [name for name in BUILD_NUISANCES if name not in problem.free]
+    motions = [name for name in MOTION_GROUPS if name in allowed and name not in problem.free]
     if problem.window.path_m is not None:
         # Errors of a path that was given would be taken for a curve.
-        tested = [name for name in tested if name != "curve"]
-    if not tested or projected.state.motion is None:
-        return None
-    reduced = problem.with_free(problem.free | frozenset(fixed)).reduce(projected)
-    sigmas = problem.nuisance_sigmas(projected.state)
-    indices = _nuisance_indices(problem, projected.state, reduced.first_moment, fixed)
-    clusters = problem.clusters(projected.state)
-    # A path that is oblique to the bar is the simplest motion, and is not taken for a curve.
-    stages = (
-        (("crab",), MIN_EVIDENCE),
-        (MOTION_GROUPS, MIN_MOTION_EVIDENCE),
-        (BUILD_NUISANCES, MIN_EVIDENCE),
-    )
-    for group, min_evidence in stages:
-        base = reduced.hessian.copy()
-        held = [name for name in fixed if group is not MOTION_GROUPS or name in MOTION_GROUPS]
-        every = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in held)])
-        base[every, every] *= FIXING_WEIGHT
-        without = float(reduced.descent @ solve_scaled(base, reduced.descent))
-        best, most = None, min_evidence
-        for name in (name for name in tested if name in group):
-            own = indices[name]
-            hessian = base.copy()
-            hessian[own, own] /= FIXING_WEIGHT
-            right = np.column_stack([reduced.descent, np.eye(len(hessian))[:, own]])
-            solved = solve_scaled(hessian, right)
-            gain = float(reduced.descent @ solved[:, 0]) - without
-            covariance = solved[own, 1:]
-            occam = 2 * np.log(sigmas[name]).sum() - np.linalg.slogdet(covariance)[1]
-            if gain < occam + min_evidence:
-                continue
-            # Unit variances and no correlations, if the residual was noise.
-            inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
-            changes = reduced.sample_changes(solved)
-            remaining = projected.residual - changes[..., 0]
-            rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
-            unit = max(
-                1.0,
-                *(float((cluster_sums(each, rows) ** 2).sum(axis=0).mean()) for each in clusters),
-            )
-            evidence = gain / unit - (occam - len(own) * np.log(unit))
-            if evidence > most:
-                best, most = name, evidence
-        if best is not None:
-            return best
-    return None
+        motions = [name for name in motions if name != "curve"]
+    rms = problem.rms_residual(projected)
+    if rms < MIN_WAVE_RESIDUAL_SIGMAS:
+        motions = [name for name in motions if name not in ("height", "rocking")]
+    tested = problem.with_free(problem.free.union(fixed, motions))
+    reduced = tested.reduce(projected)
+    indices = _nuisance_indices(problem, state, reduced.first_moment, [*fixed, *motions])
+    held = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in motions)])
+    reduced.hessian[held, held] *= FIXING_WEIGHT
+    gains = {
+        name: _predict_gain(
+            reduced,
+            np.concatenate([indices[other] for other in fixed if other != name] or [held[:0]]),
+        )
+        - len(indices[name])
+        for name in fixed
+        if name in allowed
+    }
+    base = solve_scaled(reduced.hessian, reduced.descent)
+    sigmas = state.motion.group_sigmas
+    excess = float((projected.residual**2).sum() - (problem.root > 0).sum())
+    min_gain = MIN_EXPLAINED_FRACTION * max(excess, 0.0)
+    tests = [
+        _test_motion(problem, projected, reduced, base, indices[name], sigmas[name], min_gain)
+        for name in motions
+    ]
+    evidence = np.array([each[0] for each in tests])
+    changes = np.reshape([each[1] for each in tests], (len(tests), len(reduced.hessian))).T
+    best = int(np.argmax(evidence)) if motions else None
+    significant = None
+    if gains.get("crab", 0.0) > MIN_NUISANCE_GAIN:
+        significant = "crab"
+    elif (
+        best is not None
+        and evidence[best] > MIN_MOTION_EVIDENCE
+        and (motions[best] in (*HEADING_NUISANCES, "attitude") or rms > MAX_SENSOR_RESIDUAL_SIGMAS)
+    ):
+        significant = motions[best]
+    elif gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN and "attitude" not in problem.free:
+        significant = "tilt"
+    columns = tested.motion_columns(state)
+    return NuisanceTests(state, columns, reduced, changes, evidence, significant, min_gain)
+
+
+def _predict_gain(reduced: ReducedEquations, fixed: NDArray[np.intp]) -> float:
+    """Return the decrease of the cost by one step while some of the unknowns are fixed."""
+    hessian = reduced.hessian.copy()
+    hessian[fixed, fixed] *= FIXING_WEIGHT
+    return float(reduced.descent @ solve_scaled(hessian, reduced.descent))
+
+
+def _test_motion(
+    problem: PassProblem,
+    projected: ProjectedState,
+    reduced: ReducedEquations,
+    base: Array,
+    own: NDArray[np.intp],
+    sigmas: Array,
+    min_gain: float,
+) -> tuple[float, Array]:
+    """Return the evidence for a motion, and the change (q,) of the unknowns by it.
+
+    ``base`` (q,) is the step without it, ``own`` are its indices, and ``sigmas`` its priors.
+
+    The unit of the gain is not the noise but the variance of the score among clusters of samples
+    that the motion leaves unexplained (White, Econometrica 50 (1982) 1, section 3), because errors
+    of gains and axes of the sensors would else look like a motion.
+    """
+    hessian = reduced.hessian.copy()
+    hessian[own, own] /= FIXING_WEIGHT
+    right = np.column_stack([reduced.descent, np.eye(len(hessian))[:, own]])
+    solved = solve_scaled(hessian, right)
+    gain = float(reduced.descent @ (solved[:, 0] - base))
+    covariance = solved[own, 1:]
+    occam = 2 * np.log(sigmas).sum() - np.linalg.slogdet(covariance)[1]
+    evidence = gain - occam
+    if gain < min_gain:
+        evidence = -np.inf
+    if evidence > 0:
+        # Unit variances and no correlations, if the residual was noise.
+        inverse_root = np.linalg.inv(np.linalg.cholesky(covariance))
+        changes = reduced.sample_changes(solved)
+        remaining = projected.residual - changes[..., 0]
+        rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
+        unit = max(
+            1.0,
+            *(
+                float((cluster_sums(each, rows) ** 2).sum(axis=0).mean())
+                for each in problem.clusters(projected.state)
+            ),
+        )
+        evidence = gain / unit - (occam - len(own) * np.log(unit))
+    return evidence, solved[:, 0] - base
 
 
 def cluster_sums(clusters: NDArray[np.intp], rows: Array) -> Array:
     """Return the sums (K, k) of rows (C, n, k) over the clusters (C, n) 0 to K - 1."""
-    flat = rows.reshape(clusters.size, -1)
-    sums = np.zeros((int(clusters.max()) + 1, flat.shape[1]))
-    np.add.at(sums, clusters.ravel(), flat)
-    return sums
+    index = clusters.ravel()
+    members = csr_array((np.ones(len(index)), (index, np.arange(len(index)))))
+    return np.asarray(members @ rows.reshape(len(index), -1))
 
 
 def _nuisance_indices(
@@ -970,7 +1071,6 @@ def _nuisance_indices(
     """Return the indices of the unknowns of each of the ``names`` in the normal equations."""
     m = len(state.position_m)
     indices = {
-        "depth": np.arange(first_moment - m, first_moment),
         "crab": np.array([2 * m + GLOBAL_UNKNOWNS.index("crab_rad")]),
         "tilt": first_moment + 3 * np.arange(m) + 2,
     }
@@ -989,9 +1089,9 @@ def _result(
     projected: ProjectedState,
     weight: Array,
     converged: bool,
-    reduced: ReducedEquations | None,
+    tests: NuisanceTests | None,
 ) -> PassFit:
-    """Collect the result of a fit; without ``reduced`` there are no covariances."""
+    """Collect the result of a fit; without ``tests`` there are no covariances."""
     window, state = problem.window, projected.state
     m, n = len(state.position_m), len(window.time_periods)
     residual = problem.unweighted_residual(projected, weight)
@@ -1000,65 +1100,84 @@ def _result(
     if window.path_m is None:
         unknowns += n
     correction = float(np.sqrt(count / max(count - unknowns, 1)))
-    covariance, path_sigma = np.full((3 * m, 3 * m), np.nan), np.full(n, np.nan)
-    height_sigma, significance = np.nan, np.full(m, np.inf)
-    if reduced is not None:
-        covariance, path_sigma, height_sigma, significance = _covariances(
-            reduced, state, projected.residual, problem.clusters(state)
-        )
+    covariances: dict[str, Any] = {
+        "covariance": np.full((3 * m, 3 * m), np.nan),
+        "motion_covariance": np.full((1, 1), np.nan),
+        "path_sigma_m": np.full(n, np.nan),
+        "height_sigma_m": np.nan,
+        "significance": np.full(m, np.inf),
+    }
+    if tests is not None:
+        state = tests.state
+        covariances = _covariances(tests, projected.residual, problem.clusters(state))
     return PassFit(
         state=state,
         residual=residual,
         rms_sigma=float(np.sqrt(np.nansum(residual**2) / max(count, 1))) * correction,
         robust_sigma=robust_sigma(residual) * correction,
         shared_square=problem.shared_square(projected),
-        covariance=covariance,
-        path_sigma_m=path_sigma,
-        height_sigma_m=height_sigma,
-        significance=significance,
         converged=converged,
+        **covariances,
     )
 
 
 def _covariances(
-    reduced: ReducedEquations,
-    state: PassState,
-    residual: Array,
-    clusters: tuple[NDArray[np.intp], ...],
-) -> tuple[Array, Array, float, Array]:
-    """Return the covariance (3 M, 3 M) of positions and angles, and sigmas of path and height.
+    tests: NuisanceTests, residual: Array, clusters: tuple[NDArray[np.intp], ...]
+) -> dict[str, Any]:
+    """Return the attributes of :class:`PassFit` that describe the accuracy.
 
-    Last come the squares of the horizontal moments in standard deviations. Where residuals are
-    correlated within clusters, the standard deviations are those of the sandwich estimator (Liang
-    and Zeger, Biometrika 73 (1986) 13), which are never taken smaller than those of the model.
+    Where residuals are correlated within clusters, the standard deviations are those of the
+    sandwich estimator (Liang and Zeger, Biometrika 73 (1986) 13), which are never taken smaller
+    than those of the model.
     """
+    state, reduced = tests.state, tests.reduced
     m = len(state.position_m)
     full = solve_scaled(reduced.hessian, np.eye(len(reduced.hessian)))
-    # From x, y and moment to x, y and angle.
-    jacobian = np.zeros((3 * m, len(full)))
-    square = (state.moment_am2[:, :2] ** 2).sum(axis=1)
-    for k in range(m):
-        jacobian[3 * k, k] = jacobian[3 * k + 1, m + k] = 1.0
-        moment = reduced.first_moment + 3 * k
-        jacobian[3 * k + 2, moment] = -state.moment_am2[k, 1] / square[k]
-        jacobian[3 * k + 2, moment + 1] = state.moment_am2[k, 0] / square[k]
-    path = np.zeros(len(state.path_m))
-    if reduced.band is not None and reduced.coupling is not None:
-        own = solveh_banded(reduced.band, np.eye(len(path)), check_finite=False)
-        coupled = np.einsum("nq,qr,nr->n", reduced.coupling, full, reduced.coupling, optimize=True)
-        path = np.sqrt(np.maximum(np.diag(own) + coupled, 0.0))
-    height = float(np.sqrt(full[2 * m, 2 * m]))
-    horizontal = reduced.first_moment + 3 * np.arange(m)[:, None] + [0, 1]
-    of_moments = full[horizontal[:, :, None], horizontal[:, None, :]]
-    moments = state.moment_am2[:, :2, None]
-    significance = (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2))
+    jacobian = _outputs_jacobian(state, reduced)
     covariance = jacobian @ full @ jacobian.T
     # A residual that is larger everywhere scales the whole covariance later.
     relative = residual / max(1.0, robust_sigma(residual))
     rows = reduced.sample_changes(full @ jacobian.T) * relative[..., None]
     variance = np.diag(covariance)
     for each in clusters:
-        sums = cluster_sums(each, rows)
-        variance = np.maximum(variance, (sums**2).sum(axis=0))
+        variance = np.maximum(variance, (cluster_sums(each, rows) ** 2).sum(axis=0))
     inflation = np.sqrt(variance / np.diag(covariance))
-    return inflation[:, None] * covariance * inflation, path, height, significance
+    changes = jacobian @ tests.likely_changes()
+    covariance = inflation[:, None] * covariance * inflation + changes @ changes.T
+    assert state.motion is not None
+    motion = np.zeros((1 + len(state.motion.coefficients),) * 2)
+    estimated = np.append(0, 1 + tests.motion_columns)
+    motion[np.ix_(estimated, estimated)] = covariance[3 * m :, 3 * m :]
+    horizontal = reduced.first_moment + 3 * np.arange(m)[:, None] + [0, 1]
+    of_moments = full[horizontal[:, :, None], horizontal[:, None, :]]
+    moments = state.moment_am2[:, :2, None]
+    return {
+        "covariance": covariance[: 3 * m, : 3 * m],
+        "motion_covariance": motion,
+        "path_sigma_m": _path_sigma(state, reduced, full),
+        "height_sigma_m": float(np.sqrt(full[2 * m, 2 * m])),
+        "significance": (moments * np.linalg.solve(of_moments, moments)).sum(axis=(1, 2)),
+    }
+
+
+def _outputs_jacobian(state: PassState, reduced: ReducedEquations) -> Array:
+    """Return the derivatives of x, y and angle of each magnet, of crab, and of the motion."""
+    m, crab = len(state.position_m), 2 * len(state.position_m) + GLOBAL_UNKNOWNS.index("crab_rad")
+    jacobian = np.zeros((3 * m + reduced.first_moment - crab, len(reduced.hessian)))
+    square = (state.moment_am2[:, :2] ** 2).sum(axis=1)
+    for k in range(m):
+        jacobian[3 * k, k] = jacobian[3 * k + 1, m + k] = 1.0
+        moment = reduced.first_moment + 3 * k
+        jacobian[3 * k + 2, moment] = -state.moment_am2[k, 1] / square[k]
+        jacobian[3 * k + 2, moment + 1] = state.moment_am2[k, 0] / square[k]
+    jacobian[3 * m :, crab : reduced.first_moment] = np.eye(reduced.first_moment - crab)
+    return jacobian
+
+
+def _path_sigma(state: PassState, reduced: ReducedEquations, full: Array) -> Array:
+    """Return the standard deviations (n,) of the path; 0 if it is known."""
+    if reduced.band is None or reduced.coupling is None:
+        return np.zeros(len(state.path_m))
+    own = solveh_banded(reduced.band, np.eye(len(state.path_m)), check_finite=False)
+    coupled = np.einsum("nq,qr,nr->n", reduced.coupling, full, reduced.coupling, optimize=True)
+    return np.sqrt(np.maximum(np.diag(own) + coupled, 0.0))

@@ -21,10 +21,15 @@ from scipy.ndimage import median_filter
 from locatk.core.errors import DegenerateError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.field_model import MagnetOffsets
-from locatk.core.polaris.detection.fit import PassFit, PassState, fit_coarse, fit_pass
+from locatk.core.polaris.detection.fit import (
+    BUILD_NUISANCES,
+    PassFit,
+    PassState,
+    fit_coarse,
+    fit_pass,
+)
 from locatk.core.polaris.detection.motion import Motion
 from locatk.core.polaris.detection.window import (
-    MAX_EFFORT,
     PassPriors,
     PassWindow,
     PreparedPass,
@@ -35,6 +40,7 @@ from locatk.core.polaris.detection.window import (
 from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import PassRange, PreprocessedSamples
 from locatk.core.polaris.tag import Tags
+from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE
 
 Array = NDArray[np.float64]
 
@@ -70,15 +76,19 @@ TRIED_STEPS_M = np.geomspace(0.02e-3, 10e-3, 14)
 MAX_PASS_LENGTH_M = 2.0
 """Maximum length of a pass [m]."""
 
+LAST_RESORT_EFFORT_FRACTION = 0.25
+"""Work that the fit of a grid of magnets may take, relative to that of all other fits."""
+
 MAX_INITIAL_GUESSES = 4
-"""Number of initial guesses that are refined, per direction of travel."""
+"""Number of initial guesses that are refined."""
+
+MAX_FORWARD_REMAINING = 0.5
+"""Fraction of the samples' squares that the first magnets leave unexplained, from which the array
+may have moved backward."""
 
 SEARCH_SHARED_FIELD_T = 3e-6
 """Standard deviation of a field that all sensors share (motors, rotation in the Earth's field) that
 is allowed for while magnets are searched for [T]."""
-
-FORWARD_EFFORT_FRACTION = 0.5
-"""Fraction of the effort after which no further guess of forward travel is tried."""
 
 MAX_GROWTH_ROUNDS = 4
 """Maximum number of searches of the residual for more magnets."""
@@ -213,15 +223,15 @@ def detect_magnets_at(
     prepared, magnets = hypothesis.prepared, hypothesis.magnets
     window, priors = prepared.window, prepared.priors[0]
     # The grid of a dense tag is the last resort, and has effort of its own.
-    window.effort.limit = 2 * MAX_EFFORT
-    if window.effort.is_exhausted:
-        raise DegenerateError("the effort for this pass is spent")
+    window.effort.limit = window.effort.spent + LAST_RESORT_EFFORT_FRACTION * window.effort.limit
+    # Nuisances of a fit without some of the magnets may have replaced them.
     state = replace(
         hypothesis.fit.state,
         position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
         moment_am2=np.zeros((len(positions_m), 3)),
-        depth_m=None,
-        free=hypothesis.fit.state.free - {"depth"},
+        crab_rad=0.0,
+        motion=None,
+        free=frozenset(),
     )
     coarse = fit_coarse(window, state, priors)
     moment = _horizontal_moments(coarse.state)
@@ -436,32 +446,37 @@ def _initial_state(
 def _pass_fits(prepared: PreparedPass) -> Iterator[PassFit]:
     """Yield fits of a pass, one per initial guess; nothing if the pass holds no magnet.
 
-    The speeds, heights and time axes that explain the samples best come first. An array that moves
-    backward is considered last, and only if nothing else describes the samples.
+    The speeds, heights and time axes that explain the samples best come first.
     """
     least = np.inf
-    for direction in (1.0, -1.0):
-        guesses = [
-            (timed, guess)
-            for timed in time_hypotheses(prepared)
-            for guess in _initial_guesses(timed, direction)
-        ]
-        guesses.sort(key=lambda pair: pair[1].remaining)
-        for timed, guess in guesses[:MAX_INITIAL_GUESSES]:
-            effort = prepared.window.effort
-            if effort.spent > (FORWARD_EFFORT_FRACTION if direction > 0 else 1.0) * effort.limit:
-                break
-            try:
-                fit = _grow_fit(timed, guess)
-            except DegenerateError:
-                continue
-            yield fit
-            is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
-            if is_residual_moderate and fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * least:
-                return  # Another initial guess does not reduce the residual.
-            least = min(least, fit.rms_sigma)
-        if prepared.window.path_m is not None or least < UNRELATED_RESIDUAL_SIGMAS:
+    for timed, guess in _timed_guesses(prepared)[:MAX_INITIAL_GUESSES]:
+        if prepared.window.effort.is_exhausted:
             return
+        try:
+            fit = _grow_fit(timed, guess)
+        except DegenerateError:
+            continue
+        yield fit
+        is_residual_moderate = WHITE_RESIDUAL_SIGMAS < least < UNRELATED_RESIDUAL_SIGMAS
+        if is_residual_moderate and fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * least:
+            return  # Another initial guess does not reduce the residual.
+        least = min(least, fit.rms_sigma)
+
+
+def _timed_guesses(prepared: PreparedPass) -> list[tuple[PreparedPass, _InitialGuess]]:
+    """Return the initial guesses for each time axis, those that leave least unexplained first.
+
+    An array that moves backward is considered only if forward travel explains little: no magnets
+    have the field of magnets that are passed in the other direction.
+    """
+    guesses: list[tuple[PreparedPass, _InitialGuess]] = []
+    for direction in (1.0, -1.0) if prepared.window.path_m is None else (1.0,):
+        for timed in time_hypotheses(prepared):
+            guesses += [(timed, guess) for guess in _initial_guesses(timed, direction)]
+        guesses.sort(key=lambda pair: pair[1].remaining)
+        if guesses and guesses[0][1].remaining < MAX_FORWARD_REMAINING:
+            break
+    return guesses
 
 
 # ---- growing a fit
@@ -493,6 +508,8 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
         information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
         window = replace(window, common_t=float(np.sqrt((fit.shared_square - 1) / information)))
     state = _without_spurious_sources(fit.state, prepared)
+    if window.path_m is not None and _is_path_contradicted(window, state, priors):
+        raise DegenerateError("the samples contradict the given path")
     while True:
         fit = fit_pass(window, state, priors)
         if _has_drift(window, fit):
@@ -506,12 +523,18 @@ def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
         is_complete = len(state.position_m) == len(fit.state.position_m)
         if is_complete or window.effort.is_exhausted:
             break
-    if window.path_m is not None and fit.rms_sigma < WHITE_RESIDUAL_SIGMAS:
-        # From the given path, a free one leads to the nearest path that the samples prefer.
-        free = fit_pass(replace(window, path_m=None), fit.state, priors)
-        if fit.rms_sigma > MAX_GIVEN_PATH_RESIDUAL_RATIO * free.rms_sigma:
-            raise DegenerateError("the samples contradict the given path")
     return fit
+
+
+def _is_path_contradicted(window: PassWindow, state: PassState, priors: PassPriors) -> bool:
+    """Return whether a free path explains the samples better than the given one.
+
+    Motions of the bar would explain a wrong path as well, and are left out of the comparison.
+    """
+    given = fit_pass(window, state, priors, BUILD_NUISANCES)
+    # From the given path, a free one leads to the nearest path that the samples prefer.
+    free = fit_pass(replace(window, path_m=None), given.state, priors, BUILD_NUISANCES)
+    return given.rms_sigma > MAX_GIVEN_PATH_RESIDUAL_RATIO * free.rms_sigma
 
 
 def _separate_candidates(
@@ -615,7 +638,6 @@ def _select_sources(state: PassState, chosen: NDArray[np.bool_] | list[int]) -> 
         state,
         position_m=state.position_m[chosen],
         moment_am2=state.moment_am2[chosen],
-        depth_m=None if state.depth_m is None else state.depth_m[chosen],
     )
 
 
@@ -623,13 +645,22 @@ def _with_sources(state: PassState, candidates: list[MagnetCandidate]) -> PassSt
     """Return the state with further sources."""
     positions = [candidate.position_m for candidate in candidates]
     moments = [[*candidate.moment_am2, 0.0] for candidate in candidates]
-    depth = state.depth_m
     return replace(
         state,
-        depth_m=None if depth is None else np.append(depth, np.zeros(len(candidates))),
         position_m=np.vstack([state.position_m, positions]),
         moment_am2=np.vstack([state.moment_am2, moments]),
     )
+
+
+def _is_passed(state: PassState, sensors_m: Array, margin_heights: float) -> NDArray[np.bool_]:
+    """Return which sources (M,) the array passed, up to a margin around its sensors."""
+    margin = margin_heights * state.height_m
+    along, across = _along_and_across(state)
+    is_passed = along > state.path_m.min() + sensors_m[:, 0].min() - margin
+    is_passed &= along < state.path_m.max() + sensors_m[:, 0].max() + margin
+    is_passed &= across > sensors_m[:, 1].min() - margin
+    is_passed &= across < sensors_m[:, 1].max() + margin
+    return is_passed
 
 
 def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassState:
@@ -643,14 +674,9 @@ def _without_spurious_sources(state: PassState, prepared: PreparedPass) -> PassS
     DegenerateError
         No source remains.
     """
-    sensors, position = prepared.window.sensors_m, state.position_m
-    margin = (SIDE_MARGIN_HEIGHTS + 0.5) * state.height_m
-    along, across = _along_and_across(state)
-    is_inside = along > state.path_m.min() + sensors[:, 0].min() - margin
-    is_inside &= along < state.path_m.max() + sensors[:, 0].max() + margin
-    is_inside &= across > sensors[:, 1].min() - margin
-    is_inside &= across < sensors[:, 1].max() + margin
-    moment = np.where(is_inside, _horizontal_moments(state), 0.0)
+    position = state.position_m
+    is_passed = _is_passed(state, prepared.window.sensors_m, SIDE_MARGIN_HEIGHTS + 0.5)
+    moment = np.where(is_passed, _horizontal_moments(state), 0.0)
     by_strength = np.argsort(-moment)
     strongest = moment[by_strength[0]]
     kept: list[int] = []
@@ -676,11 +702,8 @@ def _magnet_indices(prepared: PreparedPass, fit: PassFit) -> NDArray[np.intp]:
     DegenerateError
         None is.
     """
-    state, sensors = fit.state, prepared.window.sensors_m
-    margin = SIDE_MARGIN_HEIGHTS * state.height_m
-    _, across = _along_and_across(state)
-    is_under_bar = across > sensors[:, 1].min() - margin
-    is_under_bar &= across < sensors[:, 1].max() + margin
+    state = fit.state
+    is_under_bar = _is_passed(state, prepared.window.sensors_m, SIDE_MARGIN_HEIGHTS)
     moment = np.where(is_under_bar, _horizontal_moments(state), 0.0)
     expected = prepared.priors[0].moment_am2
     is_usual = moment > MIN_MOMENT_RATIO / 2 * expected
@@ -711,6 +734,19 @@ def _debris_covariance(prepared: PreparedPass, fit: PassFit, magnets: NDArray[np
     return np.diag(np.column_stack([place, place, angle]).ravel())
 
 
+def _path_sigma(fit: PassFit, noise_factor: float) -> Array:
+    """Return the standard deviations (n,) of the path, by the residual of each sample.
+
+    A sample that the magnets do not explain (of another time, or disturbed) has no position.
+    """
+    size = np.abs(fit.residual).reshape(len(fit.residual), -1)
+    is_empty = ~np.isfinite(size).any(axis=1)
+    size[is_empty] = 0.0
+    residual = SIGMA_PER_MEDIAN_ABSOLUTE * np.nanmedian(size, axis=1)
+    sigma = fit.path_sigma_m * np.maximum(residual, noise_factor)
+    return np.where(residual > UNRELATED_RESIDUAL_SIGMAS, MAX_PASS_LENGTH_M, sigma)
+
+
 def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> DetectedMagnets:
     """Return the magnets of a fit, in the array's frame at a sample near their middle."""
     state = fit.state
@@ -722,7 +758,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     path = np.interp(index, prepared.group_index, state.path_m)
     if prepared.path_m is not None and prepared.window.path_m is not None:
         path = prepared.path_m + (state.path_m[0] - prepared.window.path_m[0])
-    path_sigma = np.interp(index, prepared.group_index, fit.path_sigma_m) * noise_factor
+    path_sigma = np.interp(index, prepared.group_index, _path_sigma(fit, noise_factor))
     motion = state.motion or Motion.straight(path, 0.0, state.height_m)
     poses = motion.poses(path, state.crab_rad)
     yaw = np.arctan2(poses.rotation[:, 1, 0], poses.rotation[:, 0, 0])
@@ -740,6 +776,11 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     covariance = covariance * noise_factor**2 + _debris_covariance(prepared, fit, chosen)
     moment = state.moment_am2[chosen]
     moment[:, :2] = moment[:, :2] @ into_array
+    # Deviations from the pose at the reference sample.
+    planar = motion.planar_derivatives(path, state.crab_rad)
+    planar = planar - planar[reference]
+    planar[:, :2] = into_array.T @ planar[:, :2]
+    motion_covariance = planar @ fit.motion_covariance @ planar.swapaxes(1, 2) * noise_factor**2
     forward, lateral = ((poses.position_m[:, :2] - origin) @ into_array).T
     return DetectedMagnets(
         time_ns=int(samples.time_ns[prepared.first + reference]),
@@ -748,6 +789,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
         path_m=forward,
         lateral_m=lateral,
         heading_rad=yaw - heading,
+        motion_covariance=motion_covariance,
         position_m=(position - origin) @ into_array,
         angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
         moment_am2=np.hypot(moment[:, 0], moment[:, 1]),

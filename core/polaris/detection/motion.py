@@ -2,10 +2,11 @@
 
 A straight and level pass needs none of this. The functions of the path are
 
-- heading: Legendre polynomials from the first degree, which is a circle. The bar moves along its x
-  axis, so that its lateral position follows from the heading;
-- roll and pitch: constants, and cosines if the bar rocks;
-- height: cosines.
+- curve: the direction of the path, and of the bar with it, as Legendre polynomials. The first one
+  is a circle;
+- yaw: a rotation of the bar that its path does not follow, as cosines;
+- attitude: constant roll and pitch;
+- height, rocking: height, and roll and pitch, as cosines.
 
 The frame of the floor is that of the bar at :attr:`Motion.middle_m`, except for roll and pitch.
 """
@@ -20,13 +21,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MOTION_GROUPS = ("curve", "attitude", "height", "rocking")
+CURVE_SIGMAS_RAD = (0.5, 0.1, 0.04)
+"""Standard deviations of the polynomials of the path's direction over half a pass [rad]: a half
+pass of 0.1 m on a radius of 0.2 m is 0.5 rad. That of a change of curvature is a fifth of it, and
+of the change of this change less than a tenth."""
+
+MOTION_GROUPS = ("curve", "yaw", "attitude", "height", "rocking")
 """Groups of coefficients, each of which is estimated as a whole."""
 
-YAW_SIGMAS_RAD = (0.5, 0.1, 0.04)
-"""Standard deviations of the heading's polynomials over half a pass [rad]: a half pass of 0.1 m on
-a radius of 0.2 m is 0.5 rad. That of a change of curvature is a third of it, and of the change of
-this change a sixth."""
+YAW_SIGMA_RAD = 0.02
+"""Standard deviation of each wave of the yaw: 3 degrees rms of several of them."""
 
 ATTITUDE_SIGMA_RAD = 0.035
 """Standard deviation of roll and pitch: two degrees, a robot on one edge of a mat."""
@@ -39,14 +43,14 @@ ROCKING_SIGMA_RAD = 0.006
 80 mm."""
 
 SHORTEST_WAVE_HEIGHTS = 4.0
-"""Shortest wavelength of height and attitude, in heights over the magnets: the field of a magnet
-is two heights wide."""
+"""Shortest wavelength, in heights over the magnets: the field of a magnet is two heights wide."""
 
 MAX_WAVES = 16
 """Maximum number of waves; it bounds the time of a fit of a long pass."""
 
-GRID_POINTS = 257
-"""Points at which the heading is integrated; the steps between are arcs of circles."""
+GRID_POINTS = 513
+"""Points at which the direction of the path is integrated: between two of them, a path of 0.2 m
+with a radius of 0.15 m is within a nanometre of the line."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ class BarPoses:
     rotation : (n, 3, 3) ndarray
         From the axes of the bar to those of the floor.
     yaw_rate : (n,) ndarray
-        Curvature of the path [rad/m].
+        Rotation of the bar per length of path [rad/m].
     """
 
     position_m: Array
@@ -79,7 +83,7 @@ class Motion:
     waves : int
         Number of cosines.
     coefficients : (K,) ndarray
-        In the order of :data:`MOTION_GROUPS`.
+        In the order of :attr:`groups`.
     """
 
     middle_m: float
@@ -92,29 +96,33 @@ class Motion:
         """Return a straight and level motion over a path (n,)."""
         half = float(np.abs(path_m - middle_m).max())
         waves = int(np.clip(np.ceil(4 * half / (SHORTEST_WAVE_HEIGHTS * height_m)), 2, MAX_WAVES))
-        return cls(middle_m, half, waves, np.zeros(len(YAW_SIGMAS_RAD) + 2 + 3 * waves))
+        motion = cls(middle_m, half, waves, np.zeros(0))
+        return replace(motion, coefficients=np.zeros(len(motion.sigmas)))
+
+    @property
+    def group_sigmas(self) -> Mapping[str, Array]:
+        """Prior standard deviations of the coefficients of each group."""
+        return {
+            "curve": np.array(CURVE_SIGMAS_RAD),
+            "yaw": np.full(self.waves, YAW_SIGMA_RAD),
+            "attitude": np.full(2, ATTITUDE_SIGMA_RAD),
+            "height": np.full(self.waves, HEIGHT_WAVE_SIGMA_M),
+            "rocking": np.full(2 * self.waves, ROCKING_SIGMA_RAD),
+        }
 
     @property
     def groups(self) -> Mapping[str, slice]:
         """Range of the coefficients of each group."""
-        sizes = (len(YAW_SIGMAS_RAD), 2, self.waves, 2 * self.waves)
-        stops = np.cumsum(sizes)
-        return {
-            name: slice(int(stop - size), int(stop))
-            for name, size, stop in zip(MOTION_GROUPS, sizes, stops, strict=True)
-        }
+        ranges, start = {}, 0
+        for name, sigmas in self.group_sigmas.items():
+            ranges[name] = slice(start, start + len(sigmas))
+            start += len(sigmas)
+        return ranges
 
     @property
     def sigmas(self) -> Array:
         """Prior standard deviations (K,) of the coefficients."""
-        return np.concatenate(
-            [
-                YAW_SIGMAS_RAD,
-                np.full(2, ATTITUDE_SIGMA_RAD),
-                np.full(self.waves, HEIGHT_WAVE_SIGMA_M),
-                np.full(2 * self.waves, ROCKING_SIGMA_RAD),
-            ]
-        )
+        return np.concatenate(list(self.group_sigmas.values()))
 
     @property
     def is_straight(self) -> bool:
@@ -127,7 +135,8 @@ class Motion:
 
     def poses(self, path_m: Array, crab_rad: float = 0.0) -> BarPoses:
         """Return the poses of the bar at points (n,) of its path."""
-        return self._evaluate(path_m, crab_rad, [])[0]
+        path, angles = self._path(path_m, crab_rad), self._angles(path_m)
+        return BarPoses(path.position_m, _rotations(angles.roll_pitch_yaw), angles.rates[:, 2])
 
     def derivatives(
         self, path_m: Array, crab_rad: float, columns: NDArray[np.intp]
@@ -137,96 +146,151 @@ class Motion:
         They are derivatives of the pose by the path, the crab angle, and the coefficients
         ``columns`` (k,).
         """
-        _, velocity, rate = self._evaluate(path_m, crab_rad, list(columns))
-        return velocity, rate
-
-    def _evaluate(
-        self, path_m: Array, crab_rad: float, columns: list[int]
-    ) -> tuple[BarPoses, Array, Array]:
-        groups, values = self.groups, self.coefficients
-        n, yaw_terms, waves = len(path_m), len(YAW_SIGMAS_RAD), self.waves
-        unit = (path_m - self.middle_m) / self.half_length_m
-        yaw_basis, yaw_slope = self._yaw_basis(unit)
-        bend = values[groups["curve"]]
-        yaw, yaw_rate = yaw_basis @ bend, yaw_slope @ bend / self.half_length_m
-        phase = np.pi / 2 * np.outer(unit + 1, np.arange(1, waves + 1))
-        wave = np.cos(phase)
-        wave_slope = -np.sin(phase) * (np.pi / 2 / self.half_length_m) * np.arange(1, waves + 1)
-        height = values[groups["height"]]
-        rocking = values[groups["rocking"]].reshape(2, waves)
-        roll, pitch = values[groups["attitude"]][:, None] + rocking @ wave.T
-        roll_rate, pitch_rate = rocking @ wave_slope.T
-        # Integrals of the heading: on a grid, and along arcs between its points.
-        reach = max(1.0, float(np.abs(unit).max()))
-        grid = np.linspace(-reach, reach, GRID_POINTS)
-        grid_basis, _ = self._yaw_basis(grid)
-        grid_yaw = grid_basis @ bend
-        step = (grid[1] - grid[0]) * self.half_length_m
-        index = np.clip(np.round((unit - grid[0]) / (grid[1] - grid[0])).astype(int), 0, 256)
-        rest = path_m - self.middle_m - grid[index] * self.half_length_m
-
-        def integrate(on_grid: Array, at_path: Array) -> Array:
-            """Integrate a function of the path from the middle to each point."""
-            cumulated = np.zeros_like(on_grid)
-            np.cumsum((on_grid[1:] + on_grid[:-1]) * (step / 2), axis=0, out=cumulated[1:])
-            cumulated -= cumulated[GRID_POINTS // 2]
-            rests = rest[:, None] if on_grid.ndim == 2 else rest
-            return np.asarray(cumulated[index] + rests * (at_path + on_grid[index]) / 2)
-
-        forward = self.middle_m + integrate(np.cos(grid_yaw), np.cos(yaw))
-        sideways = integrate(np.sin(grid_yaw), np.sin(yaw))
-        tangent = np.tan(crab_rad)
-        position = np.column_stack(
-            [forward - tangent * sideways, sideways + tangent * forward, wave @ height]
-        )
-        (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-        rotation = np.array([
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]).transpose(2, 0, 1)  # fmt: skip
-        # Axes of the three angles in those of the bar.
+        n, groups, total = len(path_m), self.groups, len(self.coefficients)
+        path, angles = self._path(path_m, crab_rad), self._angles(path_m)
+        velocity, rate = np.zeros((n, 3, 2 + total)), np.zeros((n, 3, 2 + total))
+        velocity[..., 0], velocity[..., 1] = path.by_path, path.by_crab
+        by_coefficient, rotated = velocity[..., 2:], rate[..., 2:]
+        by_coefficient[:, :2, groups["curve"]] = path.by_curve
+        by_coefficient[:, 2, groups["height"]] = angles.wave
+        # Axes of roll, pitch and yaw in those of the bar.
+        rotation = _rotations(angles.roll_pitch_yaw)
+        cos, sin = np.cos(angles.roll_pitch_yaw[:, 0]), np.sin(angles.roll_pitch_yaw[:, 0])
         zero = np.zeros(n)
-        yaw_axis = rotation[:, 2]
-        pitch_axis = np.column_stack([zero, cr, -sr])
-        roll_axis = np.array([1.0, 0.0, 0.0])
-        poses = BarPoses(position, rotation, yaw_rate)
-        velocity = np.zeros((n, 3, 2 + len(columns)))
-        rate = np.zeros((n, 3, 2 + len(columns)))
-        velocity[:, 0, 0] = cy - tangent * sy
-        velocity[:, 1, 0] = sy + tangent * cy
-        velocity[:, 2, 0] = wave_slope @ height
-        rate[:, :, 0] = yaw_rate[:, None] * yaw_axis + pitch_rate[:, None] * pitch_axis
-        rate[:, :, 0] += roll_rate[:, None] * roll_axis
-        velocity[:, 0, 1] = -(1 + tangent**2) * sideways
-        velocity[:, 1, 1] = (1 + tangent**2) * forward
-        if columns:
-            full_velocity = np.zeros((n, 3, len(values)))
-            full_rate = np.zeros((n, 3, len(values)))
-            cosines, sines = np.cos(grid_yaw)[:, None], np.sin(grid_yaw)[:, None]
-            by_forward = -integrate(sines * grid_basis, sy[:, None] * yaw_basis)
-            by_sideways = integrate(cosines * grid_basis, cy[:, None] * yaw_basis)
-            full_velocity[:, 0, :yaw_terms] = by_forward - tangent * by_sideways
-            full_velocity[:, 1, :yaw_terms] = by_sideways + tangent * by_forward
-            full_rate[:, :, :yaw_terms] = yaw_axis[:, :, None] * yaw_basis[:, None]
-            full_rate[:, 0, groups["attitude"].start] = 1.0
-            full_rate[:, :, groups["attitude"].start + 1] = pitch_axis
-            full_velocity[:, 2, groups["height"]] = wave
-            start = groups["rocking"].start
-            full_rate[:, 0, start : start + waves] = wave
-            full_rate[:, :, start + waves :] = pitch_axis[:, :, None] * wave[:, None]
-            velocity[:, :, 2:], rate[:, :, 2:] = (
-                full_velocity[..., columns],
-                full_rate[..., columns],
-            )
-        return poses, np.einsum("nji,njk->nik", rotation, velocity), rate
+        roll_axis = np.tile([1.0, 0.0, 0.0], (n, 1))
+        pitch_axis, yaw_axis = np.column_stack([zero, cos, -sin]), rotation[:, 2]
+        axes = np.stack([roll_axis, pitch_axis, yaw_axis], axis=2)
+        rate[..., 0] = np.einsum("nik,nk->ni", axes, angles.rates)
+        rotated[..., groups["curve"]] = yaw_axis[:, :, None] * path.basis[:, None]
+        rotated[..., groups["yaw"]] = yaw_axis[:, :, None] * angles.yaw_wave[:, None]
+        rotated[..., groups["attitude"]] = axes[..., :2]
+        rocking = np.concatenate(
+            [axis[:, :, None] * angles.wave[:, None] for axis in (roll_axis, pitch_axis)], axis=2
+        )
+        rotated[..., groups["rocking"]] = rocking
+        chosen = np.concatenate([[0, 1], 2 + columns])
+        return np.einsum("nji,njk->nik", rotation, velocity[..., chosen]), rate[..., chosen]
 
-    @staticmethod
-    def _yaw_basis(unit: Array) -> tuple[Array, Array]:
-        """Return the polynomials (n, k) of the heading, zero in the middle, and their slopes."""
-        terms = np.eye(len(YAW_SIGMAS_RAD) + 1)[1:].T
-        legendre = np.polynomial.legendre
-        middle = legendre.legval(np.zeros(1), terms)
-        basis = legendre.legval(unit, terms) - middle
-        slope = legendre.legval(unit, legendre.legder(terms))
-        return np.asarray(basis.T, float), np.asarray(slope.T, float)
+    def planar_derivatives(self, path_m: Array, crab_rad: float) -> Array:
+        """Return the derivatives (n, 3, 1 + K) of x, y and heading on the floor.
+
+        They are derivatives by the crab angle and by the coefficients.
+        """
+        path, angles, groups = self._path(path_m, crab_rad), self._angles(path_m), self.groups
+        derivatives = np.zeros((len(path_m), 3, 1 + len(self.coefficients)))
+        derivatives[:, :2, 0] = path.by_crab[:, :2]
+        by_coefficient = derivatives[..., 1:]
+        by_coefficient[:, :2, groups["curve"]] = path.by_curve
+        by_coefficient[:, 2, groups["curve"]] = path.basis
+        by_coefficient[:, 2, groups["yaw"]] = angles.yaw_wave
+        return derivatives
+
+    def _path(self, path_m: Array, crab_rad: float) -> _Path:
+        bend, tangent = self.coefficients[self.groups["curve"]], np.tan(crab_rad)
+        unit = (path_m - self.middle_m) / self.half_length_m
+        basis, _ = _direction_basis(unit)
+        limit = max(1.0, float(np.abs(unit).max()))
+        grid = np.linspace(-limit, limit, GRID_POINTS)
+        grid_basis, _ = _direction_basis(grid)
+        direction, grid_direction = basis @ bend, grid_basis @ bend
+        cos, sin = np.cos(grid_direction), np.sin(grid_direction)
+        slopes = np.column_stack([cos, sin, -sin[:, None] * grid_basis, cos[:, None] * grid_basis])
+        integral = np.zeros_like(slopes)
+        np.cumsum((slopes[1:] + slopes[:-1]) / 2, axis=0, out=integral[1:])
+        integral -= integral[GRID_POINTS // 2]
+        step = 2 * limit / (GRID_POINTS - 1)
+        index = np.clip(((unit + limit) / step).astype(int), 0, GRID_POINTS - 2)
+        fraction = ((unit + limit) / step - index)[:, None]
+        values = (1 - fraction) * integral[index] + fraction * integral[index + 1]
+        values *= step * self.half_length_m
+        forward, sideways = self.middle_m + values[:, 0], values[:, 1]
+        by_forward, by_sideways = values[:, 2:].reshape(len(path_m), 2, -1).swapaxes(0, 1)
+        cos, sin = np.cos(direction), np.sin(direction)
+        height = self._waves(path_m) @ self.coefficients[self.groups["height"]]
+        slope = self._wave_slopes(path_m) @ self.coefficients[self.groups["height"]]
+        zero = np.zeros(len(path_m))
+        secant_square = 1 + tangent**2
+        return _Path(
+            position_m=np.column_stack(
+                [forward - tangent * sideways, sideways + tangent * forward, height]
+            ),
+            by_path=np.column_stack([cos - tangent * sin, sin + tangent * cos, slope]),
+            by_crab=np.column_stack([-secant_square * sideways, secant_square * forward, zero]),
+            by_curve=np.stack(
+                [by_forward - tangent * by_sideways, by_sideways + tangent * by_forward], axis=1
+            ),
+            basis=basis,
+        )
+
+    def _angles(self, path_m: Array) -> _Angles:
+        values, groups = self.coefficients, self.groups
+        wave, slope = self._waves(path_m), self._wave_slopes(path_m)
+        of_waves = np.concatenate([values[groups["rocking"]], values[groups["yaw"]]])
+        of_waves = of_waves.reshape(3, self.waves)
+        unit = (path_m - self.middle_m) / self.half_length_m
+        basis, basis_slope = _direction_basis(unit)
+        bend = values[groups["curve"]]
+        angles, rates = wave @ of_waves.T, slope @ of_waves.T
+        angles[:, :2] += values[groups["attitude"]]
+        yaw_wave = wave - self._waves(np.array([self.middle_m]))
+        angles[:, 2] = basis @ bend + yaw_wave @ values[groups["yaw"]]
+        rates[:, 2] += basis_slope @ bend / self.half_length_m
+        return _Angles(angles, rates, wave, yaw_wave)
+
+    def _waves(self, path_m: Array) -> Array:
+        return np.cos(self._phases(path_m))
+
+    def _wave_slopes(self, path_m: Array) -> Array:
+        number = np.arange(1, self.waves + 1)
+        return -np.sin(self._phases(path_m)) * (np.pi / 2 / self.half_length_m * number)
+
+    def _phases(self, path_m: Array) -> Array:
+        unit = (path_m - self.middle_m) / self.half_length_m
+        return np.asarray(np.pi / 2 * np.outer(unit + 1, np.arange(1, self.waves + 1)))
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Positions (n, 3) of the bar, their derivatives, and the polynomials (n, k) of the direction.
+
+    ``by_curve`` is (n, 2, k); the other derivatives are (n, 3).
+    """
+
+    position_m: Array
+    by_path: Array
+    by_crab: Array
+    by_curve: Array
+    basis: Array
+
+
+@dataclass(frozen=True)
+class _Angles:
+    """Roll, pitch and yaw (n, 3) of the bar, their derivatives by the path, and waves (n, k).
+
+    Those of the yaw are zero in the middle.
+    """
+
+    roll_pitch_yaw: Array
+    rates: Array
+    wave: Array
+    yaw_wave: Array
+
+
+def _rotations(roll_pitch_yaw: Array) -> Array:
+    """Return the matrices (n, 3, 3) from the axes of the bar to those of the floor."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(roll_pitch_yaw.T), np.sin(roll_pitch_yaw.T)
+    return np.array([
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]).transpose(2, 0, 1)  # fmt: skip
+
+
+def _direction_basis(unit: Array) -> tuple[Array, Array]:
+    """Return the polynomials (n, k) of the path's direction, zero in the middle, and slopes."""
+    terms = np.eye(len(CURVE_SIGMAS_RAD) + 1)[1:].T
+    legendre = np.polynomial.legendre
+    middle = legendre.legval(np.zeros(1), terms)
+    basis = legendre.legval(unit, terms) - middle
+    slope = legendre.legval(unit, legendre.legder(terms))
+    return np.asarray(basis.T, float), np.asarray(slope.T, float)

@@ -58,9 +58,11 @@ MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
 
-MAX_EFFORT = 2e8
-"""Work that a pass may take, in samples times unknowns of all iterations: about two seconds of
-a processor. A hundred sources under a bar in a cluttered hall would take minutes."""
+EFFORT_PER_SOURCE_SQUARE = 2.5e5
+"""Work that a pass may take, in samples times unknowns of all iterations, by the square of the
+number of sources that it may hold: an iteration takes longer with each source, and each is searched
+for. It is less than a second of a processor for a tag of five magnets, and three for thirteen. A
+hundred sources under a bar in a cluttered hall would take minutes."""
 
 
 @dataclass
@@ -74,7 +76,7 @@ class Effort:
     """
 
     spent: float = 0.0
-    limit: float = MAX_EFFORT
+    limit: float = EFFORT_PER_SOURCE_SQUARE * MAX_SOURCES_WITHOUT_TAG**2
 
     @property
     def is_exhausted(self) -> bool:
@@ -143,8 +145,6 @@ class PassPriors:
         Expected magnitude of a magnet's moment.
     tilt_sigma : float
         Vertical part of a magnet's moment, relative to its magnitude (standard deviation).
-    depth_sigma_m : float
-        Standard deviation of a magnet's height.
     crab_sigma_rad : float
         Standard deviation of the angle between the array's x axis and its path.
     jitter_fraction : float
@@ -155,7 +155,6 @@ class PassPriors:
     skew_periods: tuple[float, float] = (0.0, 0.5)
     moment_am2: float = 1.5e-3
     tilt_sigma: float = 0.05
-    depth_sigma_m: float = 2e-4
     crab_sigma_rad: float = 0.009
     jitter_fraction: float = 0.3
 
@@ -235,6 +234,8 @@ def prepare_pass(
     delay = samples.array.delay_s
     middle, half = (delay.max() + delay.min()) / 2, np.ptp(delay) / 2
     magnet = None if tags is None else tags.magnet
+    # Twice the magnets of a tag (two tags in one pass), and some iron.
+    max_sources = MAX_SOURCES_WITHOUT_TAG if tags is None else 2 * tags.magnets + 4
     window = PassWindow(
         field_t=means,
         sensors_m=samples.array.position_m,
@@ -244,6 +245,7 @@ def prepare_pass(
         axis_order=(delay - middle) / half if half > 0 else np.zeros(3),
         path_m=None if path_m is None else group_means(path_m[rows]),
         disc_correction_m2=disc_correction(magnet),
+        effort=Effort(limit=EFFORT_PER_SOURCE_SQUARE * max_sources**2),
     )
     heights = DEFAULT_HEIGHTS_M if tags is None else (tags.clearance_m,)
     priors = tuple(
@@ -264,8 +266,7 @@ def prepare_pass(
         sample_count=len(field),
         path_m=None if path_m is None else path_m[rows],
         min_separation_m=MIN_SEPARATION_FRACTION * length,
-        # Twice the magnets of a tag (two tags in one pass), and some iron.
-        max_sources=MAX_SOURCES_WITHOUT_TAG if tags is None else 2 * tags.magnets + 4,
+        max_sources=max_sources,
     )
 
 
