@@ -23,6 +23,7 @@ from locatk.core.polaris.array import Samples
 from locatk.core.polaris.detection.field_model import MagnetOffsets
 from locatk.core.polaris.detection.fit import (
     BUILD_NUISANCES,
+    MAX_MOTION_RESIDUAL_SIGMAS,
     PassFit,
     PassState,
     fit_coarse,
@@ -41,6 +42,7 @@ from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import PassRange, PreprocessedSamples
 from locatk.core.polaris.tag import Tags
 from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE
+from locatk.core.solution import SolverWarning
 
 Array = NDArray[np.float64]
 
@@ -150,6 +152,10 @@ HIDDEN_DEBRIS_ANGLE, HIDDEN_DEBRIS_POSITION = 1.0, 0.25
 """Variances of a magnet's direction, and of its x and y in squared heights, by a layer of dipoles
 of any direction whose mean square moment on a squared height is that of the magnet. They are
 integrals of the least-squares solution for one magnet over the plane of the sensors."""
+
+MIN_RADIUS_M, MAX_ATTITUDE_RAD = 0.08, np.radians(5.0)
+"""Least radius of the path, and largest attitude of the array, at which simulated tags of five
+magnets and a spacing of 40 mm are read: none at 70 mm, and few from 6 degrees on."""
 
 DEFAULT_SKEW_PERIODS = 0.2
 """Initial skew if the expected one is half a sample period or more."""
@@ -803,4 +809,30 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
         origin_m=origin,
         origin_heading_rad=heading,
         other_sources=len(state.position_m) - len(chosen),
+        warnings=tuple(each.about(samples.device) for each in _motion_warnings(fit, path)),
     )
+
+
+def _motion_warnings(fit: PassFit, path_m: Array) -> Iterator[SolverWarning]:
+    """Yield a warning if the bar moved on a narrower curve, or was more tilted, than is read."""
+    state = fit.state
+    if state.motion is None or fit.rms_sigma > MAX_MOTION_RESIDUAL_SIGMAS:
+        return
+    along, _ = _along_and_across(state)
+    is_over = (path_m > along.min()) & (path_m < along.max())
+    if "curve" in state.free and is_over.any():
+        radius = 1 / np.abs(state.motion.curvature(path_m[is_over])).max()
+        if radius < MIN_RADIUS_M:
+            yield SolverWarning(
+                "curved_path",
+                f"the path over the magnets has a radius of {radius * 1e3:.0f} mm; tags are read "
+                f"from {MIN_RADIUS_M * 1e3:.0f} mm on",
+            )
+    attitude = state.motion.coefficients[state.motion.groups["attitude"]]
+    tilt = float(np.hypot(*attitude))
+    if tilt > MAX_ATTITUDE_RAD:
+        yield SolverWarning(
+            "tilted_array",
+            f"the array is tilted by {np.degrees(tilt):.1f} degrees; tags are read up to "
+            f"{np.degrees(MAX_ATTITUDE_RAD):.0f}",
+        )

@@ -50,7 +50,7 @@ MAX_WAVES = 16
 
 GRID_POINTS = 513
 """Points at which the direction of the path is integrated: between two of them, a path of 0.2 m
-with a radius of 0.15 m is within a nanometre of the line."""
+with a radius of 0.15 m deviates from the line by less than a micrometre."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,11 @@ class Motion:
         """Return the poses of the bar at points (n,) of its path."""
         path, angles = self._path(path_m, crab_rad), self._angles(path_m)
         return BarPoses(path.position_m, _rotations(angles.roll_pitch_yaw), angles.rates[:, 2])
+
+    def curvature(self, path_m: Array) -> Array:
+        """Return the curvature (n,) of the path [1/m]."""
+        _, slope = _direction_basis((path_m - self.middle_m) / self.half_length_m)
+        return np.asarray(slope @ self.coefficients[self.groups["curve"]] / self.half_length_m)
 
     def derivatives(
         self, path_m: Array, crab_rad: float, columns: NDArray[np.intp]

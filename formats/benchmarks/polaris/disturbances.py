@@ -80,6 +80,8 @@ class Disturbance:
         Number of iron bits.
     debris_moment : (float, float)
         Moment of a bit relative to that of a magnet, log-uniform.
+    yaw_deg : (float, float)
+        Amplitude of a rotation of the bar that its path does not follow.
     """
 
     radius_m: tuple[float, float] | None = None
@@ -90,6 +92,7 @@ class Disturbance:
     wavelength_m: tuple[float, float] = (0.06, 0.3)
     debris: int = 0
     debris_moment: tuple[float, float] = (0.01, 0.15)
+    yaw_deg: tuple[float, float] = (0.0, 0.0)
 
 
 DISTURBANCES: dict[str, Disturbance] = {
@@ -105,6 +108,7 @@ DISTURBANCES: dict[str, Disturbance] = {
     "height of 0.5 to 1 mm, 40 to 150 mm": Disturbance(
         wobble_m=(0.5e-3, 1e-3), wavelength_m=(0.04, 0.15)
     ),
+    "yaw of 1 to 4 deg": Disturbance(yaw_deg=(1.0, 4.0)),
     "iron debris": Disturbance(debris=10),
     "all of these": Disturbance((0.2, 0.6), 0.7, (0.5, 2.0), True, (0.2e-3, 0.5e-3), debris=6),
 }  # fmt: skip
@@ -148,10 +152,17 @@ class BarPath:
             rng.uniform(*disturbance.wobble_m) * swing[2],
             roll,
             pitch,
-            heading,
+            heading + self._yaw(s),
         ]
         object.__setattr__(self, "distance_m", s)
         object.__setattr__(self, "pose", np.column_stack(pose))
+
+    def _yaw(self, s: Array) -> Array:
+        if not self.disturbance.yaw_deg[1]:
+            return np.zeros_like(s)
+        amplitude = math.radians(self.rng.uniform(*self.disturbance.yaw_deg))
+        swing = np.sin(math.tau * (s / self._wavelength() + self.rng.random()))
+        return np.asarray(amplitude * swing)
 
     def _wavelength(self) -> float:
         low, high = np.log(self.disturbance.wavelength_m)

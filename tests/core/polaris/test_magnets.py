@@ -137,7 +137,9 @@ def test_noise_of_the_residual_scales_the_covariance(world: Any) -> None:
     unsure = next(detect_magnets(understated, part, TAGS)).magnets
     assert unsure.robust_residual_sigma == pytest.approx(2 * sure.robust_residual_sigma, rel=0.1)
     ratio = np.sqrt(np.diag(unsure.covariance) / np.diag(sure.covariance))
-    assert np.median(ratio[2::3]) == pytest.approx(1.0, rel=0.15)
+    # The sandwich estimator of single magnets has an uncertainty of its own.
+    np.testing.assert_allclose(ratio[2::3], 1.0, rtol=0.5)
+    assert ratio[2::3].mean() == pytest.approx(1.0, rel=0.15)
 
 
 def test_a_contradicted_path_is_replaced(world: Any) -> None:
