@@ -64,9 +64,9 @@ bar, magnets that are not flat, and the groups of :mod:`locatk.core.polaris.dete
 COARSE_NUISANCES = ("curve", "attitude")
 """Those that a coarse fit estimates: without them it takes the residual for further magnets."""
 
-HEADING_NUISANCES = ("curve", "yaw")
-"""Those that change the residual little, but the heading of the bar much: the magnets, whose
-orientations are unknown, rotate with them."""
+WAVE_NUISANCES = ("height", "rocking")
+"""Motions that are estimated only if errors of real sensors do not explain the residual: their many
+unknowns follow such errors, and change the magnets more than the residual."""
 
 GLOBAL_UNKNOWNS = ("height_m", "skew_periods", "crab_rad")
 """Attributes of :class:`PassState` that hold one number for the whole pass."""
@@ -955,63 +955,71 @@ def _test_nuisances(
     last, because an attitude of the bar would look like them.
     """
     state = projected.state
-    if state.motion is None:
+    motion = state.motion
+    if motion is None:
         middle = float(np.median(state.position_m[:, 0]))
-        state = replace(state, motion=Motion.straight(state.path_m, middle, state.height_m))
+        motion = Motion.straight(state.path_m, middle, state.height_m)
+        state = replace(state, motion=motion)
         projected = replace(projected, state=state)
-    fixed = [name for name in BUILD_NUISANCES if name not in problem.free]
-    motions = [name for name in MOTION_GROUPS if name in allowed and name not in problem.free]
-    if problem.window.path_m is not None:
-        # Errors of a path that was given would be taken for a curve.
-        motions = [name for name in motions if name != "curve"]
     rms = problem.rms_residual(projected)
-    if rms < MIN_WAVE_RESIDUAL_SIGMAS:
-        motions = [name for name in motions if name not in ("height", "rocking")]
+    fixed = [name for name in BUILD_NUISANCES if name not in problem.free]
+    motions = _testable_motions(problem, rms, allowed)
     tested = problem.with_free(problem.free.union(fixed, motions))
     reduced = tested.reduce(projected)
-    indices = _nuisance_indices(problem, state, reduced.first_moment, [*fixed, *motions])
+    indices = _nuisance_indices(tested, state, reduced.first_moment)
     held = np.concatenate([np.zeros(0, np.intp), *(indices[name] for name in motions)])
     reduced.hessian[held, held] *= FIXING_WEIGHT
-    gains = {
-        name: _predict_gain(
-            reduced,
-            np.concatenate([indices[other] for other in fixed if other != name] or [held[:0]]),
-        )
-        - len(indices[name])
-        for name in fixed
-        if name in allowed
-    }
-    base = solve_scaled(reduced.hessian, reduced.descent)
-    sigmas = state.motion.group_sigmas
     excess = float((projected.residual**2).sum() - (problem.root > 0).sum())
     min_gain = MIN_EXPLAINED_FRACTION * max(excess, 0.0)
-    tests = [
-        _test_motion(problem, projected, reduced, base, indices[name], sigmas[name], min_gain)
-        for name in motions
-    ]
-    evidence = np.array([each[0] for each in tests])
-    changes = np.reshape([each[1] for each in tests], (len(tests), len(reduced.hessian))).T
-    best = int(np.argmax(evidence)) if motions else None
+    base = solve_scaled(reduced.hessian, reduced.descent)
+    evidence, changes = np.zeros(len(motions)), np.zeros((len(base), len(motions)))
+    for k, name in enumerate(motions):
+        evidence[k], changes[:, k] = _test_motion(
+            problem, projected, reduced, base, indices[name], motion.group_sigmas[name], min_gain
+        )
     significant = None
-    if gains.get("crab", 0.0) > MIN_NUISANCE_GAIN:
+    build_gains = {
+        name: _build_gain(reduced, indices, name, fixed) for name in fixed if name in allowed
+    }
+    if build_gains.get("crab", 0.0) > MIN_NUISANCE_GAIN:
         significant = "crab"
-    elif (
-        best is not None
-        and evidence[best] > MIN_MOTION_EVIDENCE
-        and (motions[best] in (*HEADING_NUISANCES, "attitude") or rms > MAX_SENSOR_RESIDUAL_SIGMAS)
-    ):
-        significant = motions[best]
-    elif gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN and "attitude" not in problem.free:
+    elif motions and evidence.max() > MIN_MOTION_EVIDENCE:
+        best = motions[int(np.argmax(evidence))]
+        if best not in WAVE_NUISANCES or rms > MAX_SENSOR_RESIDUAL_SIGMAS:
+            significant = best
+    is_level = "attitude" not in problem.free
+    if significant is None and is_level and build_gains.get("tilt", 0.0) > MIN_NUISANCE_GAIN:
         significant = "tilt"
     columns = tested.motion_columns(state)
     return NuisanceTests(state, columns, reduced, changes, evidence, significant, min_gain)
 
 
-def _predict_gain(reduced: ReducedEquations, fixed: NDArray[np.intp]) -> float:
-    """Return the decrease of the cost by one step while some of the unknowns are fixed."""
+def _testable_motions(
+    problem: PassProblem, rms_sigma: float, allowed: tuple[str, ...]
+) -> list[str]:
+    """Return the motions that are fixed, and of which the samples may show something."""
+    motions = [name for name in MOTION_GROUPS if name in allowed and name not in problem.free]
+    if problem.window.path_m is not None:
+        # Errors of a path that was given would be taken for a curve.
+        motions = [name for name in motions if name != "curve"]
+    if rms_sigma < MIN_WAVE_RESIDUAL_SIGMAS:
+        motions = [name for name in motions if name not in WAVE_NUISANCES]
+    return motions
+
+
+def _build_gain(
+    reduced: ReducedEquations,
+    indices: dict[str, NDArray[np.intp]],
+    name: str,
+    fixed: list[str],
+) -> float:
+    """Return the decrease of the cost by crab or tilt beyond the number of its unknowns."""
+    others = [indices[other] for other in fixed if other != name]
     hessian = reduced.hessian.copy()
-    hessian[fixed, fixed] *= FIXING_WEIGHT
-    return float(reduced.descent @ solve_scaled(hessian, reduced.descent))
+    for held in others:
+        hessian[held, held] *= FIXING_WEIGHT
+    gain = float(reduced.descent @ solve_scaled(hessian, reduced.descent))
+    return gain - len(indices[name])
 
 
 def _test_motion(
@@ -1066,22 +1074,21 @@ def cluster_sums(clusters: NDArray[np.intp], rows: Array) -> Array:
 
 
 def _nuisance_indices(
-    problem: PassProblem, state: PassState, first_moment: int, names: list[str]
+    problem: PassProblem, state: PassState, first_moment: int
 ) -> dict[str, NDArray[np.intp]]:
-    """Return the indices of the unknowns of each of the ``names`` in the normal equations."""
+    """Return the indices in the normal equations of the unknowns of each free nuisance."""
     m = len(state.position_m)
     indices = {
         "crab": np.array([2 * m + GLOBAL_UNKNOWNS.index("crab_rad")]),
         "tilt": first_moment + 3 * np.arange(m) + 2,
     }
-    if state.motion is not None:
-        start = 2 * m + len(GLOBAL_UNKNOWNS)
-        for name, part in state.motion.groups.items():
-            if name in problem.free or name in names:
-                size = part.stop - part.start
-                indices[name] = np.arange(start, start + size)
-                start += size
-    return {name: indices[name] for name in names}
+    start = 2 * m + len(GLOBAL_UNKNOWNS)
+    groups = {} if state.motion is None else state.motion.groups
+    for name, part in groups.items():
+        if name in problem.free:
+            indices[name] = np.arange(start, start + part.stop - part.start)
+            start += part.stop - part.start
+    return indices
 
 
 def _result(

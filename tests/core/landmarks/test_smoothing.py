@@ -134,10 +134,7 @@ def test_derivatives_of_all_rows(kind: str) -> None:
     robot, landmarks = session(0.01)
     system = SmoothingSystem([robot], landmarks, GEOMETRY, PRIORS)
     random = np.random.default_rng(2)
-    state = (
-        system.initial_state()
-        + 0.3 * random.normal(size=system.size) * system.prior_weight_weight_weight_weight
-    )
+    state = system.initial_state() + 0.3 * random.normal(size=system.size) * system.prior_weight
     for cell in landmarks:  # their derivatives are approximate otherwise
         state[system.landmark_columns[cell][3 + 4 :]] = 0.0
 
