@@ -153,6 +153,11 @@ HIDDEN_DEBRIS_ANGLE, HIDDEN_DEBRIS_POSITION = 1.0, 0.25
 of any direction whose mean square moment on a squared height is that of the magnet. They are
 integrals of the least-squares solution for one magnet over the plane of the sensors."""
 
+MAX_PATH_STEP_HEIGHTS = 3.0
+"""Largest deviation of a step from the mean one between two samples over the magnets, in heights:
+samples that are farther apart have no field in common. The published recordings lose samples over
+up to 1.1 heights."""
+
 MIN_RADIUS_M, MAX_ATTITUDE_RAD = 0.08, np.radians(5.0)
 """Least radius of the path, and largest attitude of the array, at which simulated tags of five
 magnets and a spacing of 40 mm are read: none at 70 mm, and few from 6 degrees on."""
@@ -740,6 +745,28 @@ def _debris_covariance(prepared: PreparedPass, fit: PassFit, magnets: NDArray[np
     return np.diag(np.column_stack([place, place, angle]).ravel())
 
 
+def _require_continuous_path(
+    prepared: PreparedPass, state: PassState, chosen: NDArray[np.intp]
+) -> None:
+    """Check that the path over the magnets has no step that no field bridges.
+
+    Raises
+    ------
+    DegenerateError
+        The magnets before and after such a step have no common frame.
+    """
+    along = _along_and_across(state)[0][chosen]
+    excess = np.diff(state.path_m) - state.mean_step_m * np.diff(prepared.window.time_periods)
+    margin = MAX_PATH_STEP_HEIGHTS * state.height_m
+    low, high = (
+        np.minimum(state.path_m[1:], state.path_m[:-1]),
+        np.maximum(state.path_m[1:], state.path_m[:-1]),
+    )
+    is_over = (high > along.min() - margin) & (low < along.max() + margin)
+    if prepared.window.path_m is None and np.any(np.abs(excess[is_over]) > margin):
+        raise DegenerateError("the path over the magnets is interrupted")
+
+
 def _path_sigma(fit: PassFit, noise_factor: float) -> Array:
     """Return the standard deviations (n,) of the path, by the residual of each sample.
 
@@ -759,6 +786,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
     # Errors of the model show in the residual.
     noise_factor = max(1.0, fit.robust_sigma)
     chosen = _magnet_indices(prepared, fit)
+    _require_continuous_path(prepared, state, chosen)
     position = state.position_m[chosen]
     index = np.arange(prepared.sample_count)
     path = np.interp(index, prepared.group_index, state.path_m)

@@ -108,3 +108,28 @@ def test_a_narrow_curve_is_named() -> None:
     solution = solve([wide.samples], wide.tags, SolveOptions())
     assert [each.tag_id for each in solution.detections] == [wide.tag_id]
     assert "curved_path" not in [each.code for each in solution.warnings]
+
+
+def test_a_path_that_turns_back_is_not_read_across_the_turn() -> None:
+    """Over half of the tag, back by 0.1 m, and over all of it, within one pass."""
+    for seed in range(FIRST_SEED, FIRST_SEED + 3):
+        disturbed = simulate_disturbed(Disturbance(), seed)
+        samples = disturbed.samples
+        middle = int(np.argmin(np.abs(disturbed.bar_position_m[:, 0])))
+        order = np.concatenate(
+            [
+                np.arange(middle),
+                np.arange(middle, middle - 70, -1),
+                np.arange(middle - 70, len(samples)),
+            ]
+        )
+        step_ns = int(samples.time_ns[1] - samples.time_ns[0])
+        time_ns = samples.time_ns[0] + step_ns * np.arange(len(order))
+        turned = replace(samples, time_ns=time_ns, field_t=samples.field_t[order])
+        for each in solve([turned], disturbed.tags, SolveOptions()).detections:
+            if each.tag_id is not None:
+                at = order[np.searchsorted(time_ns, round(each.time_s * 1e9))]
+                centre = disturbed.magnet_m.mean(axis=0) - disturbed.bar_position_m[at]
+                found = np.mean([[magnet.x_m, magnet.y_m] for magnet in each.magnets], axis=0)
+                assert each.tag_id == disturbed.tag_id
+                assert np.hypot(*(found - centre)) < 0.01
