@@ -756,13 +756,12 @@ def _require_continuous_path(
         The magnets before and after such a step have no common frame.
     """
     along = _along_and_across(state)[0][chosen]
-    excess = np.diff(state.path_m) - state.mean_step_m * np.diff(prepared.window.time_periods)
+    # Without single samples that were disturbed.
+    path = median_filter(state.path_m, 5)
+    excess = np.diff(path) - state.mean_step_m * np.diff(prepared.window.time_periods)
     margin = MAX_PATH_STEP_HEIGHTS * state.height_m
-    low, high = (
-        np.minimum(state.path_m[1:], state.path_m[:-1]),
-        np.maximum(state.path_m[1:], state.path_m[:-1]),
-    )
-    is_over = (high > along.min() - margin) & (low < along.max() + margin)
+    low, high = np.minimum(path[1:], path[:-1]), np.maximum(path[1:], path[:-1])
+    is_over = (low > along.min() - margin) & (high < along.max() + margin)
     if prepared.window.path_m is None and np.any(np.abs(excess[is_over]) > margin):
         raise DegenerateError("the path over the magnets is interrupted")
 
