@@ -225,3 +225,15 @@ def test_finer_templates_scatter_less(
     options = SolveOptions(method="paper", speed_mps=0.105, templates=TemplateGrid(72, 9, 80))
     runs = [solved(one, options) for one in samples[name]]
     assert scatter_deg(runs) < 0.9 * scatter_deg(published_runs[name])
+
+
+@pytest.mark.slow
+def test_angles_scatter_over_the_runs_as_their_sigmas_state(runs: dict[str, list[Run]]) -> None:
+    """Rotations of the robot are part of the scatter."""
+    by_cell = [{m.cell: m for m in run.detection.magnets} for run in runs["default"]]
+    cells = sorted(by_cell[0], key=str)
+    rotated = np.exp(1j * np.array([[each[cell].angle_rad for cell in cells] for each in by_cell]))
+    sigma = np.array([[each[cell].sigma_angle_rad for cell in cells] for each in by_cell])
+    deviation = np.angle(rotated * rotated.mean(axis=0).conj())
+    count = len(by_cell)
+    assert 0.5 < float(((deviation / sigma) ** 2).mean()) * count / (count - 1) < 1.25

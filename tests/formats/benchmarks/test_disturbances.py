@@ -60,20 +60,20 @@ def test_disturbed_passes_are_read_with_an_honest_covariance(name: str) -> None:
     assert max(nees(outcomes)) < 3.0
 
 
-@pytest.mark.parametrize("name", ["curve of 150 to 300 mm", "yaw of 1 to 4 deg"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tightening curve", "yaw of 1 to 4 deg"])
 def test_headings_of_poses_follow_the_bar(name: str) -> None:
-    for seed in range(FIRST_SEED, FIRST_SEED + 3):
+    largest = []
+    for seed in range(FIRST_SEED, FIRST_SEED + 5):
         disturbed = simulate_disturbed(DISTURBANCES[name], seed)
         solution = solve([disturbed.samples], disturbed.tags, SolveOptions())
         (trajectory,) = solution.trajectories
-        heading = heading_from_quaternion(trajectory.quaternion)
         at = np.searchsorted(disturbed.samples.time_ns, trajectory.time_ns)
-        error = heading - disturbed.bar_heading_rad[at]
+        error = heading_from_quaternion(trajectory.quaternion) - disturbed.bar_heading_rad[at]
         # The frame of the tag is turned against that of the floor.
         error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))
-        sigma = np.sqrt(trajectory.covariance[:, 5, 5])
-        assert np.abs(error / sigma).max() < 5
-        assert np.ptp(disturbed.bar_heading_rad[at]) > 3 * np.abs(error).max()
+        largest.append(np.abs(error / np.sqrt(trajectory.covariance[:, 5, 5])).max())
+    assert np.mean(largest) < 3
 
 
 @pytest.mark.slow
