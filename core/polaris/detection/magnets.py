@@ -759,10 +759,12 @@ def _require_continuous_path(
     # Without single samples that were disturbed.
     path = median_filter(state.path_m, 5)
     excess = np.diff(path) - state.mean_step_m * np.diff(prepared.window.time_periods)
-    margin = MAX_PATH_STEP_HEIGHTS * state.height_m
     low, high = np.minimum(path[1:], path[:-1]), np.maximum(path[1:], path[:-1])
-    is_over = (low > along.min() - margin) & (high < along.max() + margin)
-    if prepared.window.path_m is None and np.any(np.abs(excess[is_over]) > margin):
+    # Beyond the fields of the first and of the last magnet, nothing holds the path.
+    is_over = high > along.min() - state.height_m
+    is_over &= low < along.max() + state.height_m
+    is_large = np.abs(excess) > MAX_PATH_STEP_HEIGHTS * state.height_m
+    if prepared.window.path_m is None and np.any(is_over & is_large):
         raise DegenerateError("the path over the magnets is interrupted")
 
 
