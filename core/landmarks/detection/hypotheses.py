@@ -146,6 +146,9 @@ million for the prior probability of a fault, and the same again for errors of t
 MAX_CHANGE_LOG_LOSS = 7.0
 """Log evidence of a single visit against a change from which on it is not believed (1 : 1000)."""
 
+MIN_SUPPORTING_VISITS = 2
+"""Number of visits that must speak for a change by the same odds: a single one may be disturbed."""
+
 MAX_LOG_EVIDENCE = 1e9
 """Log evidence against a change with which no landmark can be fitted."""
 
@@ -852,6 +855,9 @@ def check_wiring(
         for index in indices
     ]
     if sum(gains) < MIN_CHANGE_LOG_ODDS or min(gains) < -MAX_CHANGE_LOG_LOSS:
+        return 1.0
+    supporting = sum(gain > MAX_CHANGE_LOG_LOSS for gain in gains)
+    if supporting < min(MIN_SUPPORTING_VISITS, len(visits)):
         return 1.0
     fits = [fit for index in indices if (fit := refined_fit(best, index)) is not None]
     if np.median([fit.residual_sigma for fit in fits]) > MAX_FITTING_RESIDUAL_SIGMAS:
