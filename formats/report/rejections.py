@@ -220,8 +220,8 @@ def _dots_reasons() -> dict[str, Reason]:
 
 def _polaris_reasons() -> dict[str, Reason]:
     passes = {
-        "no_magnets": "The field changed, but no magnets explain that, or not within the effort for "
-        "a pass: several large tags in one pass, or much debris.",
+        "no_magnets": "The field changed, but no magnets explain that, or not within the effort "
+        "for a pass: several large tags in one pass, or much debris.",
         "no_pass": "The field changed while the array rested, or far less than by a tag.",
         "no_tag_given": "The design of the tags (tag.toml) is not known: magnets were detected, "
         "but not identified.",
