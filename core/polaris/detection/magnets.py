@@ -761,8 +761,8 @@ def _require_continuous_path(
     excess = np.diff(path) - state.mean_step_m * np.diff(prepared.window.time_periods)
     low, high = np.minimum(path[1:], path[:-1]), np.maximum(path[1:], path[:-1])
     # Beyond the fields of the first and of the last magnet, nothing holds the path.
-    is_over = high > along.min() - state.height_m
-    is_over &= low < along.max() + state.height_m
+    is_over = low > along.min() - state.height_m
+    is_over &= high < along.max() + state.height_m
     is_large = np.abs(excess) > MAX_PATH_STEP_HEIGHTS * state.height_m
     if prepared.window.path_m is None and np.any(is_over & is_large):
         raise DegenerateError("the path over the magnets is interrupted")
@@ -842,7 +842,7 @@ def _to_array_frame(samples: Samples, prepared: PreparedPass, fit: PassFit) -> D
         origin_m=origin,
         origin_heading_rad=heading,
         other_sources=len(state.position_m) - len(chosen),
-        warnings=tuple(each.about(samples.device) for each in _motion_warnings(fit, path)),
+        warnings=tuple(_motion_warnings(fit, path)),
     )
 
 

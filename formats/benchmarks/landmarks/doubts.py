@@ -63,7 +63,7 @@ def floor_figures(floor: FloorMap, source: str) -> Iterator[Figure]:
             solution = solve(session.samples, floor, odometry=session.odometry)
             probabilities.append(_probability(solution))
         believed = sum(one >= PROVISIONAL_PROBABILITY for one in probabilities)
-        yield Figure(f"{name}: believed", believed, "drives",
+        yield Figure(f"{name}: believed", float(believed), "drives",
                      f"of {DRIVES} over 11 landmarks, on the map of {source}: poses with a "
                      f"probability of {PROVISIONAL_PROBABILITY} or more; largest "
                      f"{max(probabilities):.2g}", 0.0)  # fmt: skip
@@ -113,7 +113,7 @@ def nominal_figures(floor: FloorMap, source: str) -> Iterator[Figure]:
         accused += [one.refused for one in solution.detections if one.refused == "misread"]
         certain += _probability(solution) >= PROVISIONAL_PROBABILITY
     how = f"of {2 * DRIVES} drives over 11 landmarks without a fault, {source}"
-    yield Figure("drives without a fault: accusations", len(accused), "",
+    yield Figure("drives without a fault: accusations", float(len(accused)), "",
                  f"{how}; {', '.join(accused) or 'none'}")  # fmt: skip
     yield Figure("drives without a fault: certain", 100 * certain / (2 * DRIVES), "%",
                  how, better="higher")  # fmt: skip

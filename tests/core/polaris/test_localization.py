@@ -249,7 +249,9 @@ def first_tag(tour: tuple[Any, Samples]) -> TagObservation:
 
 
 def with_path(observation: TagObservation, path_m: Array) -> TagObservation:
-    return replace(observation, magnets=replace(observation.magnets, path_m=path_m))
+    sigma_m = np.minimum(observation.magnets.path_sigma_m, 2e-4)
+    magnets = replace(observation.magnets, path_m=path_m, path_sigma_m=sigma_m)
+    return replace(observation, magnets=magnets)
 
 
 def localized_times(recording: Samples, observation: TagObservation) -> NDArray[np.int64]:
