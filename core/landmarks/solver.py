@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from locatk.core.errors import InputError
+from locatk.core.errors import DegenerateError, InputError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import detect_landmarks
 from locatk.core.landmarks.detection.trace import CONSTANT_ERROR_COUNT, known_drift
@@ -308,13 +308,20 @@ def localize_robot(
         )
         not_localised = replace(facts, localised=False, provisional=False)
         return _with_warnings(replace(unlocalized, facts=not_localised), obstacle, *polarity)
-    smoothed = smooth_drive(
-        on_map,
-        identified.odometry,
-        floor,
-        identified.priors,
-        estimate_walk=options.odometry_noise is None,
-    )
+    try:
+        smoothed = smooth_drive(
+            on_map,
+            identified.odometry,
+            floor,
+            identified.priors,
+            estimate_walk=options.odometry_noise is None,
+        )
+    except DegenerateError as error:
+        message = f"no poses: {error}; check the clocks and the scale of the odometry"
+        return _with_warnings(
+            replace(unlocalized, facts=replace(facts, localised=False, provisional=False)),
+            SolverWarning("field_misfit", message).about(identified.device),
+        )
     facts = replace(facts, misfit_sigma=smoothed.residual_sigma)
     robot = _with_warnings(
         replace(unlocalized, facts=facts, lag_s=smoothed.significant_lag()),

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from locatk.core.errors import DegenerateError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.trace import OdometryDrift
 from locatk.core.landmarks.localization.cell_filter import IdentifiedVisit
@@ -212,6 +213,11 @@ def smooth_drive(
         With the noise of the recording.
     estimate_walk : bool
         See :func:`.robust_smoothing.smooth_robustly`.
+
+    Raises
+    ------
+    DegenerateError
+        No part has a solution, because fields and odometry contradict each other.
     """
     count = round(len(visits) / PART_VISITS) if len(visits) > MAX_PART_VISITS else 1
     edges = np.linspace(0, len(visits), count + 1).astype(int).tolist()
@@ -222,9 +228,16 @@ def smooth_drive(
     parts = []
     for (start, stop), (first_ns, stop_ns) in ranges:
         near = visits[max(0, start - NEIGHBOURING_VISITS) : stop + NEIGHBOURING_VISITS]
-        smoothed, used = _smooth_part(near, odometry, floor, priors, estimate_walk=estimate_walk)
+        try:
+            smoothed, used = _smooth_part(
+                near, odometry, floor, priors, estimate_walk=estimate_walk
+            )
+        except DegenerateError:
+            continue
         cells = frozenset(visit.cell for visit in visits[start:stop])
         parts.append(SmoothedPart(smoothed, used, cells, first_ns, stop_ns))
+    if not parts:
+        raise DegenerateError("the fields and the odometry contradict each other")
     return SmoothedDrive(parts, priors.drift)
 
 

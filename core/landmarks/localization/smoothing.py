@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
+from locatk.core.errors import DegenerateError
 from locatk.core.landmarks.detection.fit import ModelPriors, ParameterLayout, VisitFitProblem
 from locatk.core.landmarks.detection.hypotheses import FAULTY_STRENGTH_SIGMA, LandmarkFit
 from locatk.core.landmarks.detection.trace import (
@@ -640,16 +641,27 @@ class SmoothingSystem:
         return solution
 
     def solve(self, equations: NormalEquations) -> SystemSolution:
-        """Solve linearized equations with the present weights of the priors."""
-        factorized = splu(
-            (equations.matrix + diags_array(self.prior_weight)).tocsc(),
-            # This order of columns keeps the factors of a symmetric matrix sparse.
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        """Solve linearized equations with the present weights of the priors.
+
+        Raises
+        ------
+        DegenerateError
+            The iteration has diverged: fields and odometry contradict each other.
+        """
         gradient = equations.gradient + self.prior_weight * equations.state
-        state = equations.state - factorized.solve(gradient)
+        try:
+            factorized = splu(
+                (equations.matrix + diags_array(self.prior_weight)).tocsc(),
+                # This order of columns keeps the factors of a symmetric matrix sparse.
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+            state = equations.state - factorized.solve(gradient)
+        except RuntimeError:  # A factor is singular.
+            state = np.full(self.size, np.nan)
+        if not np.isfinite(state).all():
+            raise DegenerateError("the fields and the odometry contradict each other")
         return SystemSolution(state, factorized.solve, equations)
 
     def _linearize_paths(self, state: Array) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.landmarks.halls import HallSamples, HallSensors, circle
 from locatk.core.landmarks.landmark import pattern
-from locatk.core.landmarks.localization import drive_smoothing
+from locatk.core.landmarks.localization import drive_smoothing, smoothing
 from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing
 from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
 from locatk.core.landmarks.simulation.session import (
@@ -361,6 +361,19 @@ def test_residuals_of_the_fields_limit_the_poses(
     assert bool(robot.trajectories) == poses
     assert robot.facts.localised == poses
     assert robot.facts.misfit_sigma == residual_sigma
+
+
+@pytest.mark.slow
+def test_a_singular_system_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*given: Any, **options: Any) -> None:
+        raise RuntimeError("Factor is exactly singular")
+
+    monkeypatch.setattr(smoothing, "splu", fail)
+    robot = localize_robot(identified(), FLOOR, SolveOptions())
+    assert robot.trajectories == ()
+    assert not robot.facts.localised
+    (warning,) = (each for each in robot.warnings if each.code == "field_misfit")
+    assert "contradict each other" in warning.message
 
 
 @pytest.mark.parametrize(
