@@ -57,6 +57,10 @@ def test_contradicted_map_is_rejected(wrong: int, accepted: bool) -> None:
     result = solved(drive(), FloorMap(codes))
     assert bool(result.trajectories) == accepted
     assert ("map_contradicted" in [each.code for each in result.warnings]) != accepted
+    known = [one for one in result.detections if one.cell is not None]
+    assert bool(known) == accepted
+    (facts,) = result.facts.robots.values()
+    assert all(one.cell_probability <= facts.map_probability for one in known)
 
 
 # ---- guards
