@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -81,7 +81,7 @@ class PassOutcome:
     verdict : str
         ``"right"``: the true id was read and no other; ``"wrong"``: another id was read;
         ``"misplaced"``: the true id was read, but its pose has too large an error; ``"refused"``:
-        detected, but not read for a reason; ``"silent"``: no detection.
+        not read, for a reason; ``"silent"``: no detection and no reason.
     reasons : tuple of str
         Reasons of the refusals.
     missed : int
@@ -106,7 +106,11 @@ def simulate_pass(
     session = simulate(tags, SimulationOptions(route=(tag_id,), **options))
     speed = options.get("speed_mps", SimulationOptions.speed_mps) if known_speed else None
     solution = solve([session.samples], tags, SolveOptions(speed_mps=speed))
-    return score_pass(session, solution.detections)
+    outcome = score_pass(session, solution.detections)
+    if outcome.verdict == "silent" and "no_magnets" in solution.rejected:
+        # Counted and reported, without a detection.
+        outcome = replace(outcome, verdict="refused", reasons=("no_magnets",))
+    return outcome
 
 
 def score_pass(session: SimulatedSession, detections: Sequence[TagDetection]) -> PassOutcome:
