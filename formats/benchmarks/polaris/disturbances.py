@@ -110,7 +110,9 @@ DISTURBANCES: dict[str, Disturbance] = {
     ),
     "yaw of 1 to 4 deg": Disturbance(yaw_deg=(1.0, 4.0)),
     "iron debris": Disturbance(debris=10),
-    "all of these at once": Disturbance((0.2, 0.6), 0.7, (0.5, 2.0), True, (0.2e-3, 0.5e-3), debris=6),
+    "all of these at once": Disturbance(
+        (0.2, 0.6), 0.7, (0.5, 2.0), True, (0.2e-3, 0.5e-3), debris=6
+    ),
 }  # fmt: skip
 
 
