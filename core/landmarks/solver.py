@@ -93,14 +93,11 @@ class SolveOptions:
                 "noise and lag of the odometry do not apply to method 'paper'",
                 hint="Leave them out, or use method 'field'",
             )
-        if not all(value is None or math.isfinite(value) for value in given) or not (
-            self.odometry_noise is None or self.odometry_noise > 0
-        ):
-            raise InputError(
-                f"odometry with a noise of {self.odometry_noise} rad and a lag of "
-                f"{self.odometry_lag_s} s",
-                hint="Both are finite numbers, and the noise is positive",
-            )
+        noise, lag_s = given
+        if noise is not None and not 0 < noise < math.inf:
+            raise InputError(f"odometry with a noise of {noise} rad", hint="Give a positive number")
+        if lag_s is not None and not math.isfinite(lag_s):
+            raise InputError(f"odometry with a lag of {lag_s} s", hint="Give a number")
         if not 0 < self.misread < 0.5:
             raise InputError(
                 f"a rate of misread landmarks of {self.misread!r}", hint="Give 0.001 to 0.2"
