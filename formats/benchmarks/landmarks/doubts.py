@@ -27,7 +27,7 @@ from locatk.formats.benchmarks.timing import FIRST_SEED
 
 Array = NDArray[np.float64]
 
-DRIVES = 10
+DRIVES_PER_KIND = 10
 """Drives of each kind."""
 
 ACCUSATIONS = {
@@ -57,14 +57,14 @@ def floor_figures(floor: FloorMap, source: str) -> Iterator[Figure]:
     for number, (name, other_floor) in enumerate(OTHER_FLOORS.items()):
         first = FIRST_SEED + 3000 + 100 * number
         probabilities = []
-        for seed in range(first, first + DRIVES):
+        for seed in range(first, first + DRIVES_PER_KIND):
             other = other_floor(floor, seed)
             session = drive_over(other, seed, random_cells(floor, seed))
             solution = solve(session.samples, floor, odometry=session.odometry)
             probabilities.append(_probability(solution))
         believed = sum(one >= PROVISIONAL_PROBABILITY for one in probabilities)
         yield Figure(f"{name}: believed", float(believed), "drives",
-                     f"of {DRIVES} over 11 landmarks, on the map of {source}: poses with a "
+                     f"of {DRIVES_PER_KIND} over 11 landmarks, {source}: poses with a "
                      f"probability of {PROVISIONAL_PROBABILITY} or more; largest "
                      f"{max(probabilities):.2g}", 0.0)  # fmt: skip
 
@@ -82,13 +82,14 @@ def sensor_figures(floor: FloorMap, source: str) -> Iterator[Figure]:
     for number, (name, (change, words)) in enumerate(WIRINGS.items()):
         first = FIRST_SEED + 3400 + 100 * number
         named = 0
-        for seed in range(first, first + DRIVES):
+        for seed in range(first, first + DRIVES_PER_KIND):
             session = drive_over(floor, seed, random_cells(floor, seed)[:3])
             samples = session.samples[0]
             samples = replace(samples, field_t=change(samples.field_t, seed))
             named += words in _verdict([samples], floor, session.odometry)
-        yield Figure(f"{name}: named", 100 * named / DRIVES, "%",
-                     f"of {DRIVES} drives over 8 landmarks, {source}", better="higher")  # fmt: skip
+        yield Figure(f"{name}: named", 100 * named / DRIVES_PER_KIND, "%",
+                     f"of {DRIVES_PER_KIND} drives over 8 landmarks, {source}",
+                     better="higher")  # fmt: skip
 
 
 def _verdict(
@@ -106,16 +107,16 @@ def nominal_figures(floor: FloorMap, source: str) -> Iterator[Figure]:
     """Count what is accused wrongly, and the drives whose poses are certain."""
     accused, certain = [], 0
     first = FIRST_SEED + 3900
-    for seed in range(first, first + 2 * DRIVES):
+    for seed in range(first, first + 2 * DRIVES_PER_KIND):
         session = drive_over(floor, seed, random_cells(floor, seed))
         solution = solve(session.samples, floor, odometry=session.odometry)
         accused += [warning.code for warning in solution.warnings if warning.code in ACCUSATIONS]
         accused += [one.refused for one in solution.detections if one.refused == "misread"]
         certain += _probability(solution) >= PROVISIONAL_PROBABILITY
-    how = f"of {2 * DRIVES} drives over 11 landmarks without a fault, {source}"
+    how = f"of {2 * DRIVES_PER_KIND} drives over 11 landmarks without a fault, {source}"
     yield Figure("drives without a fault: accusations", float(len(accused)), "",
                  f"{how}; {', '.join(accused) or 'none'}")  # fmt: skip
-    yield Figure("drives without a fault: certain", 100 * certain / (2 * DRIVES), "%",
+    yield Figure("drives without a fault: certain", 100 * certain / (2 * DRIVES_PER_KIND), "%",
                  how, better="higher")  # fmt: skip
 
 

@@ -40,7 +40,7 @@ LEG_CELLS_RANGE = (2, 8)
 WHEEL_PATH_M_PER_RAD = 0.05
 """Path of the wheels in a rotation that counts like a distance for the noise."""
 
-POSES = 3
+POSE_FREEDOM = 3
 """Degrees of freedom of a pose."""
 
 
@@ -82,7 +82,7 @@ def odometry_figures(folder: Path) -> Iterator[Figure]:
             session = drive_over(floor, seed, zigzag_cells(floor, seed))
             session = with_odometry(session, errors, seed)
             score = score_session(session, solve(session.samples, floor, odometry=session.odometry))
-            nees.append(float(np.mean(score.nees)) / POSES if score.has_poses else math.nan)
+            nees.append(float(np.mean(score.nees)) / POSE_FREEDOM if score.has_poses else math.nan)
             errors_m.append(score.error_m)
         median = 1e3 * float(np.median(np.concatenate(errors_m)))
         yield Figure(f"drive of 12 m, odometry with {name}: NEES", float(np.mean(nees)), "",
@@ -125,7 +125,7 @@ def with_odometry(session: SimulatedSession, errors: OdometryErrors, seed: int) 
     noise = rng.normal(size=step.shape) * [errors.walk_m, errors.walk_m / 3, errors.walk_rad]
     scale = 1 + errors.scale * rng.normal(size=2)
     step = step * scale[[0, 0, 1]] + root[:, None] * noise
-    poses = [np.zeros(POSES)]
+    poses = [np.zeros(POSE_FREEDOM)]
     for each in step:
         poses.append(compose(poses[-1], each))
     path = np.array(poses)

@@ -35,7 +35,7 @@ from locatk.formats.benchmarks.timing import FIRST_SEED
 Array = NDArray[np.float64]
 Random = np.random.Generator
 
-PASSES = 12
+PASSES_PER_KIND = 12
 """Passes with each disturbance."""
 
 RATE_HZ, SPEED_MPS = 83.0, 0.12
@@ -371,11 +371,11 @@ def disturbance_figures() -> Iterator[Figure]:
         first = FIRST_SEED + 9000 + 100 * number
         outcomes = [
             solve_disturbed(simulate_disturbed(disturbance, seed))
-            for seed in range(first, first + PASSES)
+            for seed in range(first, first + PASSES_PER_KIND)
         ]
         durations += [outcome.duration_s for outcome in outcomes]
         reasons = [reason for outcome in outcomes for reason in outcome.reasons]
-        how = f"{PASSES} passes, any heading, random ids, seeds from {first}"
+        how = f"{PASSES_PER_KIND} passes, any heading, random ids, seeds from {first}"
         yield Figure(f"{name}: read", 100 * float(np.mean([o.is_right for o in outcomes])), "%",
                      how + "".join(f"; {r}" for r in reasons), 100.0, "higher")  # fmt: skip
         yield Figure(f"{name}: wrong ids", sum(o.is_wrong for o in outcomes), "passes",

@@ -36,7 +36,7 @@ from locatk.formats.benchmarks.timing import FIRST_SEED
 Array = NDArray[np.float64]
 Random = np.random.Generator
 
-RECORDINGS = 20
+RECORDINGS_PER_KIND = 20
 """Recordings of each kind."""
 
 SPEED_ERRORS = (0.03, 0.4)
@@ -56,21 +56,23 @@ DRIFT_T = 5e-6
 def given_speed_figures() -> Iterator[Figure]:
     """Return all figures of given speeds, and of arrays at rest."""
     first = FIRST_SEED + 9900
-    named = sum(is_corrected(seed) for seed in range(first, first + RECORDINGS))
+    named = sum(is_corrected(seed) for seed in range(first, first + RECORDINGS_PER_KIND))
     low, high = (100 * error for error in SPEED_ERRORS)
-    yield Figure("wrong speed: corrected and named", 100 * named / RECORDINGS, "%",
-                 f"of {RECORDINGS} passes, {low:.0f} to {high:.0f} % off",
+    yield Figure("wrong speed: corrected and named", 100 * named / RECORDINGS_PER_KIND, "%",
+                 f"of {RECORDINGS_PER_KIND} passes, {low:.0f} to {high:.0f} % off",
                  better="higher")  # fmt: skip
     first += 100
-    doubted = sum(bool(_solve_given(seed, 1.0)[1]) for seed in range(first, first + RECORDINGS))
-    yield Figure("right speed: doubted", doubted, "passes", f"of {RECORDINGS}", 0.0)
+    doubted = sum(
+        bool(_solve_given(seed, 1.0)[1]) for seed in range(first, first + RECORDINGS_PER_KIND)
+    )
+    yield Figure("right speed: doubted", doubted, "passes", f"of {RECORDINGS_PER_KIND}", 0.0)
     first += 100
     refused = sum(
         bool(solve([record_rest(seed)], DESIGNS[0], SolveOptions()).detections)
-        for seed in range(first, first + RECORDINGS)
+        for seed in range(first, first + RECORDINGS_PER_KIND)
     )
     yield Figure("array at rest: refused passes", refused, "recordings",
-                 f"of {RECORDINGS}: {', '.join(DISTURBANCES)}", 0.0)  # fmt: skip
+                 f"of {RECORDINGS_PER_KIND}: {', '.join(DISTURBANCES)}", 0.0)  # fmt: skip
 
 
 def is_corrected(seed: int) -> bool:

@@ -84,7 +84,7 @@ def quick(
         patch.setattr(landmarks_faults, "SAMPLE_RATE_HZ", 20.0)
         first = dict(list(landmarks_faults.FAULTS.items())[:1])
         patch.setattr(landmarks_faults, "FAULTS", first)
-        patch.setattr(landmarks_doubts, "DRIVES", 1)
+        patch.setattr(landmarks_doubts, "DRIVES_PER_KIND", 1)
         for kinds in ("OTHER_FLOORS", "WIRINGS"):
             only = dict(list(getattr(landmarks_doubts, kinds).items())[:1])
             patch.setattr(landmarks_doubts, kinds, only)

@@ -18,7 +18,7 @@ from locatk.core.polaris.simulation.session import SimulatedSession, SimulationO
 from locatk.core.polaris.tag import Tags, cell_positions, symbol_angles
 from locatk.formats.benchmarks import timing
 from locatk.formats.benchmarks.figures import Figure
-from locatk.formats.benchmarks.polaris import designs, given_speeds
+from locatk.formats.benchmarks.polaris import designs, disturbances, given_speeds
 from locatk.formats.benchmarks.polaris import passes as polaris_passes
 from locatk.formats.benchmarks.polaris import speed as polaris_speed
 from locatk.formats.benchmarks.polaris import suite as polaris
@@ -86,7 +86,8 @@ def rows(
             patch.setattr(module, "run_single_threaded", run_in_process)
         patch.setattr(polaris_speed, "time_call", time_once)
         patch.setattr(designs, "PASSES", dict.fromkeys(designs.PASSES, 1))
-        patch.setattr(given_speeds, "RECORDINGS", 1)
+        patch.setattr(given_speeds, "RECORDINGS_PER_KIND", 1)
+        patch.setattr(disturbances, "PASSES_PER_KIND", 1)
         # The solver solves these passes at once; on others it searches for seconds.
         patch.setattr(designs, "FIRST_SEED", designs.FIRST_SEED + 2)
         patch.setattr(polaris_passes, "HEADINGS_DEG", (30,))
