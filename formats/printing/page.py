@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import IO
 
 import numpy as np
-from reportlab.lib.colors import CMYKColor
+from reportlab.lib.colors import CMYKColorSep
 from reportlab.lib.units import mm
+from reportlab.pdfbase import pdfdoc
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core import drawing
@@ -21,8 +22,12 @@ from locatk.core.dots.drawing.layout import SheetLayout
 from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
 
-BLACK = CMYKColor(0, 0, 0, 1)
-"""Ink of all drawings: K alone, since printers halftone grey."""
+BLACK = CMYKColorSep(0, 0, 0, 1, spotName="Black")
+"""Ink of all drawings: the process ink, and plain black on devices without it.
+
+``0 0 0 1 k`` is 87.5 % grey on grey and 1-bit devices of Ghostscript, which convert it by a profile
+and halftone it; ``0 g`` removes the other inks below it. See :func:`black_ink`.
+"""
 
 MAX_PAGE_MM = 5080.0
 """Longest side that PDF viewers must support: 200 inches (ISO 32000-1 annex C)."""
@@ -74,7 +79,23 @@ def open_document(stream: IO[bytes], title: str) -> Canvas:
     canvas.setSubject("Print at 100 %, no scaling")
     canvas.setCreator(f"locatk {tool_version()}")
     canvas.setViewerPreference("PrintScaling", "None")
+    _define_black(canvas)
     return canvas
+
+
+def _define_black(canvas: Canvas) -> None:
+    """Define the colour space of :data:`BLACK`; the one of reportlab is converted to CMYK."""
+    to_grey = {"FunctionType": 2, "Domain": "[0 1]", "C0": "[1]", "C1": "[0]", "N": 1}
+    space = (
+        *map(pdfdoc.PDFName, ("Separation", BLACK.spotName, "DeviceGray")),
+        pdfdoc.PDFDictionary(to_grey),
+    )
+    canvas._doc.Reference(pdfdoc.PDFArrayCompact(space), BLACK.spotName)
+
+
+def black_ink(canvas: Canvas) -> pdfdoc.PDFObjectReference:
+    """Return the colour space of :data:`BLACK` in this document."""
+    return pdfdoc.PDFObjectReference(BLACK.spotName)
 
 
 def start_page(
