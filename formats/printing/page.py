@@ -32,6 +32,9 @@ and halftone it; ``0 g`` removes the other inks below it. See :func:`black_ink`.
 MAX_PAGE_MM = 5080.0
 """Longest side that PDF viewers must support: 200 inches (ISO 32000-1 annex C)."""
 
+PAGE_STEP_POINTS = 1e-4
+"""Resolution of the size of a page; single precision has 1e-3 points for the largest pages."""
+
 CLEARANCE_MM = 1.0
 STRIP_MM = 5.0
 """Depth of the strip around the pattern that contains rulers, marks and captions."""
@@ -123,19 +126,19 @@ def start_page(
     canvas.setLineWidth(drawing.LINE_WIDTH_MM * mm)
 
 
-def _points(side_mm: float) -> float:
-    """Return the points of a side in the seven digits that reportlab writes, rounded down.
+def _points(side_mm: float) -> str:
+    """Return the points of a side, rounded down, as digits that reportlab writes unchanged.
 
     Some rasterizers round the number of pixels of a page up. With single precision, or a scale of
-    300/72, 595.2 points (or even 792) become one pixel more than 2480 (3300) of 1/300 in, and the
-    page is stretched over them.
+    300/72, 595.2 or 84.96 points (or even 792) become one pixel more than 2480 (354, 3300) of
+    1/300 in, and the page is stretched over them. A page in seven digits, as reportlab writes
+    numbers, would end up to 0.01 points too early, which is 0.17 px at 1200 dpi.
     """
     side = round(side_mm * mm, 6)
-    unit = 10.0 ** (math.floor(math.log10(side)) - 6)
-    steps = round(side / unit)
-    while float(np.float32(steps * unit)) >= side:
+    steps = math.ceil(side / PAGE_STEP_POINTS) - 1
+    while float(np.float32(steps * PAGE_STEP_POINTS)) >= side:
         steps -= 1
-    return steps * unit
+    return f"{steps * PAGE_STEP_POINTS:.4f}"
 
 
 def ruler(

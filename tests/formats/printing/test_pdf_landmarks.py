@@ -57,7 +57,7 @@ def ink(data: bytes, number: int = 0, dpi: float = DPI) -> Places:
     """How dark each pixel is, 0 to 1, row 0 at the top."""
     sheet = pypdfium2.PdfDocument(data)[number]
     grey = sheet.render(scale=dpi / 72, grayscale=True).to_numpy().squeeze()
-    return (255.0 - grey) / (255 - 32)
+    return (255.0 - grey) / 255
 
 
 def at(dark: Places, x: Places, y: Places) -> Places:

@@ -88,7 +88,7 @@ def ink(pages: tuple[Page, ...], number: int = 0, dpi: float = DPI) -> Places:
     """How dark each pixel is, 0 to 1, row 0 at the top."""
     sheet = pypdfium2.PdfDocument(render_pages(pages, "test"))[number]
     grey = sheet.render(scale=dpi / 72, grayscale=True).to_numpy().squeeze()
-    return (255.0 - grey) / (255 - 32)
+    return (255.0 - grey) / 255
 
 
 def find_circles(dark: Places, diameter_mm: float, dpi: float = DPI) -> Places:
