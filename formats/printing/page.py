@@ -35,6 +35,12 @@ MAX_PAGE_MM = 5080.0
 PAGE_STEP_POINTS = 1e-4
 """Resolution of the size of a page; single precision has 1e-3 points for the largest pages."""
 
+MIN_LINE_WIDTH_MM = 0.12
+"""Smallest width of a printed line: the diagonal of a pixel of 300 dpi (0.1197 mm).
+
+A thinner line has gaps without anti-aliasing, since it passes between the centres of pixels.
+"""
+
 CLEARANCE_MM = 1.0
 STRIP_MM = 5.0
 """Depth of the strip around the pattern that contains rulers, marks and captions."""
@@ -155,7 +161,7 @@ def draw(canvas: Canvas, marks: Iterable[drawing.Mark]) -> None:
         if isinstance(mark, drawing.Text):
             _write(canvas, mark)
         else:
-            canvas.setLineWidth(mark.width_mm * mm)
+            canvas.setLineWidth(max(mark.width_mm, MIN_LINE_WIDTH_MM) * mm)
             _stroke(canvas, mark)
         canvas.restoreState()
 

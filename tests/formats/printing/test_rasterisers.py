@@ -23,14 +23,15 @@ from locatk.core.dots.drawing.tiles import tiling
 from locatk.core.dots.sheet import Manifest
 from locatk.core.drawing import Circle, Line, Page
 from locatk.core.landmarks.drawing.pack import draw_installation_pack
-from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.paper_sizes import paper_size
+from locatk.core.landmarks.drawing.true_size import draw_floor
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
+from locatk.core.paper_sizes import paper_size, parse_paper
 from locatk.core.polaris.drawing.cards import draw_tag_cards
 from locatk.core.polaris.tag import TagLayout, Tags, free_cells
 from locatk.formats.benchmarks.dots.rasterised_sheets import overlaid_sheets
 from locatk.formats.benchmarks.dots.rasterisers import RASTERISERS, Rasteriser, rasterise_inks
 from locatk.formats.printing import overlay, pattern, rasters
-from locatk.formats.printing.drawings import render_pages
+from locatk.formats.printing.drawings import render_floor, render_pages
 from locatk.formats.printing.page import CLEARANCE_MM
 
 SLOW = ("pdf.js", "Ghostscript tiffsep")
@@ -194,6 +195,13 @@ def profile(ink: Places, place: Places, across: Places, half_px: float = 4.0) ->
     ]
 
 
+def some_layout(tags: Tags) -> TagLayout:
+    last = tags.order - 1
+    cells = [(0, 0), (0, last), (last, last), *free_cells(tags.order)[: tags.magnets - 3]]
+    cells.sort(key=lambda cell: (cell[1], cell[0]))
+    return TagLayout(tuple(cells), tuple(k % tags.orientations for k in range(len(cells))))
+
+
 def assert_drawn(page: Grey, drawing: Page, dpi: int) -> int:
     """All long lines and circles are there, whole, and in the right places; return how many."""
     ink = (255.0 - page) / 255
@@ -240,11 +248,7 @@ def test_templates_are_whole_and_at_true_size(
     """Outlines, arrows and each tick of the rulers, at 300 dpi, also in black and white."""
     if kind == "tag":
         tags = Tags()
-        cells = ((0, 0), (0, tags.order - 1), (tags.order - 1,) * 2)
-        cells += tuple(free_cells(tags.order)[: tags.magnets - 3])
-        cells = tuple(sorted(cells, key=lambda cell: (cell[1], cell[0])))
-        layout = TagLayout(cells, tuple(k % tags.orientations for k in range(len(cells))))
-        drawing = draw_tag_cards(tags, [(7, layout)], (210, 297)).pages[0]
+        drawing = draw_tag_cards(tags, [(7, some_layout(tags))], (210, 297)).pages[0]
     else:
         floor = FloorMap(np.full((2, 2), 5), name="hall")
         drawing = draw_installation_pack(floor, (210, 297), parts=("templates",)).pages[0]
@@ -265,3 +269,26 @@ def test_a_ruler_of_a_sheet_is_100_mm(rasteriser: Rasteriser, tmp_path: Path) ->
     length, _ = max(runs)
     # From the outer edge of the first tick to that of the last, of 0.15 mm each.
     assert length / 300 * 25.4 == pytest.approx(100, abs=0.3)
+
+
+def test_no_line_is_thinner_than_a_pixel_is_wide() -> None:
+    """At 300 dpi, in any direction: 1.41 px. Also on a plan of many small cells."""
+    wide = FloorMap(np.arange(6000).reshape(60, 100) % 16, name="hall")
+    wide.codes[5, 5] = HOLE_CODE
+    walled = replace(wide, walls=frozenset({((0, 0), (0, 1))}))
+    small = replace(wide, codes=wide.codes[:6, :6])
+    tags = Tags()
+    drawings = [
+        *draw_tag_cards(tags, [(7, some_layout(tags))], (210, 297)).pages,
+        *draw_installation_pack(walled, (210, 297)).pages,
+        *draw_installation_pack(small, (210, 297)).pages,
+    ]
+    floor = draw_floor(small, parse_paper("A3"))
+    widths = []
+    for data in (render_pages(drawings, "t"), render_floor(floor, "t")):
+        with pikepdf.open(io.BytesIO(data)) as pdf:
+            for page in pdf.pages:
+                for operands, operator in pikepdf.parse_content_stream(page):
+                    if str(operator) == "w":
+                        widths.append(float(operands[0]) / 72 * 300)
+    assert min(widths) >= math.sqrt(2)
