@@ -101,12 +101,13 @@ def draw(
     strip_black: bool = False,
     done: Callable[[], object] = lambda: None,
 ) -> DrawnSheets:
-    """Draw sheets as ``"pdf"``, one file with a page a sheet, or ``"png"`` or ``"txt"``.
+    """Draw sheets as ``"pdf"``, one file with a page a sheet, or as one file for each.
 
     Parameters
     ----------
     manifest : Manifest
     format_name : str
+        ``"pdf"`` or one of :data:`locatk.formats.printing.rasters.WRITERS`.
     marks, crop : bool
         Of PDFs; see :func:`locatk.formats.printing.pattern.render`.
     document : path, optional
@@ -124,7 +125,7 @@ def draw(
         The document cannot be read.
     """
     if format_name != "pdf":
-        write = rasters.write_png if format_name == "png" else rasters.write_text
+        write = rasters.WRITERS[format_name]
         numbers = range(len(manifest.sheets))
         return DrawnSheets(
             [partial(write, manifest=manifest, number=n, done=done) for n in numbers]
