@@ -156,7 +156,8 @@ class PairType(click.ParamType):
     "Document below the dots",
     options.input_option(
         "--overlay",
-        help="Print over each page of this PDF document, whose pages determine the size.",
+        help="Print over each page of this PDF document, whose pages determine the size. Black "
+        "and grey of the document hide dots and are reported.",
     ),
     click.option(
         "--strip-black",
@@ -310,6 +311,8 @@ def pattern(
         )
     if as_json:
         console.emit_json(_entry(files, manifest_file, ledger_file, manifest))
+    if drawn.warning:
+        console.warn(drawn.warning)
     for loss in drawn.losses[1:]:
         console.warn(loss)
     if drawn.losses:

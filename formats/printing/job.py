@@ -33,10 +33,13 @@ class DrawnSheets:
         One for each file; it writes the content to a stream.
     losses : tuple of str
         Parts of a document below the dots that could not be kept or recoloured.
+    warning : str or None
+        Property of that document that makes the dots hard to read.
     """
 
     writers: Sequence[Writer]
     losses: tuple[str, ...] = ()
+    warning: str | None = None
 
 
 def paper_layouts(
@@ -147,7 +150,14 @@ def draw(
         losses.append(f"{document} keeps black in {kept}")
     if merged.dropped:
         losses.append(f"{document} has comments that cannot be drawn: {merged.dropped} left out")
-    return DrawnSheets([lambda stream: stream.write(merged.data)], tuple(losses))
+    warning = None
+    if merged.black_pages:
+        count = f"{merged.black_pages} of {merged.pages} page{'s' * (merged.pages > 1)}"
+        warning = (
+            f"{document} has black or grey on {count}, which hides the dots from cameras. "
+            "Hint: Print it in the other inks with --strip-black"
+        )
+    return DrawnSheets([lambda stream: stream.write(merged.data)], tuple(losses), warning)
 
 
 def publish(
