@@ -226,6 +226,14 @@ def test_overlay(locatk, tmp_path: Path) -> None:
     assert page_sizes(out) == [pytest.approx((148.17, 209.9), abs=0.05)] * 2
     first, second = json.loads(result.stdout)["sheets"]
     assert second["origin"][0] >= first["origin"][0] + first["size"][0]
+    assert "black" not in result.stderr
+    # Black that remains is reported, and nothing else changes.
+    plain = locatk("print", "pattern", "-o", tmp_path / "plain.pdf", "--overlay", source, "--json")
+    assert plain.exit_code == 0
+    assert json.loads(plain.stdout)["outputs"] == [str(tmp_path / "plain.pdf")]
+    (warning,) = [line for line in plain.stderr.splitlines() if line.startswith("Warning:")]
+    assert "drawing.pdf has black or grey on 2 of 2 pages" in warning
+    assert "--strip-black" in warning
     # Never over the document itself.
     same = locatk("print", "pattern", "-o", source, "--overlay", source, "--overwrite")
     assert same.exit_code == 1
