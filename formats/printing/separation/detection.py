@@ -7,6 +7,7 @@ a printer prints with black ink; it does not find out if something else covers t
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -118,7 +119,10 @@ class _Walk:
 
     def is_black(self, stream: Stream) -> bool:
         """Return True at the first black operator."""
-        instructions: Any = pikepdf.parse_content_stream(stream)
+        with warnings.catch_warnings():
+            # Content that ends early is drawn up to there.
+            warnings.simplefilter("ignore", UserWarning)
+            instructions: Any = pikepdf.parse_content_stream(stream)
         return any(self._paints_black(str(item.operator), item.operands) for item in instructions)
 
     def _paints_black(self, operator: str, operands: Any) -> bool:

@@ -7,7 +7,6 @@ import shutil
 import zlib
 from pathlib import Path
 
-import numpy as np
 import pikepdf
 import pytest
 from pikepdf import Array, Dictionary, Name, Pdf
@@ -174,6 +173,9 @@ def test_pages_are_counted(tmp_path: Path) -> None:
     assert overlay(source, stamp(5), strip_black=True).black_pages == 0
 
 
+@pytest.mark.filterwarnings("error")
 def test_damaged_content_is_no_error(tmp_path: Path) -> None:
-    source = document(tmp_path / "in.pdf", ["cs scn /None Do 1 0 0 rg /C 0 0 50 50 re f ((("])
-    assert np.isin(overlay(source, stamp(1), strip_black=False).black_pages, [0, 1])
+    """Viewers draw what comes before the damage, and so does the search."""
+    contents = ["0 0 9 9 re f (((", "1 0 0 rg 0 0 9 9 re f (((", "cs scn /None Do /F Tf BT"]
+    source = document(tmp_path / "in.pdf", contents)
+    assert overlay(source, stamp(3), strip_black=False).black_pages == 1

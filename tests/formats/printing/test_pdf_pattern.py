@@ -161,7 +161,7 @@ def corners(layout: SheetLayout, side: int) -> Iterator[tuple[int, int, int, int
 
 def test_papers_are_whole_numbers_of_pixels() -> None:
     """Also for a rasteriser that rounds up; 792 * (600 / 72) is more than 6600 in floats."""
-    for size in ("A5", "A4", "A3", "A2", "A1", "A0", "Letter", "Tabloid", "914x3000"):
+    for size in ("A5", "A4", "A3", "A2", "A1", "A0", "Letter", "Tabloid", "914x3000", "30x5080"):
         layout = lay_out(paper_size(size)[1], 10, snap(1.0, None, 300))
         made = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
         small = replace(made, sheets=(replace(made.sheets[0], size=(8, 8)),))
