@@ -166,9 +166,7 @@ class _Walk:
     def _shows_black(self) -> bool:
         fill = self._black[0] and self._text_mode in FILLED_TEXT
         stroke = self._black[1] and self._text_mode in STROKED_TEXT
-        return self._text_mode not in (3, 7) and self._finder.font(
-            self._font, self._resources, (fill, stroke)
-        )
+        return self._finder.font(self._font, self._resources, (fill, stroke))
 
     def _resource(self, kind: str, name: Any) -> Any:
         return self._resources.get(kind, Dictionary()).get(str(name))
