@@ -19,7 +19,7 @@ from pikepdf import Array, Dictionary, Name, Pdf, Stream
 
 from locatk.core.drawing import MM_PER_POINT
 from locatk.core.errors import FormatError, InputError
-from locatk.formats.files import read_bytes
+from locatk.formats.files import read_head
 from locatk.formats.printing.separation.content import DAMAGE_ERRORS, BlackRemover
 
 SIZE_TOLERANCE_MM = 0.1
@@ -270,7 +270,7 @@ def _plain(value: float) -> float | int:
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
     """Open a document; errors while it is processed are reported as damage, too."""
-    if b"%PDF-" not in read_bytes(path, 1024):
+    if b"%PDF-" not in read_head(path, 1024):
         raise FormatError("not a PDF", file=path, hint="Save the document as PDF")
     try:
         # A repair may lose pages without a message.

@@ -302,7 +302,7 @@ def test_other_encodings_and_missing_files(tmp_path: Path) -> None:
     assert caught.value.where == 3
     with pytest.raises(FileNotFoundError):
         read_tum(tmp_path / "none.tum")
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FormatError, match="a folder"):
         read_csv(tmp_path)
 
 
