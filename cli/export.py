@@ -111,7 +111,7 @@ def command(
     if lost == poses:
         raise InputError(f"none of the {poses} poses is a number", file=solution)
     if output == STDOUT:
-        click.echo(render(tracks, format_name), nl=False)
+        console.emit_file(render(tracks, format_name))
         check_loss(lost)
         return
 

@@ -16,7 +16,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from locatk.cli import options
+from locatk.cli import console, options
 from locatk.cli.command import Command, combine
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
@@ -88,7 +88,7 @@ class SimulationCommand(Command):
         file, is_printed = others.pop(CONFIG_FILE), others.pop(PRINT_CONFIG)
         settings = self._config.merge(self._config.read(file) if file else {}, flags)
         if is_printed:
-            click.echo(self._config.dumps(settings), nl=False)
+            console.write_result(self._config.dumps(settings))
             return None
         input_files = [*self._config.files(settings), *([file] if file else [])]
         ctx.params = {**others, "settings": settings, "input_files": input_files}

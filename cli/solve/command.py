@@ -371,7 +371,7 @@ class _BatchProgress:
         if self._is_shown:
             full = BAR_CHARACTERS * done // self._total
             bar = "#" * full + "-" * (BAR_CHARACTERS - full)
-            click.echo(f"\rSolving  [{bar}]  {done}/{self._total}", err=True, nl=False)
+            console.control(f"\rSolving  [{bar}]  {done}/{self._total}")
 
     def erase(self) -> None:
         """Erase the bar."""

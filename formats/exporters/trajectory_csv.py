@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.errors import InputError
+from locatk.core.printable import spreadsheet_text
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.trajectory_csv import COLUMNS, SIGMA_AXES
 from locatk.formats.output import atomic_write
@@ -42,7 +43,7 @@ def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool
 
 
 def _csv_lines(trajectory: Trajectory) -> Iterator[str]:
-    device = trajectory.device
+    device = spreadsheet_text(trajectory.device)
     # The csv module of Python 3.11 leaves a carriage return unquoted and reads it as a line end.
     if any(character in device for character in ',"\r\n'):
         device = '"' + device.replace('"', '""') + '"'

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.printable import text_of_spreadsheet
 from locatk.core.trajectory import Trajectory
 from locatk.formats.tables.delimited import Table, read_table
 
@@ -90,15 +91,15 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     time_ns = table.epoch_times_ns("time_s")
 
     trajectories = []
-    devices = np.array(table.columns["device"], object)
-    for device in dict.fromkeys(table.columns["device"]):
-        rows = np.flatnonzero(devices == device)
+    cells = np.array(table.columns["device"], object)
+    for cell in dict.fromkeys(table.columns["device"]):
+        rows = np.flatnonzero(cells == cell)
         check_ascending(table, time_ns, rows)
         covariance = _diagonal_covariance(sigma[rows])
         is_known = np.isfinite(probability[rows]).any()
         trajectories.append(
             Trajectory(
-                device,
+                text_of_spreadsheet(cell),
                 frame,
                 time_ns[rows],
                 position[rows],
