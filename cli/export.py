@@ -66,7 +66,8 @@ def command(
     For crazyflie-config it may also be a scene (scene.toml).
 
     \b
-    tum      time and pose, one file per device, for evo and others
+    tum      time and pose, one file per device, for evo and others; an
+             unknown orientation is 0 0 0 1
     kitti    3 x 4 matrices, one file per device; times in a second file
     csv      time_s, device, x_m, y_m, z_m, qx, qy, qz, qw, sigma_x_m,
              sigma_y_m, sigma_z_m, sigma_heading_rad, probability; unknown
@@ -112,6 +113,7 @@ def command(
         raise InputError(f"none of the {poses} poses is a number", file=solution)
     if output == STDOUT:
         click.echo(render(tracks, format_name), nl=False)
+        warn_of_orientations(tracks, format_name)
         check_loss(lost)
         return
 
@@ -127,6 +129,7 @@ def command(
     if format_name == "kitti":
         name = planned[0].times if len(planned) == 1 else f"{output}/*.times.txt"
         console.say(f"KITTI files have no times: the times are in {name}")
+    warn_of_orientations(tracks, format_name)
     if format_name == "ros2" and output.suffix != ".mcap":
         console.warn(f"{output} does not end in .mcap, which ros2 bag and evo require")
     if as_json:
@@ -179,6 +182,18 @@ def check_loss(lost: int) -> None:
     if lost:
         poses = "1 pose that is not a number" if lost == 1 else f"{lost} poses that are not numbers"
         raise failures.Incomplete(f"left out {poses}")
+
+
+def warn_of_orientations(tracks: list[Trajectory], format_name: str) -> None:
+    """Warn about unknown orientations that a format cannot represent."""
+    from locatk.core.trajectory import has_orientation
+
+    devices = [track.device for track in tracks if not has_orientation(track).all()]
+    if devices and format_name in ("tum", "kitti", "ros2"):
+        console.warn(
+            f"the orientation of {', '.join(devices)} is unknown; {format_name} has no value for "
+            "it, so that the identity was written"
+        )
 
 
 def select_devices(
