@@ -21,6 +21,16 @@ FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
 CONFIG = "crazyflie-config"
 """Format of Lighthouse stations."""
 
+ENDINGS = {
+    "tum": (".tum", ".txt"),
+    "kitti": (".kitti", ".txt"),
+    "csv": (".csv",),
+    "parquet": (".parquet", ".pq"),
+    "ros2": (".mcap",),
+    CONFIG: (".yaml", ".yml"),
+}
+"""Endings of the names of each format."""
+
 STDOUT = Path("-")
 
 
@@ -100,6 +110,7 @@ def command(
         option = "--json" if as_json else f"--format {format_name}"
         raise click.UsageError(f"{option} cannot be combined with -o -, which is for csv and tum.")
     if format_name == CONFIG:
+        options.check_ending(output, ENDINGS[CONFIG])
         if devices:
             raise click.UsageError(f"--device is for poses; {CONFIG} contains stations.")
         export_stations(solution, output, overwrite=overwrite, as_json=as_json)
@@ -122,6 +133,8 @@ def command(
         options.make_folder(output)
     for path in (path for part in planned for path in part.files):
         options.guard_output(path, overwrite=overwrite, inputs=[solution])
+    if planned[0].path == output:
+        options.check_ending(output, ENDINGS[format_name])
     facts = exports.read_origin(solution)
     for part in planned:
         exports.write(part, format_name, facts=facts, covariance=covariance, overwrite=overwrite)
@@ -130,7 +143,7 @@ def command(
         name = planned[0].times if len(planned) == 1 else f"{output}/*.times.txt"
         console.say(f"KITTI files have no times: the times are in {name}")
     warn_of_orientations(tracks, format_name)
-    if format_name == "ros2" and output.suffix != ".mcap":
+    if format_name == "ros2" and not output.suffix:
         console.warn(f"{output} does not end in .mcap, which ros2 bag and evo require")
     if as_json:
         files = [
