@@ -50,7 +50,7 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
         help="Device at the port: locatk, polaris-array, magx-array, lighthouse-deck, "
         "dotbot-gateway, lines, raw; auto identifies it from the first seconds.",
     ),
-    options.output("Session to write (.mcap).", required=False),
+    options.output("Session to write (.mcap).", required=False, endings=(".mcap",)),
     options.overwrite,
     click.option("--baud", type=click.IntRange(min=1), help="[default: that of the device]"),
     columns_option,

@@ -120,13 +120,8 @@ def simulation_command(module: str) -> Callable[[Callable[..., None]], click.Com
     """Make a function the command whose settings are the ``CONFIG`` of a module."""
     return combine(
         click.command("", cls=SimulationCommand, module=module),
-        click.option(
-            "-o",
-            "--output",
-            cls=_Option,
-            type=options.PATH,
-            required=True,
-            help="Session to write (.mcap), with the truth in it.",
+        options.output(
+            "Session to write (.mcap), with the truth in it.", endings=(".mcap",), cls=_Option
         ),
         options.input_option(
             "--config",

@@ -164,6 +164,7 @@ def _lighthouse_reasons() -> dict[str, Reason]:
         "repeated_in_rotation": "The same plane was reported twice in one rotation.",
         "spike": "A single angle deviates from a smooth sequence by more than "
         f"{math.degrees(epochs.SPIKE_RAD):g} degrees.",
+        "sweep_of_doubled_channel": "More than one station sends on the channel.",
         "station_not_in_scene": "The station is not in the given scene.",
         "station_not_solved": "The station has too few positions in common with the others to be "
         "located.",
