@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import IO
 
 import numpy as np
-from reportlab.lib.colors import CMYKColor
+from reportlab.lib.colors import CMYKColorSep
 from reportlab.lib.units import mm
+from reportlab.pdfbase import pdfdoc
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core import drawing
@@ -21,11 +22,24 @@ from locatk.core.dots.drawing.layout import SheetLayout
 from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
 
-BLACK = CMYKColor(0, 0, 0, 1)
-"""Ink of all drawings: K alone, since printers halftone grey."""
+BLACK = CMYKColorSep(0, 0, 0, 1, spotName="Black")
+"""Ink of all drawings: the process ink, and plain black on devices without it.
+
+``0 0 0 1 k`` is 87.5 % grey on grey and 1-bit devices of Ghostscript, which convert it by a profile
+and halftone it; ``0 g`` removes the other inks below it. See :func:`black_ink`.
+"""
 
 MAX_PAGE_MM = 5080.0
 """Longest side that PDF viewers must support: 200 inches (ISO 32000-1 annex C)."""
+
+PAGE_STEP_POINTS = 1e-4
+"""Resolution of the size of a page; single precision has 1e-3 points for the largest pages."""
+
+MIN_LINE_WIDTH_MM = 0.12
+"""Smallest width of a printed line: the diagonal of a pixel of 300 dpi (0.1197 mm).
+
+A thinner line has gaps without anti-aliasing, since it passes between the centres of pixels.
+"""
 
 CLEARANCE_MM = 1.0
 STRIP_MM = 5.0
@@ -74,7 +88,23 @@ def open_document(stream: IO[bytes], title: str) -> Canvas:
     canvas.setSubject("Print at 100 %, no scaling")
     canvas.setCreator(f"locatk {tool_version()}")
     canvas.setViewerPreference("PrintScaling", "None")
+    _define_black(canvas)
     return canvas
+
+
+def _define_black(canvas: Canvas) -> None:
+    """Define the colour space of :data:`BLACK`; the one of reportlab is converted to CMYK."""
+    to_grey = {"FunctionType": 2, "Domain": "[0 1]", "C0": "[1]", "C1": "[0]", "N": 1}
+    space = (
+        *map(pdfdoc.PDFName, ("Separation", BLACK.spotName, "DeviceGray")),
+        pdfdoc.PDFDictionary(to_grey),
+    )
+    canvas._doc.Reference(pdfdoc.PDFArrayCompact(space), BLACK.spotName)
+
+
+def black_ink(canvas: Canvas) -> pdfdoc.PDFObjectReference:
+    """Return the colour space of :data:`BLACK` in this document."""
+    return pdfdoc.PDFObjectReference(BLACK.spotName)
 
 
 def start_page(
@@ -102,19 +132,19 @@ def start_page(
     canvas.setLineWidth(drawing.LINE_WIDTH_MM * mm)
 
 
-def _points(side_mm: float) -> float:
-    """Return the points of a side in the seven digits that reportlab writes, rounded down.
+def _points(side_mm: float) -> str:
+    """Return the points of a side, rounded down, as digits that reportlab writes unchanged.
 
     Some rasterizers round the number of pixels of a page up. With single precision, or a scale of
-    300/72, 595.2 points (or even 792) become one pixel more than 2480 (3300) of 1/300 in, and the
-    page is stretched over them.
+    300/72, 595.2 or 84.96 points (or even 792) become one pixel more than 2480 (354, 3300) of
+    1/300 in, and the page is stretched over them. A page in seven digits, as reportlab writes
+    numbers, would end up to 0.01 points too early, which is 0.17 px at 1200 dpi.
     """
     side = round(side_mm * mm, 6)
-    unit = 10.0 ** (math.floor(math.log10(side)) - 6)
-    steps = round(side / unit)
-    while float(np.float32(steps * unit)) >= side:
+    steps = math.ceil(side / PAGE_STEP_POINTS) - 1
+    while float(np.float32(steps * PAGE_STEP_POINTS)) >= side:
         steps -= 1
-    return steps * unit
+    return f"{steps * PAGE_STEP_POINTS:.4f}"
 
 
 def ruler(
@@ -131,7 +161,7 @@ def draw(canvas: Canvas, marks: Iterable[drawing.Mark]) -> None:
         if isinstance(mark, drawing.Text):
             _write(canvas, mark)
         else:
-            canvas.setLineWidth(mark.width_mm * mm)
+            canvas.setLineWidth(max(mark.width_mm, MIN_LINE_WIDTH_MM) * mm)
             _stroke(canvas, mark)
         canvas.restoreState()
 
