@@ -52,6 +52,8 @@ def finish_with_warnings(warnings: Sequence[str]) -> None:
 
 def report(error: BaseException) -> int:
     """Print ``error`` as one line on stderr and return its exit status."""
+    if isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError):
+        error = error.__cause__  # click takes it for Ctrl-D; no command reads from the terminal
     if isinstance(error, click.Abort):
         console.message("Aborted")
         return INTERRUPTED_STATUS

@@ -399,6 +399,20 @@ def test_terminals_get_no_control_characters(
     assert printed.replace("\n", "").isprintable()
 
 
+def test_the_end_of_a_stream_is_not_an_interrupt(
+    locatk: Run, monkeypatch: pytest.MonkeyPatch, session: Path
+) -> None:
+    """click takes EOFError for Ctrl-D."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise EOFError("pickle cut short")
+
+    monkeypatch.setattr("locatk.formats.sessions.reader.Session.open", fail)
+    result = locatk("info", session)
+    assert result.exit_code == 1
+    assert "internal error, EOFError: pickle cut short" in result.stderr
+
+
 def test_a_warning_or_cell_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     console.warn("run\nError: fake.mcap")
     console.result(console.table(["device"], [["red\n-----"], ["green"]]))

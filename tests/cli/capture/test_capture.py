@@ -320,6 +320,8 @@ def unopened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         (["/dev/x", "-o", "OUT", "--rotate", "1us"], ""),
         (["/dev/x", "-o", "OUT", "--rotate", "1B"], "too small"),
         (["/dev/x", "-o", "OUT", "--silence", "0"], "is not a time"),
+        (["/dev/x", "-o", "OUT", "--max-size", "0"], "is not a size"),
+        (["/dev/x", "-o", "OUT", "--reserve", "none"], "is not a size; examples: 0, 500MB"),
         (["/dev/x", "-o", "OUT", "--columns", "a,,b"], "distinct names"),
         (["/dev/x", "-o", "OUT", "--columns", "a,a"], "distinct names"),
         (["/dev/x", "-o", "OUT", "--baud", "0"], ""),
