@@ -7,6 +7,7 @@ import os
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
@@ -97,3 +98,32 @@ def raw_bytes() -> Callable[..., bytes]:
         return bytes(content)
 
     return join
+
+
+@pytest.fixture
+def assert_one_ink() -> Callable[[Any], None]:
+    """``assert_one_ink(page)``: its content, or that of a form, is in full black ink alone.
+
+    That is the ink of this name on devices with inks, and plain black on all others.
+    """
+
+    import pikepdf
+
+    other_colours = {"g", "G", "rg", "RG", "k", "K", "sc", "SC"}
+    painting = {"Tj", "'", "f", "S", "B", "b", "Do"}
+
+    def check(holder: Any) -> None:
+        (space,) = holder.Resources.ColorSpace.values()
+        assert list(map(str, space[:3])) == ["/Separation", "/Black", "/DeviceGray"]
+        assert (list(space[3].C0), list(space[3].C1)) == ([1], [0])
+        drawn = [(str(op), operands) for operands, op in pikepdf.parse_content_stream(holder)]
+        names = [name for name, _ in drawn]
+        assert not other_colours & set(names)
+        tints = [operands for name, operands in drawn if name in ("scn", "SCN")]
+        assert all([float(value) for value in operands] == [1] for operands in tints)
+        # The ink is selected before anything is painted.
+        first = next(number for number, name in enumerate(names) if name in painting)
+        assert names.index("scn") < first
+        assert "S" not in names or names.index("SCN") < first
+
+    return check

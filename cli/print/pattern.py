@@ -10,9 +10,15 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
+from locatk.cli.print.endings import format_of
 
 CODECS = ("anoto", "libdots", "microdots")
-FORMATS = ("pdf", "png", "txt")
+FORMATS = ("pdf", "png", "tiff", "pbm", "txt")
+
+SVG_HINT = (
+    "Dots are pixels of the printer, which programs for vectors do not keep; "
+    "use .pdf, or .png, .tiff or .pbm for pixels."
+)
 
 MAX_FILES = 200
 """Largest number of files of a run, all of which are open until the last one is complete."""
@@ -53,9 +59,9 @@ class PairType(click.ParamType):
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="`png`: image of 1 bit per pixel at the printer's resolution. `txt`: a letter u, "
-    "d, l or r for each dot. Both write one file per sheet, named by its id.  "
-    "[default: by the ending of the output, else pdf]",
+    help="`png`, `tiff`, `pbm`: image of 1 bit per pixel at the printer's resolution, without "
+    "margin texts. `txt`: a letter u, d, l or r for each dot. These write one file per sheet, "
+    "named by its id.  [default: by the ending of the output]",
 )
 @options.overwrite
 @options.as_json
@@ -150,7 +156,8 @@ class PairType(click.ParamType):
     "Document below the dots",
     options.input_option(
         "--overlay",
-        help="Print over each page of this PDF document, whose pages determine the size.",
+        help="Print over each page of this PDF document, whose pages determine the size. Black "
+        "and grey of the document hide dots and are reported.",
     ),
     click.option(
         "--strip-black",
@@ -231,6 +238,7 @@ def pattern(
       locatk print pattern -o floor.pdf --size A3 --tiles 3x2 --overlap 15
       locatk print pattern -o map.pdf --overlay drawing.pdf --strip-black
       locatk print pattern -o sheet.png --origin 1330,7200 --section 24,32
+      locatk print pattern -o sheet.tiff --size A3 --dpi 1200
     """
     from locatk.core.dots.design.ledger import plan
     from locatk.core.dots.drawing import layout
@@ -238,7 +246,7 @@ def pattern(
     from locatk.formats.artifacts.ledger import LEDGER_FILE, open_ledger
     from locatk.formats.printing import job
 
-    format_name = format_name or _ending(output)
+    format_name = format_of(output, FORMATS, format_name, {".svg": SVG_HINT})
     _check_combinations(
         format_name, size, landscape, count, tiles, overlay, strip_black, crop_marks
     )
@@ -303,15 +311,12 @@ def pattern(
         )
     if as_json:
         console.emit_json(_entry(files, manifest_file, ledger_file, manifest))
+    if drawn.warning:
+        console.warn(drawn.warning)
     for loss in drawn.losses[1:]:
         console.warn(loss)
     if drawn.losses:
         raise failures.Incomplete(drawn.losses[0])
-
-
-def _ending(output: Path) -> str:
-    ending = output.suffix.lower().removeprefix(".")
-    return ending if ending in FORMATS else "pdf"
 
 
 def _check_combinations(

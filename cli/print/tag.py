@@ -11,6 +11,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command
+from locatk.cli.print.endings import format_of
 
 FORMATS = ("pdf", "svg")
 
@@ -22,8 +23,7 @@ FORMATS = ("pdf", "svg")
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="`svg` writes one numbered file per page.  [default: by the ending of the "
-    "output, else pdf]",
+    help="`svg` writes one numbered file per page.  [default: by the ending of the output]",
 )
 @click.option(
     "--id",
@@ -86,7 +86,7 @@ def tag(
     from locatk.core.polaris.drawing.cards import draw_tag_cards
     from locatk.formats.artifacts.tags import read_tags
 
-    format_name = format_name or _ending(output)
+    format_name = format_of(output, FORMATS, format_name)
     tags = read_tags(tag_file)
     _, paper_mm = paper_size(size)
     drawn = draw_tag_cards(
@@ -104,11 +104,6 @@ def tag(
     console.say("Print at 100 %, without scaling to fit, and measure the rulers.")
     if as_json:
         console.emit_json(_entry(files, drawn))
-
-
-def _ending(output: Path) -> str:
-    ending = output.suffix.lower().removeprefix(".")
-    return ending if ending in FORMATS else "pdf"
 
 
 def _layouts(tag_file: Path, tags: Any, ids: tuple[int, ...]) -> list[tuple[int, Any]]:

@@ -8,6 +8,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command
+from locatk.cli.print.endings import format_of
 
 
 @click.command(cls=Command, short_help="Draw a test sheet for choosing dots.")
@@ -51,6 +52,7 @@ def testsheet(
     from locatk.formats.output import atomic_write
     from locatk.formats.printing.pattern import render_test_sheet
 
+    format_of(output, ("pdf",))
     options.guard_output(output, overwrite=overwrite)
     sheet = printer_sheet(size, int(dpi), codec)
     with atomic_write(output, overwrite=overwrite) as stream:

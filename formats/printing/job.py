@@ -33,10 +33,13 @@ class DrawnSheets:
         One for each file; it writes the content to a stream.
     losses : tuple of str
         Parts of a document below the dots that could not be kept or recoloured.
+    warning : str or None
+        Property of that document that makes the dots hard to read.
     """
 
     writers: Sequence[Writer]
     losses: tuple[str, ...] = ()
+    warning: str | None = None
 
 
 def paper_layouts(
@@ -101,12 +104,13 @@ def draw(
     strip_black: bool = False,
     done: Callable[[], object] = lambda: None,
 ) -> DrawnSheets:
-    """Draw sheets as ``"pdf"``, one file with a page a sheet, or ``"png"`` or ``"txt"``.
+    """Draw sheets as ``"pdf"``, one file with a page a sheet, or as one file for each.
 
     Parameters
     ----------
     manifest : Manifest
     format_name : str
+        ``"pdf"`` or one of :data:`locatk.formats.printing.rasters.WRITERS`.
     marks, crop : bool
         Of PDFs; see :func:`locatk.formats.printing.pattern.render`.
     document : path, optional
@@ -124,7 +128,7 @@ def draw(
         The document cannot be read.
     """
     if format_name != "pdf":
-        write = rasters.write_png if format_name == "png" else rasters.write_text
+        write = rasters.WRITERS[format_name]
         numbers = range(len(manifest.sheets))
         return DrawnSheets(
             [partial(write, manifest=manifest, number=n, done=done) for n in numbers]
@@ -146,7 +150,14 @@ def draw(
         losses.append(f"{document} keeps black in {kept}")
     if merged.dropped:
         losses.append(f"{document} has comments that cannot be drawn: {merged.dropped} left out")
-    return DrawnSheets([lambda stream: stream.write(merged.data)], tuple(losses))
+    warning = None
+    if merged.black_pages:
+        count = f"{merged.black_pages} of {merged.pages} page{'s' * (merged.pages > 1)}"
+        warning = (
+            f"{document} has black or grey on {count}, which hides the dots from cameras. "
+            "Hint: Print it in the other inks with --strip-black"
+        )
+    return DrawnSheets([lambda stream: stream.write(merged.data)], tuple(losses), warning)
 
 
 def publish(

@@ -21,6 +21,7 @@ from locatk.core.drawing import MM_PER_POINT
 from locatk.core.errors import FormatError, InputError
 from locatk.formats.files import read_head
 from locatk.formats.printing.separation.content import DAMAGE_ERRORS, BlackRemover
+from locatk.formats.printing.separation.detection import BlackFinder
 
 SIZE_TOLERANCE_MM = 0.1
 """Largest difference in size between a stamp and its page."""
@@ -50,12 +51,15 @@ class OverlaidDocument:
     dropped : int
         Printable comments without an appearance, which each viewer draws in its own way; they are
         left out.
+    black_pages : int
+        Pages with black below the stamp; not counted if black was to be removed.
     """
 
     data: bytes
     pages: int
     left_black: dict[str, int] = field(default_factory=dict)
     dropped: int = 0
+    black_pages: int = 0
 
 
 @dataclass(frozen=True)
@@ -165,9 +169,13 @@ def overlay(
             )
         dropped = _flatten(pdf)
         remover = BlackRemover(pdf) if strip_black else None
+        finder = BlackFinder()
+        black_pages = 0
         for number, page in enumerate(pdf.pages, 1):
             try:
-                _draw_over(pdf, page, stamps, stamps.pages[number - 1], remover)
+                black_pages += _draw_over(
+                    pdf, page, stamps, stamps.pages[number - 1], remover or finder
+                )
             except InputError as error:
                 raise InputError(error.message, file=document, where=f"page {number}") from None
             if progress is not None:
@@ -183,12 +191,17 @@ def overlay(
             deterministic_id=True,
         )
         left_black = {} if remover is None else dict(sorted(remover.left.items()))
-        return OverlaidDocument(target.getvalue(), len(pdf.pages), left_black, dropped)
+        return OverlaidDocument(target.getvalue(), len(pdf.pages), left_black, dropped, black_pages)
 
 
 def _draw_over(
-    pdf: Pdf, page: pikepdf.Page, stamps: Pdf, stamp: pikepdf.Page, remover: BlackRemover | None
-) -> None:
+    pdf: Pdf,
+    page: pikepdf.Page,
+    stamps: Pdf,
+    stamp: pikepdf.Page,
+    black: BlackRemover | BlackFinder,
+) -> bool:
+    """Draw a stamp over a page; return True if it has black and that is only to be found."""
     frame, stamp_frame = _PageFrame.of(page.obj), _PageFrame.of(stamp.obj)
     if stamp_frame.rotation:
         raise InputError("the stamp is rotated")
@@ -201,8 +214,11 @@ def _draw_over(
             "the stamp has {:.2f} x {:.2f} mm, the page {:.2f} x {:.2f} mm".format(*sizes)
         )
     below = _as_form(pdf, page.obj)
-    if remover is not None:
-        below = remover.form(below, starts=True)
+    is_black = False
+    if isinstance(black, BlackFinder):
+        is_black = black.is_black(below)
+    else:
+        below = black.form(below, starts=True)
     above = pdf.copy_foreign(_as_form(stamps, stamp.obj))
     # The page gets the size of the stamp, which is an integer number of the printer's pixels. The
     # document becomes a form, so that neither affects the state, blending or profiles of the other.
@@ -218,6 +234,7 @@ def _draw_over(
     page.obj.Contents = pdf.make_stream(
         f"q {frame.onto(stamp_frame)} cm /Below Do Q /Dots Do".encode()
     )
+    return is_black
 
 
 def _as_form(pdf: Pdf, page: pikepdf.Object) -> Stream:

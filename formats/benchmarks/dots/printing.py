@@ -57,7 +57,7 @@ MICRODOTS_PERCENT = {1: (44.0, 43.0), 2: (19.0, 55.0), 4: (2.7, 56.0)}
 GREY_ROUNDING = 5
 """Grey values by which pdfium rounds: some white pixels have 254."""
 
-PRINT_TARGETS = {"A4": (0.25, 170.0), "A0": (3.0, 2700.0)}
+PRINT_TARGETS = {"A4": (0.15, 170.0), "A0": (2.0, 2700.0)}
 """Paper to targets of seconds and kB."""
 
 REPORTLAB = "reportlab, a circle a dot"

@@ -151,7 +151,9 @@ def rasteriser_figures() -> list[Figure]:
             sheets.write(path)
             for rasteriser in usable:
                 name = rasteriser.name
-                if sheets.name == TIMED_SHEET and name in SLOW_RASTERISERS and not is_study():
+                is_large = max(expected[0].shape) > (rasteriser.max_side_px or math.inf)
+                is_slow = sheets.name == TIMED_SHEET and name in SLOW_RASTERISERS
+                if is_large or (is_slow and not is_study()):
                     continue
                 (own_folder := Path(folder) / name).mkdir()
                 begin = time.perf_counter()

@@ -37,6 +37,9 @@ PDFJS_VARIABLE = "LOCATK_PDFJS"
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
+MAX_CANVAS_PX = 65_535
+"""Longest side of a canvas in Chromium; a longer one remains empty."""
+
 INKS = ("Cyan", "Magenta", "Yellow", "Black")
 
 
@@ -51,14 +54,14 @@ class Rasteriser:
         Returns the reason why it cannot be used on this machine, else None.
     rasterise : callable
         Yields the pages of a PDF; its arguments are the file, dpi, and an empty folder.
-    has_grey : bool
-        False if pages are black and white.
+    max_side_px : int or None
+        Longest side of a page that it can draw.
     """
 
     name: str
     missing: Callable[[], str | None]
     rasterise: Callable[[Path, int, Path], Iterator[Grey]]
-    has_grey: bool = True
+    max_side_px: int | None = None
 
 
 def _missing_program(name: str) -> str | None:
@@ -273,20 +276,20 @@ def _pdfjs(pdf: Path, dpi: int, folder: Path) -> Iterator[Grey]:
 
 
 def _program(
-    name: str, program: str, rasterise: Callable[[Path, int, Path], Iterator[Grey]], **more: bool
+    name: str, program: str, rasterise: Callable[[Path, int, Path], Iterator[Grey]]
 ) -> Rasteriser:
-    return Rasteriser(name, partial(_missing_program, program), rasterise, **more)
+    return Rasteriser(name, partial(_missing_program, program), rasterise)
 
 
 RASTERISERS = (
     Rasteriser("pdfium", _missing_pdfium, _pdfium),
     _program("MuPDF", "mutool", partial(_mupdf, 8)),
     _program("MuPDF, no anti-aliasing", "mutool", partial(_mupdf, 0)),
-    _program("Ghostscript pbmraw", "gs", partial(_ghostscript, "pbmraw"), has_grey=False),
+    _program("Ghostscript pbmraw", "gs", partial(_ghostscript, "pbmraw")),
     _program("Ghostscript pgmraw", "gs", partial(_ghostscript, "pgmraw")),
     _program("Ghostscript tiffsep", "gs", _black_ink),
-    _program("poppler -mono", "pdftoppm", partial(_poppler, "-mono"), has_grey=False),
+    _program("poppler -mono", "pdftoppm", partial(_poppler, "-mono")),
     _program("poppler -gray", "pdftoppm", partial(_poppler, "-gray")),
-    Rasteriser("pdf.js", _missing_pdfjs, _pdfjs),
+    Rasteriser("pdf.js", _missing_pdfjs, _pdfjs, MAX_CANVAS_PX),
 )
 """Rasterisers that sheets are tested with, the black ink of separations among them."""

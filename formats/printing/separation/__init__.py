@@ -1,1 +1,1 @@
-"""Removal of black ink from PDF documents."""
+"""Search for black ink in PDF documents, and its removal."""

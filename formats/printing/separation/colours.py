@@ -1,13 +1,15 @@
-"""Colours of a PDF without black ink: black is replaced by the other three inks.
+"""Colours of a PDF with and without black ink.
 
-:func:`read_colour_space` reads a colour space and provides the conversion of its colours to cyan,
-magenta and yellow, according to ISO 32000-1, 7.10 (functions) and 8.6 (colour spaces).
+:func:`read_colour_space` reads a colour space, and provides the amount of black ink of its colours
+and their conversion to cyan, magenta and yellow alone, according to ISO 32000-1, 7.10 (functions)
+and 8.6 (colour spaces).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,13 @@ COMPONENTS_BY_NAME = {
 }
 """Number of components by the name of the colour space; short names are of inline images."""
 
+MAX_NEUTRAL_DIFFERENCE = 0.05
+"""Largest difference of red, green and blue of a colour that printers print by black alone."""
+
+BLACK_ONSET = 0.5
+"""Common part of cyan, magenta and yellow from which on printers replace it by black in colours;
+half is usual for grey component replacement of medium strength."""
+
 INKS = ("/Cyan", "/Magenta", "/Yellow", "/Black")
 
 
@@ -45,6 +54,8 @@ class ColourSpace:
     cmy : callable
         Maps (n, components) numbers of the document to (n, 3) cyan, magenta and yellow, from 0
         (no ink) to 1.
+    black : callable
+        Maps (n, components) numbers to the (n,) amount of black ink of a printer, from 0 to 1.
     high : int
         Largest index of an indexed space.
     """
@@ -53,6 +64,7 @@ class ColourSpace:
     components: int
     initial: tuple[float, ...]
     cmy: Callable[[Floats], Floats]
+    black: Callable[[Floats], Floats]
     high: int = 0
 
 
@@ -75,9 +87,31 @@ def from_cmyk(values: Floats) -> Floats:
     return ink + black - ink * black
 
 
-GREY = ColourSpace("grey", 1, (0.0,), from_grey)
-RGB = ColourSpace("rgb", 3, (0.0, 0.0, 0.0), from_rgb)
-CMYK = ColourSpace("cmyk", 4, (0.0, 0.0, 0.0, 1.0), from_cmyk)
+def black_of_grey(values: Floats) -> Floats:
+    """Return the black ink (n,) of grey (n, 1): printers print grey by black alone."""
+    return 1 - np.clip(values[:, 0], 0, 1)
+
+
+def black_of_rgb(values: Floats) -> Floats:
+    """Return the black ink (n,) of RGB (n, 3).
+
+    Printers replace equal parts of the three inks by black: all of them in neutral colours, and in
+    others the part above :data:`BLACK_ONSET`.
+    """
+    light = np.clip(values, 0, 1)
+    ink = 1 - light.max(axis=1)
+    is_neutral = np.ptp(light, axis=1) <= MAX_NEUTRAL_DIFFERENCE
+    return np.where(is_neutral, ink, np.clip((ink - BLACK_ONSET) / (1 - BLACK_ONSET), 0, 1))
+
+
+def black_of_cmyk(values: Floats) -> Floats:
+    """Return the black ink (n,) of CMYK (n, 4)."""
+    return np.clip(values[:, 3], 0, 1)
+
+
+GREY = ColourSpace("grey", 1, (0.0,), from_grey, black_of_grey)
+RGB = ColourSpace("rgb", 3, (0.0, 0.0, 0.0), from_rgb, black_of_rgb)
+CMYK = ColourSpace("cmyk", 4, (0.0, 0.0, 0.0, 1.0), from_cmyk, black_of_cmyk)
 BY_COMPONENTS = {1: GREY, 3: RGB, 4: CMYK}
 
 
@@ -131,28 +165,41 @@ def _indexed(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourS
     data = table.read_bytes() if isinstance(table, pikepdf.Stream) else bytes(table)
     wanted = (high + 1) * base.components
     entries = np.frombuffer(data[:wanted].ljust(wanted, b"\0"), np.uint8) / 255.0
-    palette = base.cmy(entries.reshape(high + 1, base.components))
+    colours = entries.reshape(high + 1, base.components)
 
-    def look_up(values: Floats) -> Floats:
+    def look_up(values: Floats, palette: Floats) -> Floats:
         return palette[np.clip(values[:, 0].astype(int), 0, high)]
 
-    return ColourSpace("indexed", 1, (0.0,), look_up, high)
+    cmy, black = (partial(look_up, palette=of(colours)) for of in (base.cmy, base.black))
+    return ColourSpace("indexed", 1, (0.0,), cmy, black, high)
 
 
 def _tint(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
     """Read a single ink: black itself, or a spot colour by its alternate space."""
     name = str(definition[1])
     if name in ("/Black", "/All"):  # /All is printed with all inks, including black
-        return ColourSpace("tint", 1, (1.0,), lambda v: np.repeat(np.clip(v, 0, 1), 3, axis=1))
+        return ColourSpace(
+            "tint",
+            1,
+            (1.0,),
+            lambda v: np.repeat(np.clip(v, 0, 1), 3, axis=1),
+            lambda v: np.clip(v[:, 0], 0, 1),
+        )
     if name in INKS:
         plate = np.eye(4)[INKS.index(name), :3]
-        return ColourSpace("tint", 1, (1.0,), lambda v: np.clip(v, 0, 1) * plate)
+        return ColourSpace(
+            "tint", 1, (1.0,), lambda v: np.clip(v, 0, 1) * plate, lambda v: np.zeros(len(v))
+        )
     alternate = read_colour_space(definition[2], named)
     transform = read_function(definition[3])
     if alternate is None or transform is None:
         return None
     return ColourSpace(
-        "tint", 1, (1.0,), lambda v: alternate.cmy(transform(np.clip(v[:, 0], 0, 1)))
+        "tint",
+        1,
+        (1.0,),
+        lambda v: alternate.cmy(transform(np.clip(v[:, 0], 0, 1))),
+        lambda v: alternate.black(transform(np.clip(v[:, 0], 0, 1))),
     )
 
 
@@ -162,7 +209,13 @@ def _inks(definition: pikepdf.Array) -> ColourSpace | None:
     if not set(names) <= {*INKS, "/None"}:
         return None
     to_cmyk = np.array([[float(ink == name) for ink in INKS] for name in names])
-    return ColourSpace("inks", len(names), (1.0,) * len(names), lambda v: from_cmyk(v @ to_cmyk))
+    return ColourSpace(
+        "inks",
+        len(names),
+        (1.0,) * len(names),
+        lambda v: from_cmyk(v @ to_cmyk),
+        lambda v: black_of_cmyk(v @ to_cmyk),
+    )
 
 
 def read_function(definition: pikepdf.Object) -> Callable[[Floats], Floats] | None:

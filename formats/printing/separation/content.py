@@ -350,19 +350,11 @@ class BlackRemover:
 
     def _name_inline(self, image: PdfInlineImage, scope: ResourceScope) -> Name:
         """Add an inline image to the resources, and return its name."""
-        stream = self._pdf.make_stream(b"")
-        for key, value in image.obj.items():
-            stream[key] = value
-        _, _, data = image.unparse().partition(b"\nID\n")
-        filters: Any = image.obj.get("/Filter")
-        parameters: Any = image.obj.get("/DecodeParms")
-        data = data.removesuffix(b"EI")
-        stream.write(data, filter=filters, decode_parms=parameters, type_check=False)
+        stream = images.inline_stream(self._pdf, image)
         resources = scope.converted.XObject
         number = len(resources)
         while (name := f"/Inline{number}") in resources:
             number += 1
-        stream.Subtype = Name.Image
         resources[name] = self._xobject(stream, scope)
         return Name(name)
 

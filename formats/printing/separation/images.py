@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import copy
 import zlib
+from typing import Any
 
 import numpy as np
 import pikepdf
 from numpy.typing import NDArray
-from pikepdf import Array, Dictionary, Name, Pdf, Stream, StreamDecodeLevel
+from pikepdf import Array, Dictionary, Name, Pdf, PdfInlineImage, Stream, StreamDecodeLevel
 
 from locatk.formats.printing.separation import colours
 from locatk.formats.printing.separation.colours import ColourSpace, Floats
@@ -96,6 +97,20 @@ def convert_image(
     if "/Alternates" in converted:
         del converted.Alternates
     return converted
+
+
+def inline_stream(pdf: Pdf, image: PdfInlineImage) -> Stream:
+    """Return an inline image as a stream, as images of resources are."""
+    stream = pdf.make_stream(b"")
+    for key, value in image.obj.items():
+        stream[key] = value
+    _, _, data = image.unparse().partition(b"\nID\n")
+    filters: Any = image.obj.get("/Filter")
+    parameters: Any = image.obj.get("/DecodeParms")
+    data = data.removesuffix(b"EI")
+    stream.write(data, filter=filters, decode_parms=parameters, type_check=False)
+    stream.Subtype = Name.Image
+    return stream
 
 
 def _filters(image: Stream) -> list[str]:

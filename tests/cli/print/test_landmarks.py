@@ -119,19 +119,38 @@ def test_same_map_same_bytes(locatk, map_file: Path, tmp_path: Path) -> None:
         (["--paper", "105x105mm"], 1, "which paper 105x105"),
         (["--floor", "--margin", 2], 1, "joining marks"),
         (["--spares", -1], 2, "--spares"),
-        (["--bom", "same"], 1, "one file"),
+        (["--bom", "parts.txt"], 2, "does not end in .csv"),
     ],
 )
 def test_wrong_arguments_are_reported(
     locatk, map_file: Path, tmp_path: Path, more: list[object], status: int, said: str
 ) -> None:
     out = tmp_path / "a.pdf"
-    more = [out if item == "same" else item for item in more]
     result = locatk("print", "landmarks", map_file, "-o", out, *more)
     assert result.exit_code == status, result.stderr
     assert said in result.stdout + result.stderr
     assert out.exists() == (status == 0)
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "ending", "words"),
+    [
+        ("landmarks", ".svg", "map export"),
+        ("landmarks", ".png", "Use .pdf."),
+        ("testsheet", ".tiff", "Use .pdf."),
+        ("testsheet", "", "no ending"),
+    ],
+)
+def test_only_pdf_is_written(
+    locatk, map_file: Path, tmp_path: Path, command: str, ending: str, words: str
+) -> None:
+    source = [map_file] if command == "landmarks" else []
+    before = sorted(tmp_path.iterdir())
+    result = locatk("print", command, *source, "-o", tmp_path / f"a{ending}")
+    assert result.exit_code == 2
+    assert words in result.stderr
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_nothing_is_replaced_unasked(locatk, map_file: Path, tmp_path: Path) -> None:
@@ -146,7 +165,13 @@ def test_nothing_is_replaced_unasked(locatk, map_file: Path, tmp_path: Path) -> 
     assert done.exit_code == 0, done.stderr
     before = map_file.read_bytes()
     itself = locatk("print", "landmarks", map_file, "-o", map_file, "--overwrite")
+    assert itself.exit_code == 2
+    assert map_file.read_bytes() == before
+    # Nor under another name of it.
+    (tmp_path / "link.pdf").symlink_to(map_file)
+    itself = locatk("print", "landmarks", map_file, "-o", tmp_path / "link.pdf", "--overwrite")
     assert itself.exit_code == 1
+    assert "one of the inputs" in itself.stderr
     assert map_file.read_bytes() == before
 
 

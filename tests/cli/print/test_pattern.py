@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import struct
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -182,13 +184,25 @@ def test_png_and_text(locatk, tmp_path: Path) -> None:
     data = (tmp_path / "a.png").read_bytes()
     assert struct.unpack(">II", data[16:24]) == (2 * 1748, 2 * 2480)
     assert data[24] == 1
-    # A file a sheet, named by its id; the ending does not matter where --format is given.
-    assert locatk(*base, "-o", tmp_path / "b.dots", "--format", "txt", "--count", 2).exit_code == 0
-    assert {"b-A5-0002.dots", "b-A5-0003.dots", "b.toml"} <= set(names(tmp_path))
+    # A file a sheet, named by its id.
+    assert locatk(*base, "-o", tmp_path / "b.txt", "--count", 2).exit_code == 0
+    assert {"b-A5-0002.txt", "b-A5-0003.txt", "b.toml"} <= set(names(tmp_path))
     made = read_manifest(tmp_path / "b.toml")
-    lines = (tmp_path / "b-A5-0003.dots").read_text().splitlines()
+    lines = (tmp_path / "b-A5-0003.txt").read_text().splitlines()
     assert (len(lines[0]), len(lines)) == made.sheets[1].size
     assert set("".join(lines)) == set("uldr")
+
+
+@pytest.mark.parametrize("ending", ["tif", "TIFF", "pbm"])
+def test_images_of_the_printers_pixels(locatk, tmp_path: Path, ending: str) -> None:
+    base = ["print", "pattern", "--size", "60x80mm", "--origin", "0,0", "--force"]
+    for name in ("a.png", f"b.{ending}"):
+        assert locatk(*base, "-o", tmp_path / name).exit_code == 0
+    images = [
+        cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED) for name in ("a.png", f"b.{ending}")
+    ]
+    np.testing.assert_array_equal(*images)
+    assert {"a.toml", "b.toml"} < set(names(tmp_path))
 
 
 def document(path: Path, pages: int = 2, **more: Any) -> Path:
@@ -212,6 +226,14 @@ def test_overlay(locatk, tmp_path: Path) -> None:
     assert page_sizes(out) == [pytest.approx((148.17, 209.9), abs=0.05)] * 2
     first, second = json.loads(result.stdout)["sheets"]
     assert second["origin"][0] >= first["origin"][0] + first["size"][0]
+    assert "black" not in result.stderr
+    # Black that remains is reported, and nothing else changes.
+    plain = locatk("print", "pattern", "-o", tmp_path / "plain.pdf", "--overlay", source, "--json")
+    assert plain.exit_code == 0
+    assert json.loads(plain.stdout)["outputs"] == [str(tmp_path / "plain.pdf")]
+    (warning,) = [line for line in plain.stderr.splitlines() if line.startswith("Warning:")]
+    assert "drawing.pdf has black or grey on 2 of 2 pages" in warning
+    assert "--strip-black" in warning
     # Never over the document itself.
     same = locatk("print", "pattern", "-o", source, "--overlay", source, "--overwrite")
     assert same.exit_code == 1
@@ -299,16 +321,24 @@ def test_a_damaged_ledger_stops_everything(locatk, tmp_path: Path) -> None:
         (["--id", "a b"], 1, "a b"),
         (["--id", "floor"], 1, "floor"),
         (["--strip-black"], 2, "--overlay"),
-        (["--crop-marks", "--format", "png"], 2, "--format pdf"),
+        (["--crop-marks", "-o", "a.png"], 2, "--format pdf"),
         (["--format", "svg"], 2, "svg"),
+        (["--format", "png"], 2, "'a.pdf' ends in .pdf, but --format is png"),
+        (["-o", "a.tif", "--format", "png"], 2, "ends in .tif"),
+        (["-o", "a.svg"], 2, ".png, .tiff or .pbm"),
+        (["-o", "a.svg", "--format", "pdf"], 2, "ends in .svg"),
+        (["-o", "a.jpg"], 2, ".pdf, .png, .tif, .tiff, .pbm or .txt"),
+        (["-o", "sheet"], 2, "no ending"),
+        (["-o", "sheet.toml"], 2, "ends in .toml"),
         (["--overlay", "none.pdf"], 1, "none.pdf"),
         (["--ledger", "none/ledger.toml"], 1, "folder"),
-        (["--count", "500", "--format", "txt"], 2, "200"),
+        (["--count", "500", "-o", "a.txt"], 2, "200"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_wrong_arguments(locatk, tmp_path: Path, args: list[str], status: int, words: str) -> None:
-    result = locatk("print", "pattern", "-o", tmp_path / "a.pdf", *args)
+    with contextlib.chdir(tmp_path):  # the last -o counts
+        result = locatk("print", "pattern", "-o", "a.pdf", *args)
     assert result.exit_code == status, result.output
     assert words in result.stderr
     assert len(result.stderr.splitlines()) == 1
@@ -326,8 +356,8 @@ def test_options_that_contradict_an_overlay(locatk, tmp_path: Path) -> None:
 
 
 def test_one_file_for_two_things_is_refused(locatk, tmp_path: Path) -> None:
-    for out in ("a.toml", "locatk-ledger.pdf"):
-        result = locatk("print", "pattern", "-o", tmp_path / out)
+    for name in ("locatk-ledger.pdf", "locatk-ledger.txt"):
+        result = locatk("print", "pattern", "-o", tmp_path / name)
         assert result.exit_code == 1
         assert "one file" in result.stderr
     assert names(tmp_path) == []

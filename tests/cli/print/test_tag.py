@@ -117,13 +117,30 @@ def test_the_ending_or_the_option_selects_the_format(
     for name, more, head in (
         ("a.svg", [], b"<?xml"),
         ("a.pdf", [], b"%PDF"),
-        ("b.pdf", ["--format", "svg"], b"<?xml"),
-        ("c", [], b"%PDF"),
+        ("b.svg", ["--format", "svg"], b"<?xml"),
+        ("c", ["--format", "pdf"], b"%PDF"),
     ):
         assert (
             locatk("print", "tag", tag_file, "--id", 1, "-o", tmp_path / name, *more).exit_code == 0
         )
         assert (tmp_path / name).read_bytes().startswith(head)
+
+
+def test_endings_of_other_formats_are_refused(locatk, tag_file: Path, tmp_path: Path) -> None:
+    before = names(tmp_path)
+    for name, more, words in (
+        ("a.svg", ["--format", "pdf"], "--format"),
+        ("a.pdf", ["--format", "svg"], "--format"),
+        ("a.png", [], ".pdf or .svg"),
+        ("a.toml", ["--format", "svg"], ".pdf or .svg"),
+        ("a.dxf", [], ".pdf or .svg"),
+        ("a", [], "no ending"),
+    ):
+        result = locatk("print", "tag", tag_file, "--id", 1, "-o", tmp_path / name, *more)
+        assert result.exit_code == 2, name
+        assert words in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+    assert names(tmp_path) == before
 
 
 def test_nothing_is_replaced_unasked(locatk, family_file: Path, tmp_path: Path) -> None:
@@ -138,8 +155,10 @@ def test_nothing_is_replaced_unasked(locatk, family_file: Path, tmp_path: Path) 
     assert done.exit_code == 0, done.stderr
     assert names(tmp_path) == ["family.toml", "tags-1.svg", "tags-2.svg"]
     before = family_file.read_bytes()
-    itself = locatk("print", "tag", family_file, "-o", family_file, "--overwrite")
+    (tmp_path / "link.pdf").symlink_to(family_file)
+    itself = locatk("print", "tag", family_file, "-o", tmp_path / "link.pdf", "--overwrite")
     assert itself.exit_code == 1
+    assert "one of the inputs" in itself.stderr
     assert family_file.read_bytes() == before
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,12 @@ from locatk.core.dots.codec import codec
 from locatk.core.dots.codec.lookup import decode_exact
 from locatk.core.dots.drawing import layout
 from locatk.core.dots.localization.frames import unlocalized_frames
+from locatk.core.errors import LocatkError
 from locatk.formats.benchmarks import timing
 from locatk.formats.benchmarks.dots import printing as dots_print
+from locatk.formats.benchmarks.dots import rasterised_sheets
 from locatk.formats.benchmarks.dots import suite as dots
+from locatk.formats.benchmarks.dots.rasterisers import RASTERISERS, Rasteriser
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.printing import pattern
 
@@ -25,10 +29,11 @@ PROMISED = {
     "8x8 windows, 1 wrong bit: wrong among accepted": 0.1,
     "random bits, 8x8: accepted": 0.1,
     "A4 printed": 0.15,
-    "A4 printed: size": 70.0,
+    "A4 printed: size": 170.0,
     "A4 at 300 dpi: dots of one black pixel": 100.0,
     "A4 at 300 dpi: windows right": 100.0,
     "A0 printed: memory": 300.0,
+    "pdfium: dots on their pixels": 100.0,
     **{f"dots {size}: right": 100.0 for size in ("0.25", "0.30", "0.35")},
     **{f"dots {size}: rms": 0.003 for size in ("0.25", "0.30", "0.35")},
     "dots 1/6: right": 99.0,
@@ -85,6 +90,9 @@ def quick(time_once: Any) -> Any:
         for module in (dots, dots_print):
             patch.setattr(module, "time_call", time_once)
         patch.delitem(dots_print.PRINT_TARGETS, "A0")
+        patch.setattr(rasterised_sheets, "QUICK_SHEETS", (("60x80mm", 300),))
+        patch.setattr(rasterised_sheets, "TIMED_SHEET", "60x80mm 300 dpi")
+        patch.setattr(rasterised_sheets, "RASTERISERS", RASTERISERS[:1])
         yield
 
 
@@ -225,6 +233,43 @@ def test_a_wrong_print_is_noticed() -> None:
     dots_alike, windows_right = dots_print.raster_figures("A5", sheet, pattern.render(other))
     assert dots_alike.value == pytest.approx(25, abs=5)
     assert windows_right.value == 0
+
+
+@pytest.mark.slow
+def test_a_wrong_pixel_is_one_wrong_dot() -> None:
+    sheets = rasterised_sheets.one_sheet("60x80mm", 300)
+    dots = math.prod(sheets.manifest.sheets[0].size)
+    expected = rasterised_sheets.expected_page(sheets.manifest, 0)
+
+    def percent(page: np.ndarray) -> float:
+        return rasterised_sheets.exact_percent(sheets.manifest, [expected], [page])
+
+    assert percent(expected) == 100
+    rows, columns = np.nonzero(expected == 0)
+    for value, row, column in (
+        (255, rows[7], columns[7]),
+        (0, rows[7], columns[7] + 1),
+        (0, rows[-1], columns[-1] - 1),
+    ):
+        spoilt = expected.copy()
+        spoilt[row, column] = value
+        assert percent(spoilt) == pytest.approx(100 * (1 - 1 / dots))
+    assert percent(np.roll(expected, 1, axis=1)) == 0
+    assert percent(expected[:-1]) == 0
+    assert rasterised_sheets.exact_percent(sheets.manifest, [expected], []) == 0
+
+
+def test_an_absent_rasteriser_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any) -> Any:
+        raise LocatkError("spoilt")
+
+    absent = Rasteriser("absent", lambda: "absent is not installed", fail)
+    failing = Rasteriser("failing", lambda: None, fail)
+    monkeypatch.setattr(rasterised_sheets, "RASTERISERS", (absent, failing))
+    figures = rasterised_sheets.rasteriser_figures()
+    assert [figure.value for figure in figures] == [None] * 4
+    assert "absent is not installed" in figures[0].how
+    assert "spoilt" in figures[2].how
 
 
 @pytest.mark.slow

@@ -118,7 +118,8 @@ def test_tiles_and_a_long_roll(rasteriser: Rasteriser, tmp_path: Path) -> None:
     tiles = manifest(
         layout.raster, tiling(layout, (2, 1), 10).sheets("floor-1", (5000, 6000)), "libdots"
     )
-    roll = lay_out((30, 3000), 8, layout.raster)
+    # With a ruler beyond 32,000 px, to which pdfium moves lines.
+    roll = lay_out((50, 3000), 8, layout.raster)
     made = replace(tiles, sheets=(*tiles.sheets, *roll.sheets("roll", (9000, 9000))))
     pages = pages_of(rasteriser, pattern.render(made), 300, tmp_path)
     for number in range(3):
