@@ -127,7 +127,8 @@ def _localizable(
     for shape in {image.shape for image in images.values()}:
         if camera is None or camera.size == shape[::-1]:
             batch = [index for index, image in images.items() if image.shape == shape]
-            localized = localize_frames(np.stack([images[k] for k in batch]), code, camera)
+            stack = np.stack([images[k] for k in batch])
+            localized = localize_frames(stack, code, camera, other_codec_odds=0)
             indices += [batch[k] for k in np.flatnonzero(localized.accepted)]
     return sorted(indices)
 
@@ -141,7 +142,7 @@ def _measure_dots(
 ) -> CalibrationFrame | str:
     """Return the dots of a frame with their positions on its sheet, or a reason."""
     height, width = image.shape
-    for dots in dot_correspondences(image[None], code, camera):
+    for dots in dot_correspondences(image[None], code, camera, other_codec_odds=0):
         middle = dots.origin + dots.grid.mean(axis=0)
         number = int(manifest.find(middle[None], [[-1, -1]], slack=SHEET_SLACK_PITCHES)[0])
         if number < 0:
