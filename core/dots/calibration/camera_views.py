@@ -15,8 +15,8 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.localization.frames import dot_correspondences, localize_frames
+from locatk.core.dots.localization.recordings import OFF_SHEET, SHEET_SLACK_PITCHES, UNREADABLE
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest
-from locatk.core.dots.solver import OFF_SHEET, SHEET_SLACK_PITCHES, UNREADABLE
 from locatk.core.errors import DegenerateError, InputError
 
 Array = NDArray[np.float64]

@@ -95,7 +95,7 @@ class CoreLines(NamedTuple):
     """Lines whose dots determine their phases: first and number; and how many a rival explains."""
 
     first: int
-    count: int
+    lines: int
     needed: int
 
 
@@ -129,7 +129,7 @@ def _rival_likelihoods(
     own, other = codecs
     length = len(own.digits[-1])
     start = (position + core.first) % length
-    difference = _phase_differences(own, other)[:, start : start + core.count]
+    difference = _phase_differences(own, other)[:, start : start + core.lines]
     agrees = difference[:, None] == np.arange(PHASE_DIFFERENCES)[:, None]
     candidate, value = np.nonzero(agrees.sum(axis=2) >= core.needed)
     residues = np.empty((len(candidate), 4), np.int64)
