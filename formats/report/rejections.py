@@ -192,16 +192,20 @@ def _lighthouse_reasons() -> dict[str, Reason]:
 
 def _dots_reasons() -> dict[str, Reason]:
     # OpenCV and scipy, which these modules need, take 0.1 s and 0.5 s to import.
-    from locatk.core.dots import solver
     from locatk.core.dots.detection import lattice
     from locatk.core.dots.identification import decoding
+    from locatk.core.dots.localization import recordings
     from locatk.core.dots.published import localization as published
 
     frames = {
         "unreadable_frame": "The image is damaged or truncated.",
         "not_of_the_cameras_size": "The size of the frame differs from the camera calibration.",
         "off_sheet": "A position was decoded, but no sheet of the manifest is within "
-        f"{solver.SHEET_SLACK_PITCHES:g} pitches of it.",
+        f"{recordings.SHEET_SLACK_PITCHES:g} pitches of it.",
+        "mirrored": "The frame is mirrored: the pattern is decoded if it is mirrored back. Its "
+        "heading would be wrong.",
+        "inverted": "The frame is inverted, with light dots on dark paper.",
+        "mirrored_and_inverted": "The frame is mirrored and inverted.",
         "too_few_dots": f"Fewer than {lattice.MIN_LATTICE_DOTS} dots were detected: no pattern in "
         "view, out of focus, or motion blur.",
         "no_grid": "Dots were detected, but no regular grid among them.",
