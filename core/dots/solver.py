@@ -200,15 +200,14 @@ def _sheet_poses(
     poses = _SheetPoses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
     for number in np.unique(sheet[sheet >= 0]):
         is_here = sheet == number
-        jacobian = manifest.jacobian(int(number))
-        heading = localized.heading[is_here]
-        poses.position[is_here] = manifest.to_metres(int(number), localized.grid[is_here])
-        right = np.column_stack([np.cos(heading), -np.sin(heading)])
-        x, y = (right @ jacobian.T).T
-        poses.heading[is_here] = np.arctan2(y, x)
-        full = np.eye(3)
-        full[:2, :2] = jacobian
-        poses.covariance[is_here] = full @ localized.covariance[is_here] @ full.T
+        poses.position[is_here], poses.heading[is_here], poses.covariance[is_here] = (
+            manifest.poses_in_metres(
+                int(number),
+                localized.grid[is_here],
+                localized.heading[is_here],
+                localized.covariance[is_here],
+            )
+        )
     return poses
 
 

@@ -228,12 +228,13 @@ class DotCorrespondences:
         In the frame, with distortion.
     grid : (m, 2) float64 ndarray
         Grid coordinates of the dot itself, with its offset, relative to :attr:`origin`.
-    origin : (2,) int64 ndarray
+    origin, section : (2,) int64 ndarray
     """
 
     pixels: NDArray[np.float64]
     grid: NDArray[np.float64]
     origin: NDArray[np.int64]
+    section: NDArray[np.int64]
 
 
 def dot_correspondences(
@@ -254,5 +255,7 @@ def dot_correspondences(
             pixels = lattices.points[0, used] * half_diagonal + centre
             if camera is not None:
                 pixels = camera.distort(pixels)
-            yield DotCorrespondences(pixels, dots.target[0, used], dots.origin[0])
+            yield DotCorrespondences(
+                pixels, dots.target[0, used], dots.origin[0], windows.section[0]
+            )
             break

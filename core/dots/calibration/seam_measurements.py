@@ -1,0 +1,249 @@
+"""Relative poses of neighbouring sheets, each from one frame that shows both.
+
+The dots of all sheets in a frame are fitted together: one homography from the paper of the first
+sheet to the frame, and a rotation and a shift of each other sheet on that paper (the frame sees one
+plane). Since the pitch of all sheets is the same, neither the height nor the tilt of the camera
+have to be known; its lens does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.dots.camera import Camera
+from locatk.core.dots.localization.seams import SheetView
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest
+from locatk.core.least_squares import DenseEquations, Indices, minimize
+from locatk.core.robust import robust_sigma
+
+Array = NDArray[np.float64]
+
+MIN_VIEW_DOTS = 12
+"""Least number of dots of each sheet in a measurement: four times those that determine a rigid
+motion, with which one bad dot is recognised."""
+
+HOMOGRAPHY_PARAMETERS = 8
+
+BIWEIGHT_SIGMAS = 4.685
+"""Distance in standard deviations from which a dot has no weight: Tukey's biweight with 95 %
+efficiency for normal errors."""
+
+REWEIGHTED_FITS = 4
+"""Number of fits, each with the weights from the previous one."""
+
+MAX_SCATTER_PITCHES = 0.05
+"""Largest standard deviation of dots about their fit; beyond it the frame is not that of a plane
+(a fold, a step), or motion has blurred it."""
+
+
+@dataclass(frozen=True)
+class SeamMeasurement:
+    """Poses of the other sheets of a frame on the paper of its first one.
+
+    Attributes
+    ----------
+    recording, frame : int
+        Index of the recording, and of the frame in it.
+    numbers : tuple of int
+        Sheets; poses are on the paper of the first.
+    points_mm : (k, 2) ndarray
+        A point on the paper of each of the k other sheets, in the middle of its visible dots.
+    poses : (k, 3) ndarray
+        Position of that point on the paper of the first sheet in mm, and heading of the other paper
+        in rad.
+    covariance : (3 k, 3 k) ndarray
+        Of the poses.
+    dots : int
+        Number of dots that were used.
+    """
+
+    recording: int
+    frame: int
+    numbers: tuple[int, ...]
+    points_mm: Array
+    poses: Array
+    covariance: Array
+    dots: int
+
+
+def measure_seam(
+    views: list[SheetView],
+    manifest: Manifest,
+    camera: Camera,
+    recording: int = 0,
+    frame: int = 0,
+) -> SeamMeasurement | None:
+    """Measure the relative poses of the sheets in a frame.
+
+    None if fewer than two sheets have :data:`MIN_VIEW_DOTS`, or if the dots do not fit.
+    """
+    if len(views) < 2:
+        return None
+    views = without_ambiguous_dots(views)
+    views = [view for view in views if len(view.pixels) >= MIN_VIEW_DOTS]
+    if len(views) < 2:
+        return None
+    fit = _SeamFit.of(views, manifest, camera)
+    covariance, scatter = fit.refine()
+    slope = fit.parameters[[0, 1, 3, 4]].reshape(2, 2)
+    pitch = manifest.pitch_mm * math.sqrt(abs(float(np.linalg.det(slope))))
+    if scatter > MAX_SCATTER_PITCHES * pitch or not np.isfinite(covariance).all():
+        return None
+    poses = fit.parameters[HOMOGRAPHY_PARAMETERS:].reshape(-1, 3)[:, [1, 2, 0]].copy()
+    poses[:, :2] += fit.middles[0]
+    order = HOMOGRAPHY_PARAMETERS + (3 * np.arange(len(poses))[:, None] + [1, 2, 0]).ravel()
+    return SeamMeasurement(
+        recording,
+        frame,
+        tuple(view.number for view in views),
+        fit.middles[1:],
+        poses,
+        covariance[np.ix_(order, order)],
+        len(fit.observed),
+    )
+
+
+def without_ambiguous_dots(views: list[SheetView]) -> list[SheetView]:
+    """Leave out dots that several sheets predict: those of the overlap of almost aligned tiles."""
+    pixels = np.concatenate([view.pixels for view in views])
+    _, index, count = np.unique(pixels, axis=0, return_inverse=True, return_counts=True)
+    is_unique = (count == 1)[index.ravel()]
+    ends = np.cumsum([len(view.pixels) for view in views])[:-1]
+    return [
+        SheetView(view.number, view.pixels[kept], view.grid[kept])
+        for view, kept in zip(views, np.split(is_unique, ends), strict=True)
+    ]
+
+
+def printed_positions(number: int, grid: Array, manifest: Manifest) -> Array:
+    """Return the positions (n, 2) in mm on the paper of dots at grid coordinates (n, 2).
+
+    The offsets of dots are those of the manifest, not those of decoded frames.
+    """
+    node = np.rint(grid)
+    offset = (grid - node) * (manifest.offset_mm / manifest.pitch_mm / DOT_OFFSET_PITCHES)
+    return manifest.to_paper(number, node + offset)
+
+
+@dataclass
+class _SeamFit:
+    """Fit of one frame. Lengths are in mm on the paper and in half diagonals in the frame.
+
+    Parameters are those of the homography (8: rows, of which the last ends in 1), and rotation [rad]
+    and position (two) of each other sheet.
+
+    Attributes
+    ----------
+    observed : (n, 2) ndarray
+        Dots in the frame, without distortion, from the middle of the frame.
+    paper : (n, 2) ndarray
+        Dots on their paper, from the middle of the dots of their sheet.
+    sheet : (n,) int ndarray
+        Index of the sheet of each dot.
+    middles : (k, 2) ndarray
+        Middle of the dots of each sheet on its paper.
+    parameters : (8 + 3 (k - 1),) ndarray
+    """
+
+    observed: Array
+    paper: Array
+    sheet: NDArray[np.int64]
+    middles: Array
+    parameters: Array
+
+    @classmethod
+    def of(cls, views: list[SheetView], manifest: Manifest, camera: Camera) -> _SeamFit:
+        half_diagonal = math.hypot(*camera.size) / 2
+        pixels = np.concatenate([view.pixels for view in views])
+        observed = (camera.undistort(pixels) - camera.centre_px) / half_diagonal
+        sheet = np.repeat(np.arange(len(views)), [len(view.pixels) for view in views])
+        positions = [printed_positions(view.number, view.grid, manifest) for view in views]
+        middles = np.array([position.mean(axis=0) for position in positions])
+        paper = np.concatenate(positions) - middles[sheet]
+        first = sheet == 0
+        homography, _ = cv2.findHomography(paper[first], observed[first])
+        parameters = [homography.ravel()[:8] / homography[2, 2]]
+        inverse = np.linalg.inv(homography)
+        for other in range(1, len(views)):
+            rows = sheet == other
+            plane = cv2.perspectiveTransform(observed[rows][:, None], inverse)[:, 0]
+            shift = plane.mean(axis=0)
+            cross = paper[rows].T @ (plane - shift)
+            angle = math.atan2(cross[0, 1] - cross[1, 0], cross[0, 0] + cross[1, 1])
+            parameters.append(np.array([angle, *shift]))
+        return cls(observed, paper, sheet, middles, np.concatenate(parameters))
+
+    def refine(self) -> tuple[Array, float]:
+        """Fit the parameters; return their covariance and the scatter of a dot."""
+        observed, paper, sheet = self.observed, self.paper, self.sheet
+        weights = np.ones(len(sheet))
+        freedom = 2 * len(sheet) - len(self.parameters)
+        for _ in range(REWEIGHTED_FITS):
+            problem = _SeamProblem(observed, paper, sheet, weights)
+            minimum = minimize(problem, self.parameters, damping=1e-6, min_gain=1e-9)
+            self.parameters = minimum.state
+            residual = minimum.equations.residual.reshape(-1, 2)
+            sigma = robust_sigma(residual) * math.sqrt(2 * len(sheet) / max(freedom, 1))
+            ratio = np.linalg.norm(residual, axis=1) / (math.sqrt(2) * BIWEIGHT_SIGMAS * sigma)
+            weights = np.clip(1 - ratio**2, 0, None) ** 2
+        information = minimum.equations.hessian[0] / sigma**2
+        try:
+            return np.linalg.inv(information), sigma
+        except np.linalg.LinAlgError:
+            return np.full_like(information, np.nan), sigma
+
+
+def _predict(parameters: Array, paper: Array, sheet: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return positions (n, 2) of dots in the frame, and their derivatives (n, 2, p)."""
+    n = len(paper)
+    others = parameters[HOMOGRAPHY_PARAMETERS:].reshape(-1, 3)
+    angle, x, y = np.concatenate([np.zeros((1, 3)), others])[sheet].T
+    c, s = np.cos(angle), np.sin(angle)
+    rotated = np.stack([c * paper[:, 0] - s * paper[:, 1], s * paper[:, 0] + c * paper[:, 1]], 1)
+    plane = rotated + np.stack([x, y], axis=1)
+    rows = np.append(parameters[:HOMOGRAPHY_PARAMETERS], 1.0).reshape(3, 3)
+    homogeneous = np.column_stack([plane, np.ones(n)])
+    projected = homogeneous @ rows.T
+    depth = projected[:, 2]
+    position = projected[:, :2] / depth[:, None]
+    jacobian = np.zeros((n, 2, len(parameters)))
+    jacobian[:, 0, 0:3] = jacobian[:, 1, 3:6] = homogeneous / depth[:, None]
+    jacobian[:, :, 6:8] = -position[:, :, None] * plane[:, None] / depth[:, None, None]
+    by_plane = (rows[:2, :2] - position[:, :, None] * rows[2, :2]) / depth[:, None, None]
+    dot = np.flatnonzero(sheet > 0)
+    column = HOMOGRAPHY_PARAMETERS + 3 * (sheet[dot] - 1)
+    by_angle = np.stack([-rotated[dot, 1], rotated[dot, 0]], axis=1)
+    jacobian[dot, :, column] = (by_plane[dot] @ by_angle[..., None])[..., 0]
+    for axis in (0, 1):
+        jacobian[dot, :, column + 1 + axis] = by_plane[dot, :, axis]
+    return position, jacobian
+
+
+@dataclass(frozen=True)
+class _SeamProblem:
+    """Fit of a frame as a problem for :func:`~locatk.core.least_squares.minimize`."""
+
+    observed: Array
+    paper: Array
+    sheet: NDArray[np.int64]
+    weights: Array
+
+    def linearize(self, state: Array, problems: Indices) -> DenseEquations:
+        predicted, jacobian = _predict(state, self.paper, self.sheet)
+        residual = (predicted - self.observed).ravel()
+        root = np.sqrt(np.repeat(self.weights, 2))
+        weighted = root * residual
+        return DenseEquations.from_weighted(
+            residual[None],
+            weighted[None],
+            (root[:, None] * jacobian.reshape(len(residual), -1))[None],
+            np.array([0.5 * weighted @ weighted]),
+        )
+
+    def retract(self, state: Array, step: Array) -> Array:
+        return np.asarray(state + step[0])
