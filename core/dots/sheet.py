@@ -187,6 +187,11 @@ class Manifest:
         sheet = self.sheets[number]
         return sheet.id if sheet.position_mm is None else "floor"
 
+    @property
+    def has_seams(self) -> bool:
+        """Whether several sheets are parts of one floor."""
+        return sum(sheet.position_mm is not None for sheet in self.sheets) > 1
+
     def find(self, grid: ArrayLike, section: ArrayLike, *, slack: float = 0.0) -> NDArray[np.intp]:
         """Return the number of the sheet that contains each position, or of the nearest one.
 
@@ -275,7 +280,7 @@ class Manifest:
         return np.array([[c, -s], [s, c]])
 
     def to_grid(self, number: int, position_m: ArrayLike) -> NDArray[np.float64]:
-        """Return the grid coordinates (..., 2) of positions in metres; inverts :meth:`to_metres`."""
+        """Return the grid coordinates (..., 2) of positions; inverts :meth:`to_metres`."""
         position = np.asarray(position_m, float)
         to_grid = np.linalg.inv(self.jacobian(number)).T
         grid = np.broadcast_to(np.array(self.sheets[number].origin, float), position.shape)

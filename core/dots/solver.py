@@ -24,6 +24,7 @@ from locatk.core.dots.localization.frames import (
     localize_frames,
     unlocalized_frames,
 )
+from locatk.core.dots.localization.seams import relocalize_at_seams
 from locatk.core.dots.published.localization import localize_published
 from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
 from locatk.core.dots.sheet import Manifest
@@ -100,6 +101,8 @@ def solve(
     for camera_frames in frames:
         localized = _localize(camera_frames, code, options)
         sheet = _assign_sheets(localized, manifest)
+        if options.method != "paper" and manifest.has_seams:
+            relocalize_at_seams(camera_frames, localized, sheet, manifest, code, options.camera)
         off_sheet += list(localized.grid[localized.rejected == OFF_SHEET])
         poses = _sheet_poses(localized, sheet, manifest)
         outcomes += _outcomes(camera_frames, localized)
@@ -122,12 +125,12 @@ def _localize(frames: Frames, code: Codec, options: SolveOptions) -> LocalizedFr
     """Localize the frames of a camera on the grid."""
     result = unlocalized_frames(len(frames), TOO_FEW_DOTS)
     localize = _localize_published if options.method == "paper" else localize_frames
-    for indices, images in _batches(frames, result.rejected, options.camera):
+    for indices, images in batches(frames, result.rejected, options.camera):
         result.update(indices, localize(images, code, options.camera))
     return result
 
 
-def _batches(
+def batches(
     frames: Frames, rejected: NDArray[np.object_], camera: Camera | None
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
     """Yield indices and images of frames of one size; store reasons of others in ``rejected``."""

@@ -134,8 +134,8 @@ def printed_positions(number: int, grid: Array, manifest: Manifest) -> Array:
 class _SeamFit:
     """Fit of one frame. Lengths are in mm on the paper and in half diagonals in the frame.
 
-    Parameters are those of the homography (8: rows, of which the last ends in 1), and rotation [rad]
-    and position (two) of each other sheet.
+    Parameters are those of the homography (8, by rows; the ninth is 1), and rotation [rad] and
+    position (two) of each other sheet.
 
     Attributes
     ----------

@@ -103,6 +103,11 @@ class LocalizedFrames:
         for field in fields(LocalizedFrames):
             getattr(self, field.name)[indices[better]] = getattr(part, field.name)[better]
 
+    def replace(self, index: int, part: LocalizedFrames) -> None:
+        """Store the single frame of ``part`` at ``index``."""
+        for field in fields(LocalizedFrames):
+            getattr(self, field.name)[index] = getattr(part, field.name)[0]
+
 
 def unlocalized_frames(n: int, reason: str) -> LocalizedFrames:
     """Return n frames that are all rejected for ``reason``."""

@@ -24,8 +24,12 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import DOT_DIRECTIONS, Codec
 from locatk.core.dots.detection.blobs import detect_dots
 from locatk.core.dots.detection.lattice import nearest_symbol_offset
+from locatk.core.dots.frames import Frames
 from locatk.core.dots.localization.frames import (
+    LOW_CONFIDENCE,
+    NO_CODE,
     DotCorrespondences,
+    LocalizedFrames,
     dot_correspondences,
     localize_frames,
 )
@@ -115,10 +119,12 @@ def separate_sheets(
     Empty if no sheet is decoded. A dot that is printed on several sheets (the overlap of tiles) is
     one of each that predicts it.
     """
-    view = _first_view(image, manifest, code, camera)
-    frame = None if view is None else _rectify(image, view, manifest, code, camera)
+    first = _first_view(image, manifest, code, camera)
+    frame = None if first is None else _rectify(image, first, manifest, code, camera)
+    if frame is None:
+        return []
     views: list[SheetView] = []
-    placement = None if frame is None else frame.identity(view.number)
+    placement: _Placement | None = frame.first_placement
     while placement is not None and len(views) < MAX_SHEETS:
         view = frame.take(placement)
         if len(view.pixels) < MIN_SHEET_DOTS:
@@ -131,6 +137,57 @@ def separate_sheets(
     return sorted(views, key=lambda view: -len(view.pixels))
 
 
+def relocalize_at_seams(
+    frames: Frames,
+    localized: LocalizedFrames,
+    numbers: NDArray[np.intp],
+    manifest: Manifest,
+    code: Codec,
+    camera: Camera | None = None,
+) -> None:
+    """Localize frames that show several sheets by the dots of one of them, in place.
+
+    Parameters
+    ----------
+    frames : Frames
+    localized : LocalizedFrames
+        Of these frames.
+    numbers : (n,) intp ndarray
+        Sheet of each frame, -1 if it has none. A frame may be about as far from the middle of one
+        sheet as from that of the next; the sheet is the one to which most of its dots belong.
+    manifest, code, camera
+    """
+    for index in np.flatnonzero(may_show_seam(localized, numbers, manifest)).tolist():
+        image = frames.images[index]
+        views = separate_sheets(image, manifest, code, camera)
+        if not views or (len(views) == 1 and views[0].number == numbers[index]):
+            continue
+        if len(views) > 1:
+            image = isolate_sheet(image, views[0])
+        part = localize_frames(image[None], code, camera)
+        localized.replace(index, part)
+        numbers[index] = views[0].number if part.accepted[0] else -1
+
+
+def may_show_seam(
+    localized: LocalizedFrames, numbers: NDArray[np.intp], manifest: Manifest
+) -> NDArray[np.bool_]:
+    """Return the frames (n,) that may show several sheets.
+
+    ``numbers`` (n,) is the sheet of each frame, -1 if it has none. A frame may show a seam if the
+    end of its sheet is no farther from the middle than the corners of the frame are, or if it was
+    rejected with many dots.
+    """
+    low = np.array([sheet.origin for sheet in manifest.sheets])[numbers]
+    high = low + np.array([sheet.size for sheet in manifest.sheets])[numbers] - 1
+    to_end = np.minimum(localized.grid - low, high - localized.grid).min(axis=1)
+    # The corners are 0.74 times the root of the area away at 188 x 120 px, 0.77 at 16:9.
+    is_near = to_end < np.sqrt(localized.dots)
+    is_rejected = np.isin(localized.rejected, [NO_CODE, LOW_CONFIDENCE])
+    is_rejected &= localized.dots >= 2 * MIN_SHEET_DOTS
+    return np.asarray(np.where(localized.accepted & (numbers >= 0), is_near, is_rejected))
+
+
 def isolate_sheet(image: Image, view: SheetView) -> Image:
     """Return the frame with all dots erased but those of one sheet."""
     pitch_px = _pitch_px(view.grid, view.pixels)
@@ -139,10 +196,12 @@ def isolate_sheet(image: Image, view: SheetView) -> Image:
     return _erase(image, pixels[~is_own], pitch_px)
 
 
-def _nearest(points: Array, others: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
+def _nearest(
+    points: Array, others: Array, radius: float
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the nearest of other points for each point, and whether it is within a radius."""
     distance, index = cKDTree(others).query(points, distance_upper_bound=radius)
-    return index, np.isfinite(distance)
+    return np.asarray(index, np.int64), np.isfinite(distance)
 
 
 # ---- the first sheet
@@ -274,9 +333,10 @@ class _RectifiedFrame:
     code: Codec
     camera: Camera | None
 
-    def identity(self, number: int) -> _Placement:
-        """Return the placement of the first sheet."""
-        return _Placement(number, np.eye(2), self.start)
+    @property
+    def first_placement(self) -> _Placement:
+        """Placement of the first sheet."""
+        return _Placement(self.first, np.eye(2), self.start)
 
     def take(self, placement: _Placement) -> SheetView:
         """Return all dots of a sheet and remove them from the rest."""

@@ -85,7 +85,10 @@ class FloorShot(Shot):  # type: ignore[misc]
         for sheet in self.sheets:
             left, bottom, right, top = sheet.visible or (0, 0, *sheet.page)
             outline = np.array(
-                [complex(x, y) for x, y in ((left, bottom), (right, bottom), (right, top), (left, top))]
+                [
+                    complex(x, y)
+                    for x, y in ((left, bottom), (right, bottom), (right, top), (left, top))
+                ]
             )
             # Clipped so that it stays within the range of OpenCV's fixed point.
             polygon = np.clip(on_raster(sheet.on_floor(outline)), -(2**24), 2**24)
@@ -103,8 +106,10 @@ class FloorShot(Shot):  # type: ignore[misc]
             symbols = codec(self.codec).symbols(start, (columns, rows), self.section)
             aside = np.array([ASIDE[k] for k in range(4)])[symbols]
             x, y = np.meshgrid(np.arange(columns) + low[0], np.arange(rows) + low[1])
-            paper = (x + aside[..., 0]) * PITCH_MM + sheet.first[0] + 1j * (
-                sheet.page[1] - sheet.first[1] - (y + aside[..., 1]) * PITCH_MM
+            paper = (
+                (x + aside[..., 0]) * PITCH_MM
+                + sheet.first[0]
+                + 1j * (sheet.page[1] - sheet.first[1] - (y + aside[..., 1]) * PITCH_MM)
             )
             inside = (paper.real > left) & (paper.real < right)
             inside &= (paper.imag > bottom) & (paper.imag < top)
