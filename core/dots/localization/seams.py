@@ -23,8 +23,19 @@ from scipy.spatial import cKDTree
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import DOT_DIRECTIONS, Codec
 from locatk.core.dots.detection.blobs import detect_dots
-from locatk.core.dots.detection.lattice import nearest_symbol_offset
+from locatk.core.dots.detection.lattice import (
+    C_U,
+    C_V,
+    LENS,
+    MIN_SIGMA_PITCHES,
+    PERSPECTIVE,
+    DotLattices,
+    nearest_symbol_offset,
+    refit_lattices,
+    slope_at_centre,
+)
 from locatk.core.dots.frames import Frames
+from locatk.core.dots.identification.decoding import MIN_CONFIDENCE
 from locatk.core.dots.localization.frames import (
     LOW_CONFIDENCE,
     NO_CODE,
@@ -32,8 +43,11 @@ from locatk.core.dots.localization.frames import (
     LocalizedFrames,
     dot_correspondences,
     localize_frames,
+    unlocalized_frames,
 )
+from locatk.core.dots.localization.pose import pose_covariance
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest, Sheet
+from locatk.core.robust import robust_sigma
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -77,6 +91,13 @@ MIN_LOG_ODDS = math.log(1e4)
 
 DETECTED_PITCH_PX = 11.0
 """Pitch to which a frame is shrunk before dots are detected; that of the paper's camera."""
+
+DOT_GATE_SIGMAS = 4.0
+"""Distance from its fit, per axis and in robust standard deviations, from which a dot is not used
+for a pose. A dot of another sheet is within the gate of a symbol in 4 % of the cases."""
+
+REFITS = 4
+"""Number of fits of a pose, each with the dots within the gate of the previous one."""
 
 ERASED_RADIUS_PITCHES = 0.3
 """Radius in which a dot is erased; two dots are 2/3 of a pitch apart or more."""
@@ -160,13 +181,59 @@ def relocalize_at_seams(
     for index in np.flatnonzero(may_show_seam(localized, numbers, manifest)).tolist():
         image = frames.images[index]
         views = separate_sheets(image, manifest, code, camera)
-        if not views or (len(views) == 1 and views[0].number == numbers[index]):
-            continue
-        if len(views) > 1:
-            image = isolate_sheet(image, views[0])
-        part = localize_frames(image[None], code, camera)
-        localized.replace(index, part)
-        numbers[index] = views[0].number if part.accepted[0] else -1
+        if len(views) > 1 or (views and views[0].number != numbers[index]):
+            localized.replace(index, localize_view(views[0], image.shape, manifest, camera))
+            numbers[index] = views[0].number
+
+
+def localize_view(
+    view: SheetView, shape: tuple[int, ...], manifest: Manifest, camera: Camera | None = None
+) -> LocalizedFrames:
+    """Return the pose of a frame (h, w) on the grid of one of its sheets."""
+    height, width = shape[:2]
+    half_diagonal = math.hypot(width, height) / 2
+    if camera is None:
+        points = view.pixels - [(width - 1) / 2, (height - 1) / 2]
+    else:
+        points = camera.undistort(view.pixels) - camera.centre_px
+    points = points / half_diagonal
+    start = np.rint(view.grid.mean(axis=0))
+    grid = view.grid - start
+    homography, _ = cv2.findHomography(points, grid, cv2.RANSAC, CONSENSUS_GATE_PITCHES)
+    parameters = np.append(homography.ravel()[:8] / homography[2, 2], 0.0)[None]
+    used = np.ones(len(grid), np.bool_)
+    for _ in range(REFITS):
+        q = points / (1 + parameters[0, LENS] * (points**2).sum(axis=1, keepdims=True))
+        depth = 1 + q @ parameters[0, PERSPECTIVE]
+        uv = np.column_stack([q, np.ones(len(q))]) @ parameters[0, :6].reshape(2, 3).T
+        uv /= depth[:, None]
+        residual = uv - grid
+        gate = DOT_GATE_SIGMAS * max(robust_sigma(residual), MIN_SIGMA_PITCHES)
+        used = (np.abs(residual) < gate).all(axis=1)
+        lattice = DotLattices(
+            parameters,
+            points.astype(np.float32)[None],
+            used[None],
+            uv.astype(np.float32)[None],
+            np.rint(uv).astype(np.float32)[None],
+            np.zeros(1),
+            np.ones(1, np.bool_),
+            camera is None,
+        )
+        parameters, covariance = refit_lattices(
+            lattice, residual.astype(np.float32)[None], used[None]
+        )
+    slope = slope_at_centre(parameters)
+    right = slope[0, :, 0]
+    result = unlocalized_frames(1, "")
+    result.grid[0] = start + parameters[0, [C_U, C_V]]
+    result.section[0] = manifest.sheets[view.number].section
+    result.heading[0] = math.atan2(-right[1], right[0])
+    result.covariance[0] = pose_covariance(covariance, slope, np.eye(2, dtype=np.int64)[None])[0]
+    result.dots[0] = used.sum()
+    # The frame was decoded with this confidence or more.
+    result.confidence[0] = MIN_CONFIDENCE
+    return result
 
 
 def may_show_seam(
@@ -186,14 +253,6 @@ def may_show_seam(
     is_rejected = np.isin(localized.rejected, [NO_CODE, LOW_CONFIDENCE])
     is_rejected &= localized.dots >= 2 * MIN_SHEET_DOTS
     return np.asarray(np.where(localized.accepted & (numbers >= 0), is_near, is_rejected))
-
-
-def isolate_sheet(image: Image, view: SheetView) -> Image:
-    """Return the frame with all dots erased but those of one sheet."""
-    pitch_px = _pitch_px(view.grid, view.pixels)
-    pixels = _detect(image, _level(pitch_px))
-    _, is_own = _nearest(pixels, view.pixels, MATCH_GATE_PITCHES * pitch_px)
-    return _erase(image, pixels[~is_own], pitch_px)
 
 
 def _nearest(
