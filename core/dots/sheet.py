@@ -195,6 +195,8 @@ class Manifest:
     def find(self, grid: ArrayLike, section: ArrayLike, *, slack: float = 0.0) -> NDArray[np.intp]:
         """Return the number of the sheet that contains each position, or of the nearest one.
 
+        In the overlap of tiles, it is the one in which the position is farther from the end.
+
         Parameters
         ----------
         grid : (n, 2) array_like
@@ -216,8 +218,8 @@ class Manifest:
         for number, sheet in enumerate(self.sheets):
             low = np.array(sheet.origin)
             high = low + np.array(sheet.size) - 1
-            beyond = np.maximum(np.maximum(low - position, position - high), 0)
-            outside = beyond.max(axis=1, initial=0)
+            # Below 0 inside: in the overlap of two tiles the cut is in the middle.
+            outside = np.maximum(low - position, position - high).max(axis=1)
             matches = ((sections == np.array(sheet.section)) | (sections == -1)).all(axis=1)
             better = matches & (outside <= slack) & (outside < least_outside)
             number_of[better], least_outside[better] = number, outside[better]

@@ -33,7 +33,11 @@ from locatk.core.dots.calibration.floor_fit import (
     planar_rotation,
 )
 from locatk.core.dots.calibration.floor_frame import BuiltSheet, build_sheets
-from locatk.core.dots.calibration.seam_measurements import SeamMeasurement, measure_seam
+from locatk.core.dots.calibration.seam_measurements import (
+    SeamMeasurement,
+    crop_overlaps,
+    measure_seam,
+)
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec, codec
 from locatk.core.dots.frames import Frames
@@ -170,7 +174,7 @@ class FloorReport:
 def calibrate_floor(
     recordings: Sequence[FloorRecording],
     manifest: Manifest,
-    progress: Callable[[int], None] = lambda _: None,
+    advance: Callable[[], None] = lambda: None,
 ) -> FloorReport:
     """Estimate the poses of the sheets of a floor, and with truth the errors of their print.
 
@@ -180,8 +184,8 @@ def calibrate_floor(
     manifest : Manifest
         Sheets with or without positions; those with positions are searched within
         :data:`~locatk.core.dots.localization.seams.MAX_PLACE_ERROR_MM` of them.
-    progress : callable
-        Called with the number of frames that were examined since the last call.
+    advance : callable
+        Called twice for each frame, when it is localized and when it is examined for seams.
 
     Raises
     ------
@@ -199,14 +203,17 @@ def calibrate_floor(
         )
     code = codec(manifest.codec)
     examined = [
-        _examine(index, recording, manifest, code, progress)
+        _examine(index, recording, manifest, code, advance)
         for index, recording in enumerate(recordings)
     ]
-    seams = [seam for each in examined for seam in _measure_seams(each, manifest, code)]
+    seams = [seam for each in examined for seam in _measure_seams(each, manifest, code, advance)]
     if any(sheet.position_mm is None for sheet in manifest.sheets):
         # The first frames give sheets rough positions, by which more are recognised.
         rough = _with_rough_positions(manifest, seams)
-        seams = [seam for each in examined for seam in _measure_seams(each, rough, code)]
+        seams = [
+            seam for each in examined for seam in _measure_seams(each, rough, code, lambda: None)
+        ]
+    manifest = crop_overlaps(manifest, seams)
     truths = [truth for each in examined for truth in _truth_observations(each, manifest)]
     sheets = _visible_sheets(manifest, examined, seams)
     poses = _initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
@@ -244,11 +251,11 @@ def _examine(
     recording: FloorRecording,
     manifest: Manifest,
     code: Codec,
-    progress: Callable[[int], None],
+    advance: Callable[[], None],
 ) -> _Examined:
     """Localize the frames of a recording on the grid, and estimate its camera if it has none."""
     frames, camera = recording.frames, recording.camera
-    localized, numbers = _localize(frames, manifest, code, camera, progress)
+    localized, numbers = _localize(frames, manifest, code, camera, advance)
     near_seam = may_show_seam(localized, numbers, manifest)
     if camera is None:
         inner = np.flatnonzero(localized.accepted & (numbers >= 0) & ~near_seam)
@@ -261,7 +268,7 @@ def _examine(
                 f"the camera of {recording.name} cannot be estimated: {error.message}",
                 hint="Give it with --camera, from `locatk calibrate camera`",
             ) from None
-        localized, numbers = _localize(frames, manifest, code, camera, lambda _: None)
+        localized, numbers = _localize(frames, manifest, code, camera, lambda: None)
         near_seam = may_show_seam(localized, numbers, manifest)
     return _Examined(index, recording, camera, localized, numbers, np.flatnonzero(near_seam))
 
@@ -294,13 +301,14 @@ def _localize(
     manifest: Manifest,
     code: Codec,
     camera: Camera | None,
-    progress: Callable[[int], None],
+    advance: Callable[[], None],
 ) -> tuple[LocalizedFrames, NDArray[np.intp]]:
     """Localize frames on the grid; return them and the sheet of each."""
     localized = unlocalized_frames(len(frames), TOO_FEW_DOTS)
     for indices, images in batches(frames, localized.rejected, camera):
         localized.update(indices, localize_frames(images, code, camera))
-        progress(len(indices))
+        for _ in indices:
+            advance()
     numbers = np.full(len(frames), -1, np.intp)
     accepted = np.flatnonzero(localized.accepted)
     numbers[accepted] = manifest.find(
@@ -310,11 +318,15 @@ def _localize(
 
 
 def _measure_seams(
-    examined: _Examined, manifest: Manifest, code: Codec
+    examined: _Examined, manifest: Manifest, code: Codec, advance: Callable[[], None]
 ) -> Iterator[SeamMeasurement]:
     """Yield the relative poses of the sheets in each frame that shows several."""
     images = examined.recording.frames.images
-    for frame in examined.seam_frames.tolist():
+    is_candidate = np.isin(np.arange(len(images)), examined.seam_frames)
+    for frame in range(len(images)):
+        advance()
+        if not is_candidate[frame]:
+            continue
         views = separate_sheets(images[frame], manifest, code, examined.camera)
         seam = measure_seam(views, manifest, examined.camera, examined.index, frame)
         if seam is not None:

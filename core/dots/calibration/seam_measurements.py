@@ -8,8 +8,10 @@ have to be known; its lens does.
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.localization.seams import SheetView
-from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest, Sheet
 from locatk.core.least_squares import DenseEquations, Indices, minimize
 from locatk.core.robust import robust_sigma
 
@@ -58,8 +60,8 @@ class SeamMeasurement:
         in rad.
     covariance : (3 k, 3 k) ndarray
         Of the poses.
-    dots : int
-        Number of dots that were used.
+    nodes : tuple of (m, 2) int ndarray
+        Grid positions of the dots of each sheet, without those that several sheets predict.
     """
 
     recording: int
@@ -68,7 +70,7 @@ class SeamMeasurement:
     points_mm: Array
     poses: Array
     covariance: Array
-    dots: int
+    nodes: tuple[NDArray[np.int64], ...]
 
 
 def measure_seam(
@@ -104,7 +106,7 @@ def measure_seam(
         fit.middles[1:],
         poses,
         covariance[np.ix_(order, order)],
-        len(fit.observed),
+        tuple(np.rint(view.grid).astype(np.int64) for view in views),
     )
 
 
@@ -247,3 +249,90 @@ class _SeamProblem:
 
     def retract(self, state: Array, step: Array) -> Array:
         return np.asarray(state + step[0])
+
+
+# ---- cuts
+
+
+def crop_overlaps(manifest: Manifest, seams: Iterable[SeamMeasurement]) -> Manifest:
+    """Return the manifest in which overlapping tiles end where one covers the other.
+
+    Dots in the overlap of two tiles are printed on both, so that a frame of them alone does not
+    reveal its tile. The frames across the seam show on which side of it each tile is visible.
+    Without them, the cut is in the middle.
+    """
+    visible: dict[int, list[NDArray[np.int64]]] = {}
+    for seam in seams:
+        for number, nodes in zip(seam.numbers, seam.nodes, strict=True):
+            visible.setdefault(number, []).append(nodes)
+    seen = {number: np.concatenate(parts) for number, parts in visible.items()}
+    sheets = list(manifest.sheets)
+    for first, second in itertools.permutations(range(len(sheets)), 2):
+        for axis in (0, 1):
+            overlap = _overlap(manifest.sheets[first], manifest.sheets[second], axis)
+            if overlap is not None:
+                low, high = overlap
+                counts = [_counts(seen.get(number), axis, low, high) for number in (first, second)]
+                cut = int(low[axis]) + _best_cut(*counts)
+                sheets[first] = _crop(sheets[first], axis, end=cut, pitch_mm=manifest.pitch_mm)
+                sheets[second] = _crop(sheets[second], axis, start=cut, pitch_mm=manifest.pitch_mm)
+    return replace(manifest, sheets=tuple(sheets))
+
+
+def _overlap(
+    first: Sheet, second: Sheet, axis: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+    """Return low and high end of the area on both tiles, if ``second`` continues ``first``.
+
+    ``axis`` is that of x or y along which it does.
+    """
+    if first.position_mm is None or second.position_mm is None or first.section != second.section:
+        return None
+    ends = [np.array(sheet.origin) + sheet.size for sheet in (first, second)]
+    low, high = np.maximum(first.origin, second.origin), np.minimum(*ends)
+    across = 1 - axis
+    if (low >= high).any() or second.origin[axis] <= first.origin[axis]:
+        return None
+    # Diagonal neighbours share a corner only.
+    is_side = high[across] - low[across] > min(first.size[across], second.size[across]) / 2
+    return (low, high) if is_side else None
+
+
+def _counts(
+    nodes: NDArray[np.int64] | None,
+    axis: int,
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Return how many dots of a tile were seen in each line of an overlap."""
+    count = int(high[axis] - low[axis])
+    if nodes is None:
+        return np.zeros(count, np.int64)
+    inside = nodes[((nodes >= low) & (nodes < high)).all(axis=1), axis] - low[axis]
+    return np.bincount(inside, minlength=count)
+
+
+def _best_cut(first: NDArray[np.int64], second: NDArray[np.int64]) -> int:
+    """Return the line from which on dots belong to the second tile; in doubt the middle."""
+    wrong = np.append(0, np.cumsum(second)) + np.append(np.cumsum(first[::-1])[::-1], 0)
+    best = np.flatnonzero(wrong == wrong.min())
+    return int(best[np.abs(best - len(first) / 2).argmin()])
+
+
+def _crop(
+    sheet: Sheet, axis: int, *, start: int | None = None, end: int | None = None, pitch_mm: float
+) -> Sheet:
+    """Return a sheet that begins at a line of the grid, or ends before it."""
+    origin, size, first_mm = list(sheet.origin), list(sheet.size), list(sheet.first_mm)
+    if start is not None and start > origin[axis]:
+        first_mm[axis] += (start - origin[axis]) * pitch_mm
+        size[axis] -= start - origin[axis]
+        origin[axis] = start
+    if end is not None:
+        size[axis] = min(size[axis], end - origin[axis])
+    return replace(
+        sheet,
+        origin=(origin[0], origin[1]),
+        size=(size[0], size[1]),
+        first_mm=(first_mm[0], first_mm[1]),
+    )
