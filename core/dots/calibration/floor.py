@@ -35,6 +35,7 @@ from locatk.core.dots.calibration.floor_fit import (
 from locatk.core.dots.calibration.floor_frame import BuiltSheet, build_sheets
 from locatk.core.dots.calibration.seam_measurements import (
     SeamMeasurement,
+    add_systematic_errors,
     crop_overlaps,
     measure_seam,
 )
@@ -214,6 +215,7 @@ def calibrate_floor(
             seam for each in examined for seam in _measure_seams(each, rough, code, lambda: None)
         ]
     manifest = crop_overlaps(manifest, seams)
+    seams = add_systematic_errors(seams, manifest.pitch_mm)
     truths = [truth for each in examined for truth in _truth_observations(each, manifest)]
     sheets = _visible_sheets(manifest, examined, seams)
     poses = _initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
