@@ -32,6 +32,7 @@ from locatk.core.dots.localization.recordings import (
     find_sheets,
     localize_recording,
 )
+from locatk.core.dots.localization.seams import relocalize_at_seams
 from locatk.core.dots.published.localization import localize_published
 from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
 from locatk.core.dots.sheet import Manifest
@@ -118,6 +119,8 @@ def solve(
     for camera_frames in frames:
         localized = localize_recording(camera_frames, manifest, code, options.camera, localize)
         sheet = find_sheets(localized, manifest)
+        if options.method != "paper" and manifest.has_seams:
+            relocalize_at_seams(camera_frames, localized, sheet, manifest, code, options.camera)
         other_codecs += count_frames_of_other_codecs(
             camera_frames, localized.rejected, manifest, options.camera
         )
@@ -176,15 +179,14 @@ def _sheet_poses(
     poses = _SheetPoses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
     for number in np.unique(sheet[sheet >= 0]):
         is_here = sheet == number
-        jacobian = manifest.jacobian(int(number))
-        heading = localized.heading[is_here]
-        poses.position[is_here] = manifest.to_metres(int(number), localized.grid[is_here])
-        right = np.column_stack([np.cos(heading), -np.sin(heading)])
-        x, y = (right @ jacobian.T).T
-        poses.heading[is_here] = np.arctan2(y, x)
-        full = np.eye(3)
-        full[:2, :2] = jacobian
-        poses.covariance[is_here] = full @ localized.covariance[is_here] @ full.T
+        poses.position[is_here], poses.heading[is_here], poses.covariance[is_here] = (
+            manifest.poses_in_metres(
+                int(number),
+                localized.grid[is_here],
+                localized.heading[is_here],
+                localized.covariance[is_here],
+            )
+        )
     return poses
 
 

@@ -102,6 +102,11 @@ class LocalizedFrames:
         for field in fields(LocalizedFrames):
             getattr(self, field.name)[indices[better]] = getattr(part, field.name)[better]
 
+    def replace(self, index: int, part: LocalizedFrames) -> None:
+        """Store the single frame of ``part`` at ``index``."""
+        for field in fields(LocalizedFrames):
+            getattr(self, field.name)[index] = getattr(part, field.name)[0]
+
 
 def unlocalized_frames(n: int, reason: str) -> LocalizedFrames:
     """Return n frames that are all rejected for ``reason``."""
@@ -238,12 +243,13 @@ class DotCorrespondences:
         In the frame, with distortion.
     grid : (m, 2) float64 ndarray
         Grid coordinates of the dot itself, with its offset, relative to :attr:`origin`.
-    origin : (2,) int64 ndarray
+    origin, section : (2,) int64 ndarray
     """
 
     pixels: NDArray[np.float64]
     grid: NDArray[np.float64]
     origin: NDArray[np.int64]
+    section: NDArray[np.int64]
 
 
 def dot_correspondences(
@@ -271,5 +277,7 @@ def dot_correspondences(
             pixels = lattices.points[0, used] * half_diagonal + centre
             if camera is not None:
                 pixels = camera.distort(pixels)
-            yield DotCorrespondences(pixels, dots.target[0, used], dots.origin[0])
+            yield DotCorrespondences(
+                pixels, dots.target[0, used], dots.origin[0], windows.section[0]
+            )
             break

@@ -67,7 +67,7 @@ def localize_recording(
     :func:`~locatk.core.dots.localization.frames.localize_frames`.
     """
     result = unlocalized_frames(len(frames), TOO_FEW_DOTS)
-    for indices, images in _batches(frames, np.arange(len(frames)), result.rejected, camera):
+    for indices, images in batches(frames, np.arange(len(frames)), result.rejected, camera):
         if localize is not None:
             part = localize(images, code, camera)
         else:
@@ -98,7 +98,7 @@ def count_frames_of_other_codecs(
     """Count the rejected frames of a sample that other codecs locate on a sheet of the manifest."""
     counts: Counter[str] = Counter()
     sample = _sample(np.flatnonzero(~np.isin(rejected, EXPLAINED) | (rejected == OFF_SHEET)))
-    for _, images in _batches(frames, sample, rejected.copy(), camera):
+    for _, images in batches(frames, sample, rejected.copy(), camera):
         for name in CODEC_NAMES:
             if name != manifest.codec:
                 part = localize_frames(images, codec(name), camera, other_codec_odds=0)
@@ -114,7 +114,7 @@ def _recognize_altered(
     def localizable(restore: Callable[[Images], Images], indices: NDArray[np.intp]) -> list[int]:
         return [
             int(index)
-            for batch, images in _batches(frames, indices, rejected, camera)
+            for batch, images in batches(frames, indices, rejected, camera)
             for index in batch[localize_frames(restore(images), code, camera).accepted]
         ]
 
@@ -134,7 +134,7 @@ def _sample(indices: NDArray[np.intp]) -> NDArray[np.intp]:
     return indices[((np.arange(count) + 0.5) * len(indices) / max(count, 1)).astype(np.intp)]
 
 
-def _batches(
+def batches(
     frames: Frames,
     chosen: NDArray[np.intp],
     rejected: NDArray[np.object_],

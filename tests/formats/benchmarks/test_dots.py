@@ -16,9 +16,8 @@ from locatk.core.dots.drawing import layout
 from locatk.core.dots.localization.frames import unlocalized_frames
 from locatk.core.errors import LocatkError
 from locatk.formats.benchmarks import timing
-from locatk.formats.benchmarks.dots import disturbances
+from locatk.formats.benchmarks.dots import disturbances, rasterised_sheets
 from locatk.formats.benchmarks.dots import printing as dots_print
-from locatk.formats.benchmarks.dots import rasterised_sheets
 from locatk.formats.benchmarks.dots import suite as dots
 from locatk.formats.benchmarks.dots.rasterisers import RASTERISERS, Rasteriser
 from locatk.formats.benchmarks.figures import Figure
