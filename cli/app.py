@@ -72,7 +72,7 @@ def _show_version(ctx: click.Context, param: click.Parameter, value: bool) -> No
     if value:
         from locatk.formats.output import tool_version
 
-        click.echo(f"locatk {tool_version()}")
+        console.write_result(f"locatk {tool_version()}\n")
         ctx.exit()
 
 
@@ -103,8 +103,28 @@ def app() -> None:
     """
 
 
+def _open_standard_streams() -> None:
+    """Connect standard streams that are closed to the null device, as if ``/dev/null`` was given.
+
+    Otherwise the next file that is opened gets the number of a closed stream, so that messages of
+    libraries would be written into a recording. A character that the encoding of a stream does not
+    contain is escaped.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            # The lowest free number is opened, which is this one; programs that are started get it.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
+        elif mode == "w":
+            getattr(sys, name).reconfigure(errors="backslashreplace")
+
+
 def main() -> None:
     """Run the `locatk` script."""
+    _open_standard_streams()
     # With protobuf 6, each schema of foxglove warns that it was generated for protobuf 5.
     warnings.filterwarnings("ignore", message="Protobuf gencode version", category=UserWarning)
     # The matrices are small: more threads would only wait for each other.

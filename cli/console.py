@@ -1,5 +1,9 @@
 """Output of commands: results on stdout; messages and progress on stderr.
 
+Characters that act upon a terminal or are invisible are printed as escapes such as ``\\x1b``,
+because names and texts may come from the files of others. A message that cannot be written (a
+closed or full stderr) is dropped and changes nothing; a result that cannot be written is an error.
+
 Messages obey ``-q`` and ``-v``. Colour appears only on a terminal (click removes it otherwise), and
 not if ``NO_COLOR`` is set. Results fit :data:`TEXT_COLUMNS`; messages are one line each, so that
 programs can filter them.
@@ -20,6 +24,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import click
+
+from locatk.core.errors import LocatkError
+from locatk.core.printable import escape_controls
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -73,33 +80,88 @@ def colour(text: str, name: str) -> str:
     return text if os.environ.get("NO_COLOR") else click.style(text, fg=name)
 
 
+def message(text: str, *, title: str = "", title_colour: str = "") -> None:
+    """Print lines on stderr, after a coloured ``title``; nothing happens if that is impossible."""
+    start = colour(title, title_colour) + " " if title else ""
+    control(start + escape_controls(text, keep="\n") + "\n")
+
+
+def control(text: str) -> None:
+    """Print text with control characters of the program itself, and no line end, on stderr."""
+    with contextlib.suppress(OSError):
+        click.echo(text, err=True, nl=False)
+
+
 def say(text: str) -> None:
     """Print a message, unless ``-q`` was given."""
     if talks():
-        click.echo(text, err=True)
+        message(text)
 
 
 def detail(text: str) -> None:
     """Print a message if ``-v`` was given."""
     if verbose():
-        click.echo(text, err=True)
+        message(text)
 
 
 def warn(text: str) -> None:
     """Print a warning about the result, unless ``-q`` was given."""
     if talks():
-        click.echo(colour("Warning:", "yellow") + f" {text}", err=True)
+        message(on_one_line(text), title="Warning:", title_colour="yellow")
+
+
+def on_one_line(text: str) -> str:
+    """Return ``text`` with line ends and other invisible characters as escapes."""
+    return escape_controls(text)
 
 
 def result(text: str) -> None:
-    """Print a result as text on stdout, unless ``--json`` was given."""
+    """Print a result as text on stdout, unless ``--json`` was given.
+
+    Raises
+    ------
+    LocatkError
+        See :func:`write_result`.
+    """
     if not _state.json:
-        click.echo(text)
+        write_result(escape_controls(text, keep="\n") + "\n")
 
 
 def emit_json(value: Any) -> None:
-    """Print ``value`` as one line of JSON; numpy values become plain, nan becomes null."""
-    click.echo(json.dumps(plain(value), allow_nan=False))
+    """Print ``value`` as one line of JSON; numpy values become plain, nan becomes null.
+
+    Characters outside of ASCII are escaped, as JSON permits.
+    """
+    write_result(json.dumps(plain(value), allow_nan=False) + "\n")
+
+
+def emit_file(data: bytes) -> None:
+    """Print the content of an output file, unchanged unless stdout is a terminal."""
+    is_terminal = sys.stdout.isatty()
+    write_result(
+        escape_controls(data.decode("utf-8", "replace"), keep="\r\n\t") if is_terminal else data
+    )
+
+
+def write_result(text: str | bytes) -> None:
+    """Write to stdout.
+
+    Raises
+    ------
+    LocatkError
+        It cannot be written, as on a full disk.
+    BrokenPipeError
+        Its reader has ended; click ends the program.
+    """
+    try:
+        click.echo(text, nl=False)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise LocatkError(
+            f"the standard output cannot be written ({error.strerror or error})",
+            hint="Free some space, or print into another file",
+        ) from None
 
 
 def plain(value: Any) -> Any:
@@ -126,7 +188,7 @@ def table(
     column. If it is still too wide, the columns continue in further tables that repeat the first
     column.
     """
-    cells = [["" if cell is None else str(cell) for cell in row] for row in rows]
+    cells = [["" if cell is None else on_one_line(str(cell)) for cell in row] for row in rows]
     columns = [list(column) for column in zip(header, *cells, strict=True)]
     titles = _wrap_titles(columns, max_width)
     widths = [
@@ -224,7 +286,8 @@ def labelled(rows: Sequence[tuple[str, str]], *, indent: int = 0) -> str:
     lines = []
     for label, text in rows:
         start = " " * indent + label
-        parts = _wrap_words(text, max(MIN_TEXT_COLUMNS, TEXT_COLUMNS - margin))
+        shown = escape_controls(text, keep="\n")
+        parts = _wrap_words(shown, max(MIN_TEXT_COLUMNS, TEXT_COLUMNS - margin))
         lines += [(start if n == 0 else "").ljust(margin) + part for n, part in enumerate(parts)]
     return "\n".join(line.rstrip() for line in lines)
 
@@ -272,7 +335,7 @@ def working(label: str) -> Iterator[None]:
     """Show a label on a terminal while one long call runs."""
     shown = _shows_progress()
     if shown:
-        click.echo(f"{label} ...", err=True, nl=False)
+        control(f"{label} ...")
     try:
         yield
     finally:
@@ -282,4 +345,4 @@ def working(label: str) -> Iterator[None]:
 
 def erase_line() -> None:
     """Erase the last line of a terminal."""
-    click.echo("\r\x1b[K", err=True, nl=False)
+    control("\r\x1b[K")

@@ -20,7 +20,7 @@ from locatk.cli.command import Command
     help="Device that sent the bytes, as in `locatk capture`; auto identifies it.  "
     "[default: that of the recording]",
 )
-@options.output("Session to write (.mcap).")
+@options.output("Session to write (.mcap).", endings=(".mcap",))
 @options.input_option(
     "--artifact",
     many=True,

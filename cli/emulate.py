@@ -32,9 +32,9 @@ FRACTION = click.FloatRange(0, 1)
     click.option(
         "--link", type=options.PATH, metavar="PATH", help="Path of the port.  [default: a new path]"
     ),
-    click.option(
+    options.output_option(
         "--save",
-        type=options.PATH,
+        endings=(".mcap",),
         metavar="FILE",
         help="Also write the simulated session of SYSTEM (.mcap), with artifacts and truth.",
     ),

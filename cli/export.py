@@ -21,6 +21,16 @@ FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
 CONFIG = "crazyflie-config"
 """Format of Lighthouse stations."""
 
+ENDINGS = {
+    "tum": (".tum", ".txt"),
+    "kitti": (".kitti", ".txt"),
+    "csv": (".csv",),
+    "parquet": (".parquet", ".pq"),
+    "ros2": (".mcap",),
+    CONFIG: (".yaml", ".yml"),
+}
+"""Endings of the names of each format."""
+
 STDOUT = Path("-")
 
 
@@ -66,7 +76,8 @@ def command(
     For crazyflie-config it may also be a scene (scene.toml).
 
     \b
-    tum      time and pose, one file per device, for evo and others
+    tum      time and pose, one file per device, for evo and others; an
+             unknown orientation is 0 0 0 1
     kitti    3 x 4 matrices, one file per device; times in a second file
     csv      time_s, device, x_m, y_m, z_m, qx, qy, qz, qw, sigma_x_m,
              sigma_y_m, sigma_z_m, sigma_heading_rad, probability; unknown
@@ -99,6 +110,7 @@ def command(
         option = "--json" if as_json else f"--format {format_name}"
         raise click.UsageError(f"{option} cannot be combined with -o -, which is for csv and tum.")
     if format_name == CONFIG:
+        options.check_ending(output, ENDINGS[CONFIG])
         if devices:
             raise click.UsageError(f"--device is for poses; {CONFIG} contains stations.")
         export_stations(solution, output, overwrite=overwrite, as_json=as_json)
@@ -111,7 +123,8 @@ def command(
     if lost == poses:
         raise InputError(f"none of the {poses} poses is a number", file=solution)
     if output == STDOUT:
-        click.echo(render(tracks, format_name), nl=False)
+        console.emit_file(render(tracks, format_name))
+        warn_of_orientations(tracks, format_name)
         check_loss(lost)
         return
 
@@ -120,6 +133,8 @@ def command(
         options.make_folder(output)
     for path in (path for part in planned for path in part.files):
         options.guard_output(path, overwrite=overwrite, inputs=[solution])
+    if planned[0].path == output:
+        options.check_ending(output, ENDINGS[format_name])
     facts = exports.read_origin(solution)
     for part in planned:
         exports.write(part, format_name, facts=facts, covariance=covariance, overwrite=overwrite)
@@ -127,7 +142,8 @@ def command(
     if format_name == "kitti":
         name = planned[0].times if len(planned) == 1 else f"{output}/*.times.txt"
         console.say(f"KITTI files have no times: the times are in {name}")
-    if format_name == "ros2" and output.suffix != ".mcap":
+    warn_of_orientations(tracks, format_name)
+    if format_name == "ros2" and not output.suffix:
         console.warn(f"{output} does not end in .mcap, which ros2 bag and evo require")
     if as_json:
         files = [
@@ -179,6 +195,18 @@ def check_loss(lost: int) -> None:
     if lost:
         poses = "1 pose that is not a number" if lost == 1 else f"{lost} poses that are not numbers"
         raise failures.Incomplete(f"left out {poses}")
+
+
+def warn_of_orientations(tracks: list[Trajectory], format_name: str) -> None:
+    """Warn about unknown orientations that a format cannot represent."""
+    from locatk.core.trajectory import has_orientation
+
+    devices = [track.device for track in tracks if not has_orientation(track).all()]
+    if devices and format_name in ("tum", "kitti", "ros2"):
+        console.warn(
+            f"the orientation of {', '.join(devices)} is unknown; {format_name} has no value for "
+            "it, so that the identity was written"
+        )
 
 
 def select_devices(

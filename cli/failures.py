@@ -52,11 +52,13 @@ def finish_with_warnings(warnings: Sequence[str]) -> None:
 
 def report(error: BaseException) -> int:
     """Print ``error`` as one line on stderr and return its exit status."""
+    if isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError):
+        error = error.__cause__  # click takes it for Ctrl-D; no command reads from the terminal
     if isinstance(error, click.Abort):
-        click.echo("Aborted", err=True)
+        console.message("Aborted")
         return INTERRUPTED_STATUS
     if isinstance(error, Incomplete):
-        click.echo(_line("Incomplete", "yellow", error.format_message(), None), err=True)
+        _print("Incomplete", "yellow", error.format_message(), None)
         return error.exit_code
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         error.show()
@@ -70,7 +72,7 @@ def report(error: BaseException) -> int:
         return error.exit_code
 
     if console.verbose():
-        click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
+        console.message("".join(traceback.format_exception(error)).rstrip())
     if isinstance(error, LocatkError):
         _print_error(str(error), error.hint or system_hint(error))
         return error.exit_status
@@ -100,11 +102,11 @@ def print_error(error: LocatkError) -> None:
 
 
 def _print_error(problem: str, hint: str | None) -> None:
-    click.echo(_line("Error", "red", problem, hint), err=True)
+    _print("Error", "red", problem, hint)
 
 
-def _line(word: str, colour: str, problem: str, hint: str | None) -> str:
-    return console.colour(f"{word}:", colour) + " " + _sentences(problem, hint)
+def _print(word: str, colour: str, problem: str, hint: str | None) -> None:
+    console.message(_sentences(problem, hint), title=f"{word}:", title_colour=colour)
 
 
 def _sentences(problem: str, hint: str | None) -> str:

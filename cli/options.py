@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -50,9 +50,70 @@ def input_option(*names: str, help: str, many: bool = False, **more: Any) -> Cal
 sessions = input_argument("sessions", many=True)
 
 
-def output(help: str, *, required: bool = True) -> Callable[[F], F]:
-    """Return the option ``-o/--output``."""
-    return click.option("-o", "--output", type=PATH, required=required, help=help)
+def check_ending(path: Path, endings: Sequence[str]) -> None:
+    """Refuse the name of an output that ends like a file of another format.
+
+    A name without ending is accepted.
+
+    Raises
+    ------
+    UsageError
+    """
+    if path.suffix and path.suffix.lower() not in endings:
+        raise click.UsageError(
+            f"{path.name!r} ends like a file of another format; end it in {' or '.join(endings)}."
+        )
+
+
+def choose_format(path: Path, given: str | None, endings: Mapping[str, Sequence[str]]) -> str:
+    """Return the format ``given``, which must fit the ending of a file, or that of the ending.
+
+    Parameters
+    ----------
+    path : Path
+    given : str or None
+        By ``--format``.
+    endings : mapping of str to sequence of str
+        Endings of the names of each format, in lower case.
+
+    Raises
+    ------
+    UsageError
+        The ending is unknown, or is not of the format ``given``.
+    """
+    if given is not None:
+        check_ending(path, endings[given])
+        return given
+    for name, candidates in endings.items():
+        if path.suffix.lower() in candidates:
+            return name
+    known = ", ".join(ending for candidates in endings.values() for ending in candidates)
+    raise click.UsageError(f"The ending of {path.name!r} is not a known format ({known}).")
+
+
+def _ending_check(
+    endings: Sequence[str],
+) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
+    """Return a callback that applies :func:`check_ending`; without endings, it accepts all."""
+
+    def callback(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
+        if value is not None and endings:
+            check_ending(value, endings)
+        return value
+
+    return callback
+
+
+def output(
+    help: str, *, required: bool = True, endings: Sequence[str] = (), cls: type | None = None
+) -> Callable[[F], F]:
+    """Return the option ``-o/--output``; ``endings`` are those of the names of its format."""
+    return output_option("-o", "--output", required=required, help=help, endings=endings, cls=cls)
+
+
+def output_option(*names: str, help: str, endings: Sequence[str], **more: Any) -> Callable[[F], F]:
+    """Return an option that names a file to write, with a name that has one of ``endings``."""
+    return click.option(*names, type=PATH, callback=_ending_check(endings), help=help, **more)
 
 
 overwrite = click.option("--overwrite", is_flag=True, help="Replace the output if it exists.")

@@ -18,7 +18,7 @@ MAX_LISTED_LOSSES = 20
 
 @click.command(cls=Command, short_help="Salvage a damaged recording.")
 @options.input_argument("file")
-@options.output("Recording to write (.mcap).")
+@options.output("Recording to write (.mcap).", endings=(".mcap",))
 @options.overwrite
 @options.as_json
 @options.verbosity

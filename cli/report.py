@@ -12,6 +12,7 @@ import click
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
 from locatk.cli.eval.command import align_option, offset_option
+from locatk.core.printable import file_name_part
 
 PAGE_SUFFIXES = (".html", ".htm")
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
@@ -147,7 +148,7 @@ def plan_outputs(
         ]
         return page, [pictures]
     return page, [
-        [output.with_name(f"{output.stem}-{name}{each}") for each in suffixes]
+        [output.with_name(f"{output.stem}-{file_name_part(name)}{each}") for each in suffixes]
         for name in _unique_stems(solutions)
     ]
 

@@ -468,39 +468,42 @@ static float median_contrast(float *contrasts, int count, int min_dots, int spli
     return contrasts[count - 1 - (count - 1) / 2];
 }
 
-/* Slope along one axis of the plane fitted to the paper's brightness [grey levels per pixel]. */
-static float paper_slope(const float *paper, int count, int step, int across, int across_step,
-                         int block)
+/* Slope of the paper's brightness along one axis about a block, relative to it [1 / pixel], from
+ * the blocks `reach` before and after. They are moved inwards where the windows of `window` blocks
+ * over which they are averaged would leave the image. */
+static float paper_slope(const float *paper, int index, int count, int step, int block, int window,
+                         int reach, float brightness, float limit)
 {
-    double sum = 0, squares = 0;
-    for (int k = 0; k < count; k++) {
-        const double from_centre = k - (count - 1) / 2.0;
-        double line = 0;
-        for (int j = 0; j < across; j++) line += paper[k * step + j * across_step];
-        sum += line / across * from_centre;
-        squares += from_centre * from_centre;
-    }
-    return (float)(sum / (squares > 1 ? squares : 1) / block);
+    const int first = window / 2 + reach, last = count - 1 - first;
+    int middle = index > first ? index : first;
+    if (middle > last) middle = last;
+    int before = middle - reach, after = middle + reach;
+    before = before > 0 ? before : 0;
+    after = after < count - 1 ? after : count - 1;
+    if (after <= before) return 0;
+    const float difference = paper[(after - index) * step] - paper[(before - index) * step];
+    const float slope = difference / (float)((after - before) * block) / brightness;
+    return slope < -limit ? -limit : slope > limit ? limit : slope;
 }
 
-/* Offset of a minimum along one axis [pixels]: top of the Gaussian through it and its neighbours.
- */
-static float minimum_offset(const float *minimum, int step, float brightness, float slope,
-                            float contrast, float top)
+/* Offset of a minimum along one axis [pixels]: top of the Gaussian through the ink at it and its
+ * neighbours, where `slope` is that of the light, relative to it. */
+static float minimum_offset(const float *minimum, int step, float brightness, float slope, float ink,
+                            float top, float smoothing_variance)
 {
-    const float floor = 0.05f * contrast;
-    const float before = brightness - slope - minimum[-step],
-                after = brightness + slope - minimum[step];
+    const float floor = 0.05f * ink;
+    const float before = 1 - minimum[-step] / (brightness * (1 - slope)),
+                after = 1 - minimum[step] / (brightness * (1 + slope));
     const float a = logf(before > floor ? before : floor);
     const float b = logf(after > floor ? after : floor);
     float curvature = 2 * top - a - b;
     curvature = curvature > 1e-6f ? curvature : 1e-6f;
-    const float offset = 0.5f * (b - a) / curvature;
-    return offset < -0.5f ? -0.5f : offset > 0.5f ? 0.5f : offset;
+    const float offset = 0.5f * (b - a) / curvature + smoothing_variance * slope;
+    return offset < -1.0f ? -1.0f : offset > 1.0f ? 1.0f : offset;
 }
 
 typedef struct {
-    float x, y, contrast, square_radius; /* square_radius: from the centre of the image */
+    float x, y, square_radius; /* square_radius: from the centre of the image */
 } Dot;
 
 /* Order of dots from the centre outwards. NaN comes last: qsort requires a total order. */
@@ -511,8 +514,8 @@ static int by_square_radius(const void *a, const void *b)
 }
 
 typedef struct {
-    int h, w, block, window, min_dots, splits, max_dots, rows, columns;
-    float min_contrast, contrast_fraction;
+    int h, w, block, window, slope_reach, min_dots, splits, max_dots, rows, columns;
+    float max_slope, min_contrast, contrast_fraction;
     const float *taps;
     float *smooth, *across, *line, *means, *blurred, *paper, *contrasts, *brightnesses;
     int *sums;
@@ -543,24 +546,34 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
             d->brightnesses[minima] = brightness;
             d->contrasts[minima] = contrast / brightness;
             dots[minima].x = (float)x;
-            dots[minima].y = (float)y;
-            dots[minima++].contrast = contrast;
+            dots[minima++].y = (float)y;
         }
     }
     memcpy(d->across, d->contrasts, (size_t)minima * sizeof(float));
     const float threshold =
         d->contrast_fraction * median_contrast(d->across, minima, d->min_dots, d->splits);
     const int rows = d->rows, columns = d->columns;
-    const float slope_x = paper_slope(d->paper, columns, 1, rows, columns, d->block);
-    const float slope_y = paper_slope(d->paper, rows, columns, columns, 1, d->block);
+    float smoothing_variance = 0;
+    for (int k = 0; k < 2; k++) smoothing_variance += 2 * d->taps[k] * (float)((2 - k) * (2 - k));
     int kept = 0;
     for (int k = 0; k < minima; k++) {
         if (!(d->contrasts[k] > threshold)) continue;
-        const float brightness = d->brightnesses[k], contrast = dots[k].contrast,
-                    top = logf(contrast);
-        const float *minimum = d->smooth + (size_t)dots[k].y * w + (size_t)dots[k].x;
-        const float x = dots[k].x + minimum_offset(minimum, 1, brightness, slope_x, contrast, top);
-        const float y = dots[k].y + minimum_offset(minimum, w, brightness, slope_y, contrast, top);
+        const float brightness = d->brightnesses[k], ink = d->contrasts[k], top = logf(ink);
+        const int px = (int)dots[k].x, py = (int)dots[k].y;
+        const float *minimum = d->smooth + (size_t)py * w + (size_t)px;
+        const int row = py / d->block < rows ? py / d->block : rows - 1;
+        const int column = px / d->block < columns ? px / d->block : columns - 1;
+        const float *paper = d->paper + row * columns + column;
+        const float slope_x = paper_slope(paper, column, columns, 1, d->block, d->window,
+                                          d->slope_reach, brightness, d->max_slope);
+        const float slope_y = paper_slope(paper, row, rows, columns, d->block, d->window,
+                                          d->slope_reach, brightness, d->max_slope);
+        const float x = dots[k].x
+                        + minimum_offset(minimum, 1, brightness, slope_x, ink, top,
+                                         smoothing_variance);
+        const float y = dots[k].y
+                        + minimum_offset(minimum, w, brightness, slope_y, ink, top,
+                                         smoothing_variance);
         const float dx = x - 0.5f * (float)(w - 1), dy = y - 0.5f * (float)(h - 1);
         dots[kept].x = x;
         dots[kept].y = y;
@@ -586,10 +599,10 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     (void)self;
     Call call = {0};
     PyObject *images_array, *taps_array, *xy_array, *counts_array;
-    long long n, h, w, block, window, min_dots, splits, max_dots;
+    long long n, h, w, block, window, reach, min_dots, splits, max_dots;
     Detector d;
-    if (!parse_arguments(args, "OLLLOLLffLLLOO:find_dots", &images_array, &n, &h, &w, &taps_array,
-                         &block, &window, &d.min_contrast, &d.contrast_fraction, &min_dots,
+    if (!parse_arguments(args, "OLLLOLLLfffLLLOO:find_dots", &images_array, &n, &h, &w,
+                         &taps_array, &block, &window, &reach, &d.max_slope, &d.min_contrast, &d.contrast_fraction, &min_dots,
                          &splits, &max_dots, &xy_array, &counts_array))
         return NULL;
     check_range(&call, "n", n, 0, INT_MAX);
@@ -599,6 +612,7 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     check_range(&call, "block", block, 1, h < w ? h : w);
     check_range(&call, "block", block, 1, MAX_BLOCK);
     check_range(&call, "window", window, 1, MAX_WINDOW);
+    check_range(&call, "slope_reach", reach, 1, MAX_WINDOW);
     check_range(&call, "min_dots", min_dots, 0, INT_MAX);
     check_range(&call, "splits", splits, 0, MAX_SPLITS);
     check_range(&call, "max_dots", max_dots, 0, INT_MAX);
@@ -612,6 +626,7 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     d.w = (int)w;
     d.block = (int)block;
     d.window = (int)window;
+    d.slope_reach = (int)reach;
     d.min_dots = (int)min_dots;
     d.splits = (int)splits;
     d.max_dots = (int)max_dots;
@@ -1711,7 +1726,7 @@ static PyObject *ddtw(PyObject *self, PyObject *args)
 /* The first line of a docstring is the signature that Python's inspect module reads. */
 static PyMethodDef methods[] = {
     {"find_dots", find_dots, METH_VARARGS,
-     "find_dots($module, images, n, height, width, taps, block, window, min_contrast,"
+     "find_dots($module, images, n, height, width, taps, block, window, slope_reach, max_slope, min_contrast,"
      " contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
      "Detect the dots of images; twin of locatk.core.dots.detection.blobs.detect_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,

@@ -10,6 +10,8 @@ def find_dots(
     taps: Buffer,
     block: int,
     window: int,
+    slope_reach: int,
+    max_slope: float,
     min_contrast: float,
     contrast_fraction: float,
     min_dots: int,

@@ -124,13 +124,12 @@ class Trajectory:
 def has_orientation(trajectory: Trajectory, *, trust_identity: bool = False) -> NDArray[np.bool_]:
     """Return a mask (n,) of the poses that report an orientation.
 
-    A pose reports none if its position has a covariance and its rotation has none (a single
+    A pose reports none if its position has a covariance and its heading has none (a single
     photodiode). Nor do the poses of a trajectory without rotation covariances whose orientations
     are all the identity (a point), unless ``trust_identity`` is set.
     """
-    rotation_variance = np.stack([trajectory.covariance[:, k, k] for k in (3, 4, 5)])
-    has_rotation_variance = np.any(np.isfinite(rotation_variance), axis=0)
-    is_point = not has_rotation_variance.any() and bool(np.all(trajectory.quaternion[:, :3] == 0.0))
+    has_heading_variance = np.isfinite(trajectory.covariance[:, 5, 5])
+    is_point = not has_heading_variance.any() and bool(np.all(trajectory.quaternion[:, :3] == 0.0))
     if is_point and not trust_identity:
-        return has_rotation_variance
-    return has_rotation_variance | np.isnan(trajectory.covariance[:, 0, 0])
+        return has_heading_variance
+    return has_heading_variance | np.isnan(trajectory.covariance[:, 0, 0])

@@ -51,7 +51,8 @@ def atomic_write(
     """Open ``path`` for writing; it appears when the block ends without an exception.
 
     The data go to a hidden file in the same folder, which is synced to the disk and renamed at
-    the end; an exception of any kind removes it.
+    the end; an exception of any kind removes it. If the process is killed, the hidden file stays
+    until the same output is written again.
 
     Parameters
     ----------
@@ -74,11 +75,12 @@ def atomic_write(
     target = Path(path)
     if os.path.islink(target):
         target = Path(os.path.realpath(target))  # replace what it points to, not the link
-    part = target.with_name(f".{target.name[:50]}.{secrets.token_hex(4)}.part")
+    remove_stale_parts(target)
+    part = target.with_name(f"{_part_prefix(target)}{secrets.token_hex(4)}{PART_SUFFIX}")
     text: dict[str, Any] = {"encoding": "utf-8", "newline": ""} if mode == "w" else {}
     try:
         with _errors_of_locatk(target, part):
-            with open(part, mode.replace("w", "x"), **text) as stream:
+            with _open_part(part, mode, text) as stream:
                 yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -90,6 +92,56 @@ def atomic_write(
         with contextlib.suppress(OSError):
             part.unlink()
         raise
+
+
+PART_SUFFIX = ".part"
+"""End of the name of an unfinished output."""
+
+
+def _part_prefix(target: Path) -> str:
+    """Return the beginning of the names of unfinished outputs for ``target``."""
+    return f".{target.name[:50]}."
+
+
+def _open_part(part: Path, mode: str, text: dict[str, Any]) -> IO[Any]:
+    """Create and lock an unfinished output.
+
+    In the instant between both, another process may take it for a stale one, and remove it.
+    """
+    while True:
+        stream = open(part, mode.replace("w", "x"), **text)  # noqa: SIM115 - the caller closes it
+        _lock(stream.fileno(), wait=True)
+        if os.name == "nt" or os.fstat(stream.fileno()).st_nlink:
+            return stream
+        stream.close()
+
+
+def remove_stale_parts(target: Path) -> None:
+    """Remove unfinished outputs for ``target`` of processes that were killed.
+
+    Those of running processes are locked; on Windows, open files cannot be removed anyway.
+    """
+    prefix = _part_prefix(target)
+    with contextlib.suppress(OSError), os.scandir(target.parent) as entries:
+        for entry in entries:
+            if not (entry.name.startswith(prefix) and entry.name.endswith(PART_SUFFIX)):
+                continue
+            with contextlib.suppress(OSError), open(entry.path, "rb") as stream:
+                if _lock(stream.fileno()):
+                    os.unlink(entry.path)
+
+
+def _lock(descriptor: int, *, wait: bool = False) -> bool:
+    """Lock a file until it is closed; return False if another process has the lock."""
+    try:
+        import fcntl  # not on Windows
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:  # locked, or a file system without locks
+        return False
+    return True
 
 
 def _move_to_free_name(part: Path, target: Path) -> None:

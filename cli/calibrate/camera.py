@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     "camera", cls=Command, short_help="Fit focal length, centre and distortion of a camera."
 )
 @options.input_argument("session")
-@options.output("Camera to write (.toml).")
+@options.output("Camera to write (.toml).", endings=(".toml",))
 @options.overwrite
 @section(
     "Input",

@@ -24,7 +24,7 @@ MAX_LANDMARKS = 40
 
 @click.command("map", cls=Command, short_help="Fit the landmarks of a map as built.")
 @options.sessions
-@options.output("Map to write (.toml), with the landmarks as built.")
+@options.output("Map to write (.toml), with the landmarks as built.", endings=(".toml",))
 @options.overwrite
 @section("Input", options.artifact)
 @options.as_json

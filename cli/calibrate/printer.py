@@ -24,7 +24,7 @@ MEASURED_LENGTH = click.FloatRange(50.0, 150.0)
 
 @click.command("printer", cls=Command, short_help="Find the best dots and the scale of a printer.")
 @options.input_argument("scan")
-@options.output("Calibration to write (.toml).", required=False)
+@options.output("Calibration to write (.toml).", required=False, endings=(".toml",))
 @options.overwrite
 @section(
     "Scale",

@@ -14,7 +14,7 @@ from locatk.core.errors import InputError
 
 @click.command("scene", cls=Command, short_help="Estimate the poses of Lighthouse stations.")
 @options.input_argument("session")
-@options.output("Scene to write (.toml).")
+@options.output("Scene to write (.toml).", endings=(".toml",))
 @click.option(
     "--method",
     type=click.Choice(("bundle", "paper")),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.command("tag", cls=Command, short_help="Fit the magnets of tags as built.")
 @options.sessions
-@options.output("Tags to write (.toml), with the magnets as built.")
+@options.output("Tags to write (.toml), with the magnets as built.", endings=(".toml",))
 @options.overwrite
 @section("Input", options.artifact, speed_option)
 @options.as_json

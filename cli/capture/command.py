@@ -10,7 +10,7 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.capture import text as capture_text
-from locatk.cli.capture.options import DURATION, ROTATION, SIZE, columns_option
+from locatk.cli.capture.options import DURATION, ROTATION, SIZE, SIZE_OR_ZERO, columns_option
 from locatk.cli.command import Command, section
 from locatk.cli.signals import asked_to_stop
 
@@ -50,7 +50,7 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
         help="Device at the port: locatk, polaris-array, magx-array, lighthouse-deck, "
         "dotbot-gateway, lines, raw; auto identifies it from the first seconds.",
     ),
-    options.output("Session to write (.mcap).", required=False),
+    options.output("Session to write (.mcap).", required=False, endings=(".mcap",)),
     options.overwrite,
     click.option("--baud", type=click.IntRange(min=1), help="[default: that of the device]"),
     columns_option,
@@ -113,9 +113,9 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
     options.number(
         "--reserve",
         default="64MiB",
-        type=SIZE,
+        type=SIZE_OR_ZERO,
         metavar="SIZE",
-        help="Stop when less than this much disk space is free.",
+        help="Stop when less than this much disk space is free; 0 uses all of it.",
     ),
 )
 @section(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -20,10 +21,13 @@ MIN_PART_S, MIN_PART_BYTES = 1.0, 100_000
 
 
 class _Quantity(click.ParamType[float]):
-    """Positive number with a unit."""
+    """Positive number with a unit, or 0 if that is possible."""
 
-    def __init__(self, name: str, units: dict[str, Any], example: str) -> None:
+    def __init__(
+        self, name: str, units: dict[str, Any], example: str, *, can_be_zero: bool = False
+    ) -> None:
         self.name, self._units, self._example = name, units, example
+        self._can_be_zero = can_be_zero
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -32,9 +36,9 @@ class _Quantity(click.ParamType[float]):
             return value
         match = _NUMBER.fullmatch(value.strip())
         factor = self._units.get(match[2].lower()) if match else None
-        if match is None or factor is None or not 0 < float(match[1]) * factor < MAX_QUANTITY:
+        number = math.nan if match is None or factor is None else float(match[1]) * factor
+        if not 0 <= number < MAX_QUANTITY or (number == 0 and not self._can_be_zero):
             self.fail(f"{value!r} is not a {self.name}; examples: {self._example}", param, ctx)
-        number: float = float(match[1]) * factor
         return number
 
 
@@ -43,6 +47,9 @@ DURATION = _Quantity("time", _SECONDS, "90, 90s, 5min or 2h")
 
 SIZE = _Quantity("size", _BYTES, "500MB, 2GB or 64MiB")
 """Converts to bytes as a float."""
+
+SIZE_OR_ZERO = _Quantity("size", _BYTES, "0, 500MB, 2GB or 64MiB", can_be_zero=True)
+"""Converts to bytes as a float, which may be 0."""
 
 
 class RotationType(click.ParamType[tuple[str, float]]):

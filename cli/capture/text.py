@@ -8,8 +8,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import click
-
 from locatk.cli import console
 
 ENDS = {
@@ -46,36 +44,25 @@ class Live:
 
     def tell(self, text: str) -> None:
         """Report an event."""
-        with self._without_reader():
-            self.wipe()
-            console.warn(text)
+        self.wipe()
+        console.warn(text)
 
     def show(self, status: Any) -> None:
         """Show the status."""
         if not self._shown:
             return
         text = status_line(status)
-        with self._without_reader():
-            if self._terminal:
-                text = text[: shutil.get_terminal_size().columns - 1]
-                click.echo("\r" + text.ljust(self._width), err=True, nl=False)
-                self._width = len(text)
-            else:
-                click.echo(text, err=True)
-
-    @contextlib.contextmanager
-    def _without_reader(self) -> Iterator[None]:
-        """Continue the recording if stderr is closed."""
-        try:
-            yield
-        except OSError:
-            console.set_verbosity(-1)
-            self._shown, self._width = False, 0
+        if self._terminal:
+            text = text[: shutil.get_terminal_size().columns - 1]
+            console.control("\r" + text.ljust(self._width))
+            self._width = len(text)
+        else:
+            console.message(text)
 
     def wipe(self) -> None:
         """Remove the status line."""
         if self._width:
-            click.echo("\r" + " " * self._width + "\r", err=True, nl=False)
+            console.control("\r" + " " * self._width + "\r")
             self._width = 0
 
 

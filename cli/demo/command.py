@@ -24,6 +24,7 @@ REPORT = "report.html"
 @options.output(
     f"Report to write (.html).  [default: {REPORT}, in the folder of --keep if given]",
     required=False,
+    endings=(".html",),
 )
 @options.overwrite
 @section(

@@ -163,6 +163,7 @@ def command(
     options.guard_output(
         output, overwrite=overwrite, inputs=[*paths, *given.get("truth", ()), *input_files]
     )
+    options.check_ending(output, (".toml",) if format_name == "crazyflie-config" else (".mcap",))
     results, lost = chosen.run(options.load(chosen.reader), paths, output, given, overwrite)
     warnings = results["warnings"]
     for warning in warnings[:MAX_PRINTED_WARNINGS]:

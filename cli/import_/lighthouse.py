@@ -134,10 +134,6 @@ def import_scene(
     from locatk.formats.artifacts import scene as artifacts
     from locatk.formats.descriptions.lighthouse import describe_scene
 
-    if output.suffix.lower() != ".toml":
-        raise click.UsageError(
-            f"-o {output}: the output is a scene, whose name ends in .toml (scene.toml)."
-        )
     scene = reader(paths[0])
     artifacts.write_scene(output, scene, overwrite=overwrite)
     description = describe_scene(scene)

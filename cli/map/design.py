@@ -30,7 +30,7 @@ OVERLAP_TOLERANCE_M = 1e-9
 
 @click.command(cls=Command)
 @click.argument("size", metavar="[ROWSxCOLS]", type=Size(), required=False)
-@options.output("Map to write (.toml).", required=False)
+@options.output("Map to write (.toml).", required=False, endings=(".toml",))
 @click.option("--name", default="", metavar="TEXT", help="Descriptive name of the map.")
 @click.option(
     "--landmark",

@@ -16,18 +16,14 @@ if TYPE_CHECKING:
 
     from locatk.core.landmarks.map.floor import FloorMap
 
-ENDINGS = {".csv": "csv", ".json": "lif", ".lif": "lif", ".yaml": "ros", ".svg": "svg"}
-ENDINGS |= {".yml": "ros", ".dxf": "dxf"}
-FORMATS = ("csv", "lif", "ros", "svg", "dxf")
+ENDINGS = {
+    "csv": (".csv",),
+    "lif": (".json", ".lif"),
+    "ros": (".yaml", ".yml"),
+    "svg": (".svg",),
+    "dxf": (".dxf",),
+}
 LIF_VERSIONS = ("1.0.0", "2.0.0")
-
-
-def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
-    """Return the given format, or that of the ending of the file."""
-    name = given or ENDINGS.get(path.suffix.lower(), "")
-    if name not in known:
-        raise click.UsageError(f"The ending of {path.name} is not a known format; give --format.")
-    return name
 
 
 @click.command(cls=Command)
@@ -35,7 +31,7 @@ def format_of(path: Path, given: str | None, known: tuple[str, ...]) -> str:
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice(FORMATS),
+    type=click.Choice(tuple(ENDINGS)),
     help="Format of the output.  [default: by the ending of the output: .csv, .json "
     "(LIF), .yaml (ROS), .svg, .dxf]",
 )
@@ -93,14 +89,12 @@ def command(
     from locatk.formats.artifacts.maps import read_map
     from locatk.formats.output import atomic_write
 
-    format_name = format_of(output, format_name, FORMATS)
+    format_name = options.choose_format(output, format_name, ENDINGS)
     if lif_version is not None and format_name != "lif":
         raise click.UsageError(f"--lif-version is of --format lif, not of {format_name}.")
     if unique_codes and format_name != "csv":
         raise click.UsageError(f"--unique-codes is of --format csv, not of {format_name}.")
     files = [output, output.with_suffix(".pgm")] if format_name == "ros" else [output]
-    if len(set(files)) < len(files):
-        raise click.UsageError("The image of `ros` is the .pgm; end the output with .yaml.")
     for path in files:
         options.guard_output(path, overwrite=overwrite, inputs=[map_file])
     floor = read_map(map_file)

@@ -9,7 +9,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
-from locatk.cli.map.export import format_of
+from locatk.cli.map.export import ENDINGS
 
 FORMATS = ("csv", "lif")
 ALPHABETS = ("6", "16", "compass")
@@ -24,7 +24,7 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
     type=click.Choice(FORMATS),
     help="Format of SOURCE.  [default: by the ending of SOURCE: .csv, .json (LIF)]",
 )
-@options.output("Map to write (.toml).")
+@options.output("Map to write (.toml).", endings=(".toml",))
 @section(
     "Grid",
     click.option(
@@ -90,7 +90,9 @@ def command(
     from locatk.formats.artifacts.maps import dumps_map, loads_map, read_map, write_map
     from locatk.formats.files import read_text
 
-    format_name = format_of(source, format_name, FORMATS)
+    if format_name is None:
+        known = {name: ENDINGS[name] for name in FORMATS}
+        format_name = options.choose_format(source, None, known)
     inputs = [source] if like is None else [source, like]
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
     text = read_text(source)

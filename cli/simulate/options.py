@@ -16,7 +16,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from locatk.cli import options
+from locatk.cli import console, options
 from locatk.cli.command import Command, combine
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
@@ -88,7 +88,7 @@ class SimulationCommand(Command):
         file, is_printed = others.pop(CONFIG_FILE), others.pop(PRINT_CONFIG)
         settings = self._config.merge(self._config.read(file) if file else {}, flags)
         if is_printed:
-            click.echo(self._config.dumps(settings), nl=False)
+            console.write_result(self._config.dumps(settings))
             return None
         input_files = [*self._config.files(settings), *([file] if file else [])]
         ctx.params = {**others, "settings": settings, "input_files": input_files}
@@ -120,13 +120,8 @@ def simulation_command(module: str) -> Callable[[Callable[..., None]], click.Com
     """Make a function the command whose settings are the ``CONFIG`` of a module."""
     return combine(
         click.command("", cls=SimulationCommand, module=module),
-        click.option(
-            "-o",
-            "--output",
-            cls=_Option,
-            type=options.PATH,
-            required=True,
-            help="Session to write (.mcap), with the truth in it.",
+        options.output(
+            "Session to write (.mcap), with the truth in it.", endings=(".mcap",), cls=_Option
         ),
         options.input_option(
             "--config",

@@ -118,9 +118,9 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
 )
 @section(
     "Output",
-    click.option(
+    options.output_option(
         "--save-scene",
-        type=options.PATH,
+        endings=(".toml",),
         metavar="FILE",
         help="Lighthouse: also write the estimated scene (.toml), for --artifact.",
     ),
@@ -223,6 +223,8 @@ def command(
     )
     try:
         outputs = pipeline.plan_outputs(names, output, is_folder=found.has_folder)
+        if output is not None and outputs == [output]:
+            options.check_ending(Path(output.partition("?")[0]), (".mcap",))
         if len(names) > 1:
             pipeline.check_artifacts(request)
         pipeline.check_outputs(
@@ -371,7 +373,7 @@ class _BatchProgress:
         if self._is_shown:
             full = BAR_CHARACTERS * done // self._total
             bar = "#" * full + "-" * (BAR_CHARACTERS - full)
-            click.echo(f"\rSolving  [{bar}]  {done}/{self._total}", err=True, nl=False)
+            console.control(f"\rSolving  [{bar}]  {done}/{self._total}")
 
     def erase(self) -> None:
         """Erase the bar."""

@@ -23,9 +23,9 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
 
 
 @click.command(cls=Command)
-@options.output("Tags to write (.toml).")
-@click.option(
-    "--bom", type=options.PATH, metavar="FILE", help="Also write the bill of materials (.csv)."
+@options.output("Tags to write (.toml).", endings=(".toml",))
+@options.output_option(
+    "--bom", endings=(".csv",), metavar="FILE", help="Also write the bill of materials (.csv)."
 )
 @code_options
 @section(

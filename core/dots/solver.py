@@ -21,9 +21,18 @@ from locatk.core.dots.localization.frames import (
     NO_CODE,
     TOO_FEW_DOTS,
     LocalizedFrames,
-    localize_frames,
     unlocalized_frames,
 )
+from locatk.core.dots.localization.recordings import (
+    INVERTED,
+    MIRRORED,
+    MIRRORED_AND_INVERTED,
+    OFF_SHEET,
+    count_frames_of_other_codecs,
+    find_sheets,
+    localize_recording,
+)
+from locatk.core.dots.localization.seams import relocalize_at_seams
 from locatk.core.dots.published.localization import localize_published
 from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
 from locatk.core.dots.sheet import Manifest
@@ -34,19 +43,27 @@ from locatk.core.trajectory import Trajectory
 
 METHODS = ("lattice", "paper")
 
-MAX_LOADED_PX = 6_000_000
-"""Pixels of the frames of one size that are in memory at once."""
-
-SHEET_SLACK_PITCHES = 12.0
-"""Largest distance of the middle of a frame from the printed area whose dots it shows [pitches]."""
-
 MAX_TOLERATED_NO_CODE = 3
 """Number of frames without code up to which a session gets no warning; beyond it they must also be
 most of the rejected frames."""
 
-UNREADABLE = "unreadable_frame"
-OTHER_SIZE = "not_of_the_cameras_size"
-OFF_SHEET = "off_sheet"
+
+UNMIRROR = (
+    "switch off the mirroring (flip) of the camera or its driver, or mirror the images back before "
+    "the import"
+)
+UNINVERT = "switch off the negative effect of the camera, or invert the images before the import"
+RECOGNIZED_FRAMES = {
+    MIRRORED: ("mirrored_frames", "mirrored", UNMIRROR),
+    INVERTED: ("inverted_frames", "inverted (light dots on dark paper)", UNINVERT),
+    MIRRORED_AND_INVERTED: (
+        "mirrored_and_inverted_frames",
+        "mirrored and inverted",
+        f"{UNMIRROR}; and {UNINVERT}",
+    ),
+}
+"""Code of the warning, appearance and remedy of frames that show the pattern otherwise than
+printed, by the reason of their rejection."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +110,20 @@ def solve(
             f"no method {options.method!r} for dots", hint=f"Known: {', '.join(METHODS)}"
         )
     code = codec(manifest.codec)
+    localize = _localize_published if options.method == "paper" else None
     outcomes: list[FrameOutcome] = []
     detections: list[DotDetection] = []
     trajectories: list[Trajectory] = []
     off_sheet: list[NDArray[np.float64]] = []
+    other_codecs: Counter[str] = Counter()
     for camera_frames in frames:
-        localized = _localize(camera_frames, code, options)
-        sheet = _assign_sheets(localized, manifest)
+        localized = localize_recording(camera_frames, manifest, code, options.camera, localize)
+        sheet = find_sheets(localized, manifest)
+        if options.method != "paper" and manifest.has_seams:
+            relocalize_at_seams(camera_frames, localized, sheet, manifest, code, options.camera)
+        other_codecs += count_frames_of_other_codecs(
+            camera_frames, localized.rejected, manifest, options.camera
+        )
         off_sheet += list(localized.grid[localized.rejected == OFF_SHEET])
         poses = _sheet_poses(localized, sheet, manifest)
         outcomes += _outcomes(camera_frames, localized)
@@ -113,43 +137,9 @@ def solve(
         rejected=dict(sorted(rejected.items())),
         detections=tuple(detections),
         artifact=manifest,
-        warnings=_warnings(options, manifest, rejected, off_sheet),
+        warnings=_warnings(options, manifest, rejected, off_sheet, other_codecs),
         facts=DotFacts(tuple(outcomes)),
     )
-
-
-def _localize(frames: Frames, code: Codec, options: SolveOptions) -> LocalizedFrames:
-    """Localize the frames of a camera on the grid."""
-    result = unlocalized_frames(len(frames), TOO_FEW_DOTS)
-    localize = _localize_published if options.method == "paper" else localize_frames
-    for indices, images in _batches(frames, result.rejected, options.camera):
-        result.update(indices, localize(images, code, options.camera))
-    return result
-
-
-def _batches(
-    frames: Frames, rejected: NDArray[np.object_], camera: Camera | None
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """Yield indices and images of frames of one size; store reasons of others in ``rejected``."""
-    indices_by_shape: dict[tuple[int, ...], list[int]] = {}
-    images: dict[int, NDArray[np.uint8]] = {}
-    for index in range(len(frames)):
-        try:
-            image = frames.images[index]
-        except InputError:
-            rejected[index] = UNREADABLE
-            continue
-        if camera is not None and image.shape != camera.size[::-1]:
-            rejected[index] = OTHER_SIZE
-            continue
-        images[index] = image
-        indices = indices_by_shape.setdefault(image.shape, [])
-        indices.append(index)
-        if len(indices) * image.size >= MAX_LOADED_PX:
-            yield np.array(indices), np.stack([images.pop(k) for k in indices])
-            indices.clear()
-    for indices in filter(None, indices_by_shape.values()):
-        yield np.array(indices), np.stack([images.pop(k) for k in indices])
 
 
 def _localize_published(
@@ -181,17 +171,6 @@ class _SheetPoses:
     covariance: NDArray[np.float64]
 
 
-def _assign_sheets(localized: LocalizedFrames, manifest: Manifest) -> NDArray[np.intp]:
-    """Return the sheet (n,) of each frame, -1 if it has none, and reject frames off all sheets."""
-    sheet = np.full(len(localized), -1, np.intp)
-    accepted = np.flatnonzero(localized.accepted)
-    sheet[accepted] = manifest.find(
-        localized.grid[accepted], localized.section[accepted], slack=SHEET_SLACK_PITCHES
-    )
-    localized.rejected[accepted[sheet[accepted] < 0]] = OFF_SHEET
-    return sheet
-
-
 def _sheet_poses(
     localized: LocalizedFrames, sheet: NDArray[np.intp], manifest: Manifest
 ) -> _SheetPoses:
@@ -200,15 +179,14 @@ def _sheet_poses(
     poses = _SheetPoses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
     for number in np.unique(sheet[sheet >= 0]):
         is_here = sheet == number
-        jacobian = manifest.jacobian(int(number))
-        heading = localized.heading[is_here]
-        poses.position[is_here] = manifest.to_metres(int(number), localized.grid[is_here])
-        right = np.column_stack([np.cos(heading), -np.sin(heading)])
-        x, y = (right @ jacobian.T).T
-        poses.heading[is_here] = np.arctan2(y, x)
-        full = np.eye(3)
-        full[:2, :2] = jacobian
-        poses.covariance[is_here] = full @ localized.covariance[is_here] @ full.T
+        poses.position[is_here], poses.heading[is_here], poses.covariance[is_here] = (
+            manifest.poses_in_metres(
+                int(number),
+                localized.grid[is_here],
+                localized.heading[is_here],
+                localized.covariance[is_here],
+            )
+        )
     return poses
 
 
@@ -282,8 +260,13 @@ def _warnings(
     manifest: Manifest,
     rejected: Counter[str],
     off_sheet: list[NDArray[np.float64]],
+    other_codecs: Counter[str],
 ) -> tuple[SolverWarning, ...]:
-    """Return the warnings of a session; ``off_sheet`` are grid coordinates of rejected frames."""
+    """Return the warnings of a session.
+
+    ``off_sheet`` are grid coordinates of rejected frames, and ``other_codecs`` are numbers of
+    rejected frames that another codec locates on the sheets.
+    """
     warnings = []
     if options.method == "paper":
         warnings.append(
@@ -300,7 +283,21 @@ def _warnings(
                 f"no camera model: poses are of the middle of the frame, its lens {lens}",
             )
         )
-    if off_sheet:
+    for reason, (code, appearance, remedy) in RECOGNIZED_FRAMES.items():
+        if count := rejected[reason]:
+            message = f"{count} frames are {appearance} and have no pose: {remedy}"
+            warnings.append(SolverWarning(code, message))
+    if other_codecs:
+        ((name, count),) = other_codecs.most_common(1)
+        warnings.append(
+            SolverWarning(
+                "other_codec",
+                f"the sheets were printed with the codec {name!r}, not {manifest.codec!r} as in "
+                f"the manifest: with it, {count} of the rejected frames that were tried are on "
+                "the sheets. Correct the codec in the manifest",
+            )
+        )
+    elif off_sheet:
         x, y = off_sheet[0]
         warnings.append(
             SolverWarning(

@@ -13,6 +13,11 @@ from locatk.core.lighthouse.devices.solver import (
     select_rigid_receivers,
     solve_devices,
 )
+from locatk.core.lighthouse.doubled_channels import (
+    DOUBLED_CHANNEL_HINT,
+    doubled_channel_message,
+    find_doubled_channels,
+)
 from locatk.core.lighthouse.epochs import Epochs, group_epochs, rotor_angles
 from locatk.core.lighthouse.localization.photodiodes import detect_stations, track_photodiodes
 from locatk.core.lighthouse.published.scene import solve_published
@@ -98,12 +103,18 @@ def solve(
     Raises
     ------
     DegenerateError
-        The recording does not determine the scene. The message states what is missing.
+        The recording does not determine the scene. The message states what is missing, or that
+        several stations send on each channel.
     InputError
         The options contradict the scene, or a marker names an unknown device.
     """
     scene = scene or Scene()
     options = options or SolveOptions()
+    doubled = find_doubled_channels(sweeps)
+    is_doubled = np.isin(sweeps.channel, doubled)
+    if doubled and np.all(is_doubled):
+        raise DegenerateError(doubled_channel_message(doubled), hint=DOUBLED_CHANNEL_HINT)
+    sweeps = sweeps.take(~is_doubled)
     rigid = select_rigid_receivers(sweeps, receivers) if receivers else {}
     if rigid and options.method == "bundle":
         solution = solve_devices(sweeps, rigid, scene)
@@ -121,6 +132,14 @@ def solve(
                 "separately",
             )
             solution = replace(solution, warnings=(*solution.warnings, warning))
+    if doubled:
+        warning = SolverWarning("doubled_channel", doubled_channel_message(doubled))
+        number = int(np.count_nonzero(is_doubled))
+        solution = replace(
+            solution,
+            rejected=add_counts(solution.rejected, {"sweep_of_doubled_channel": number}),
+            warnings=(warning, *solution.warnings),
+        )
     return replace(solution, warnings=tuple(dict.fromkeys(solution.warnings)))
 
 

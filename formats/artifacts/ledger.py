@@ -16,6 +16,7 @@ from locatk.core.errors import InputError
 from locatk.formats.artifacts.kinds import Integer, Row, Text
 from locatk.formats.artifacts.schema import Artifact, Key, Table, Tables, Values, refuse_repeated
 from locatk.formats.artifacts.sheets import check_area
+from locatk.formats.files import MAX_TEXT_BYTES, read_bytes
 from locatk.formats.output import atomic_write, check_output
 
 LEDGER_FILE = "locatk-ledger.toml"
@@ -77,7 +78,7 @@ class Ledger:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._content = path.read_bytes() if path.exists() else None
+        self._content = read_bytes(path, MAX_TEXT_BYTES) if path.exists() else None
         self.areas: tuple[Area, ...] = (
             () if self._content is None else LEDGER.loads(self._content, file=path)
         )
@@ -90,7 +91,7 @@ class Ledger:
         InputError
             Another program has changed it since it was read.
         """
-        content = self.path.read_bytes() if self.path.exists() else None
+        content = read_bytes(self.path, MAX_TEXT_BYTES) if self.path.exists() else None
         if content != self._content:
             raise InputError(
                 "changed while sheets were drawn", file=self.path, hint="Run the command again"

@@ -8,13 +8,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, check_window, sequences
-from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest, Sheet
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Distortion, Manifest, Sheet
 from locatk.core.errors import InputError
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
+    NOT_NEGATIVE,
     POSITIVE,
     Integer,
     InvalidValueError,
@@ -59,8 +61,35 @@ def _sheet_of(values: Values) -> Sheet:
             "heading_deg",
             "Give both for a tile of a floor, otherwise neither",
         )
+    covariance = values["covariance_mm_deg"]
+    if covariance is not None:
+        if values["position_mm"] is None:
+            raise InvalidValueError(
+                "a covariance without position_mm",
+                "covariance_mm_deg",
+                "Give both for a tile of a floor, otherwise neither",
+            )
+        if not is_covariance(np.array(covariance)):
+            raise InvalidValueError("expected a covariance", "covariance_mm_deg")
     heading_deg = 0.0 if values["heading_deg"] is None else values["heading_deg"]
     return Sheet(**{**values, "heading_deg": heading_deg})
+
+
+def is_covariance(matrix: NDArray[np.float64]) -> bool:
+    """Return whether a matrix is symmetric and has no negative eigenvalue, but for rounding."""
+    tolerance = 1e-6 * np.abs(matrix).max()
+    is_symmetric = bool((np.abs(matrix - matrix.T) <= tolerance).all())
+    return is_symmetric and bool((np.linalg.eigvalsh(matrix) >= -tolerance).all())
+
+
+def _distortion_of(values: Values) -> Distortion:
+    x, y = values["x_mm"], values["y_mm"]
+    shapes = {tuple(len(row) for row in rows) for rows in (x, y)}
+    if len(shapes) > 1 or len({len(row) for row in x}) > 1:
+        raise InvalidValueError("expected as many rows and columns as x_mm", "y_mm")
+    if len(x) < 2 or len(x[0]) < 2:
+        raise InvalidValueError("expected at least two rows and columns", "x_mm")
+    return Distortion(x, y)
 
 
 def check_area(values: Values) -> None:
@@ -129,10 +158,30 @@ def _sheet_values(sheet: Sheet, pitch_mm: float) -> Values:
         "#": f"{width_mm:.1f} x {height_mm:.1f} mm of pattern",
         **vars(sheet),
         "heading_deg": None if sheet.position_mm is None else sheet.heading_deg,
+        "distortion_sigma_mm": sheet.distortion_sigma_mm
+        if any(sheet.distortion_sigma_mm)
+        else None,
     }
 
 
 _NUMBER_PAIR = Row(ANY_NUMBER, 2)
+
+_DISPLACEMENTS = ListOf(ListOf(ANY_NUMBER))
+
+_DISTORTION = Table(
+    (
+        Key(
+            "x_mm",
+            _DISPLACEMENTS,
+            "rows of displacements to the right at the nodes of a regular grid, from the lower "
+            "left to the upper right end of the printed area",
+            is_si=False,
+        ),
+        Key("y_mm", _DISPLACEMENTS, "the same of displacements up the paper", is_si=False),
+    ),
+    _distortion_of,
+    vars,
+)
 
 _SHEET = Table(
     (
@@ -162,6 +211,29 @@ _SHEET = Table(
             "of a tile: rotation of the paper on the floor, counter-clockwise",
             None,
             "0",
+            is_si=False,
+        ),
+        Key(
+            "covariance_mm_deg",
+            Row(Row(ANY_NUMBER, 3), 3),
+            "of a tile: covariance of position_mm and heading_deg as measured by `locatk calibrate "
+            "sheet`",
+            None,
+            "as designed, exact",
+            is_si=False,
+        ),
+        Key(
+            "distortion",
+            _DISTORTION,
+            "measured errors of the print, added to positions on the paper after the scale",
+            None,
+            "none",
+        ),
+        Key(
+            "distortion_sigma_mm",
+            Row(NOT_NEGATIVE, 2),
+            "standard deviation of the print's other errors, along the paper's axes",
+            (0.0, 0.0),
             is_si=False,
         ),
     ),

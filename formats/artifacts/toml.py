@@ -19,7 +19,7 @@ from decimal import Decimal, DecimalException
 from typing import Any
 
 from locatk.core.errors import ArtifactError
-from locatk.formats.files import read_bytes
+from locatk.formats.files import MAX_TEXT_BYTES, read_bytes
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -36,7 +36,7 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     ArtifactError
         It is not TOML; see :func:`loads`.
     """
-    return loads(read_bytes(path), path)
+    return loads(read_bytes(path, MAX_TEXT_BYTES), path)
 
 
 def loads(text: str | bytes, file: str | os.PathLike[str]) -> dict[str, Any]:

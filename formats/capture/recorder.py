@@ -54,7 +54,7 @@ class Limits:
     silence_s : float
         Time without data after which a warning is issued.
     reserve_bytes : int
-        Free space of the disk at which the recording ends.
+        Free space of the disk at which the recording ends; 0 to use all of it.
     flush_s : float
         Interval of flushes to the system: with :data:`WRITE_INTERVAL_S`, the most that is lost when
         the program is killed.
@@ -360,7 +360,7 @@ class Recorder:
 
     def _check_disk(self, free: int) -> str:
         available = free - self._limits.reserve_bytes
-        if available <= 0:
+        if available <= 0 and self._limits.reserve_bytes:
             return "the disk is full up to --reserve"
         per_s = self._files.bytes_written / max(self._elapsed_s(), 1.0)
         if per_s > 0 and available / per_s < DISK_WARNING_S:

@@ -237,8 +237,11 @@ def check_outputs(
 
 
 RESERVED_BYTES = 4 << 20
-"""Space of the disk that is allocated in advance, so that a recording can still be finished when
-the disk is full."""
+"""Space of the disk that is allocated in advance if it has that much, so that the system is asked
+rarely."""
+
+MIN_RESERVED_BYTES = 2 * CHUNK_BYTES
+"""Smallest space that is allocated in advance: half of it covers one chunk more."""
 
 FULL_DISK_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Errors of the system if the disk, a quota, or the largest file of a file system is full."""
@@ -284,6 +287,7 @@ class LiveFile:
             raise LocatkError(f"cannot write: {error.strerror or error}", file=path) from error
         self._size = 0
         self._allocated_end = 0
+        self._reserved = RESERVED_BYTES
         self._can_allocate = sys.platform == "linux"
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
@@ -304,6 +308,7 @@ class LiveFile:
         except BaseException as error:
             with contextlib.suppress(OSError):
                 self._file.truncate(self._size)
+                self._allocated_end = self._size
                 self._file.seek(self._size)
             if isinstance(error, OSError) and error.errno in FULL_DISK_ERRNOS:
                 raise DiskFullError(_describe_errno(error.errno), file=self.path) from error
@@ -312,9 +317,10 @@ class LiveFile:
         return done
 
     def make_room(self, more: int) -> None:
-        """Allocate ``more`` bytes beyond the present end, and :data:`RESERVED_BYTES`.
+        """Allocate ``more`` bytes beyond the present end, so that they can certainly be written.
 
-        On file systems without allocation this has no effect.
+        Up to :data:`RESERVED_BYTES` are allocated in addition, as many as the disk has. On file
+        systems without allocation this has no effect.
 
         Raises
         ------
@@ -322,15 +328,21 @@ class LiveFile:
             The disk is full; space allocated before remains available to finish the file.
         """
         wanted = self._size + more
-        if not self._can_allocate or wanted + RESERVED_BYTES // 2 <= self._allocated_end:
-            return
-        number = _fallocate(self._file.fileno(), self._size, more + RESERVED_BYTES)
-        if number in FULL_DISK_ERRNOS:
-            raise DiskFullError(_describe_errno(number), file=self.path)
-        if number == 0:
-            self._allocated_end = wanted + RESERVED_BYTES
-        elif number != errno.EINTR:
-            self._can_allocate = False
+        # tmpfs releases all unwritten space of a range whose allocation fails: begin behind it.
+        start = max(self._size, self._allocated_end)
+        while self._can_allocate and wanted + self._reserved // 2 > self._allocated_end:
+            end = wanted + self._reserved
+            number = _fallocate(self._file.fileno(), start, end - start)
+            if number == 0:
+                self._allocated_end = end
+            elif number in FULL_DISK_ERRNOS and self._reserved > MIN_RESERVED_BYTES:
+                self._reserved //= 2
+            elif number in FULL_DISK_ERRNOS:
+                raise DiskFullError(_describe_errno(number), file=self.path)
+            elif number == errno.EINTR:
+                return
+            else:
+                self._can_allocate = False
 
     def free(self) -> int | None:
         """Return the free bytes of the disk; None if they are unknown."""

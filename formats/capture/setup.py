@@ -186,7 +186,7 @@ def _check_disk(folder: Path, reserve: int) -> None:
         raise DiskFullError(
             f"only {free / 1e6:.0f} MB of the disk are free",
             file=folder,
-            hint=f"Free some space, or reduce --reserve below {reserve / 1e6:.0f} MB",
+            hint=f"Free some space, or reduce --reserve below {free / 1e6:.0f} MB",
         )
 
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 
 from locatk.core.materials import BillItem
+from locatk.core.printable import spreadsheet_text
 from locatk.formats.output import atomic_write
 
 COLUMNS = ("part", "count", "detail", "price_usd", "source")
@@ -25,4 +26,5 @@ def write_bill(path: str | os.PathLike[str], items: Sequence[BillItem], *, overw
         table.writerow(COLUMNS)
         for item in items:
             price = "" if item.price_usd is None else f"{item.price_usd:g}"
-            table.writerow((item.part, item.count, item.detail, price, item.source))
+            part, detail, source = map(spreadsheet_text, (item.part, item.detail, item.source))
+            table.writerow((part, item.count, detail, price, source))

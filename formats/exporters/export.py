@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.errors import InputError
+from locatk.core.printable import file_name_part
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.kitti import write_kitti
 from locatk.formats.exporters.trajectory_csv import write_csv
@@ -71,7 +72,7 @@ def plan_files(
     is_single = len(trajectories) == 1 and not output.is_dir()
     planned = []
     for each in trajectories:
-        path = output if is_single else output / f"{each.device.replace('/', '_')}{ending}"
+        path = output if is_single else output / f"{file_name_part(each.device)}{ending}"
         times = path.with_name(f"{path.stem}.times.txt") if format_name == "kitti" else None
         planned.append(OutputFile(path, (each,), times))
     files = [path for file in planned for path in file.files]

@@ -1,7 +1,8 @@
 """Trajectories as KITTI odometry poses.
 
-A line is the upper three rows of a 4 x 4 pose, row by row. The format has no times: two files
-correspond row by row. The reader is :mod:`locatk.formats.importers.kitti`.
+A line is the upper three rows of a 4 x 4 pose, row by row; an unknown orientation is the identity.
+The format has no times: two files correspond row by row. The reader is
+:mod:`locatk.formats.importers.kitti`.
 """
 
 from __future__ import annotations

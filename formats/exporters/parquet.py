@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from locatk.core.errors import LocatkError
-from locatk.core.trajectory import Trajectory
+from locatk.core.trajectory import Trajectory, has_orientation
 from locatk.formats.importers.trajectory_csv import COLUMNS, PROBABILITY_COLUMN, SIGMA_AXES
 from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.messages import triangle
@@ -100,7 +100,8 @@ def _table(arrow: Any, trajectory: Trajectory) -> Any:
             arrow.array(np.ascontiguousarray(column), mask=np.isnan(column)) for column in values.T
         ]
 
-    pose = np.hstack([trajectory.position, trajectory.quaternion])
+    quaternion = np.where(has_orientation(trajectory)[:, None], trajectory.quaternion, np.nan)
+    pose = np.hstack([trajectory.position, quaternion])
     probability = trajectory.probability
     if probability is None:
         probability = np.full(n, np.nan)

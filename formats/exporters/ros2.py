@@ -37,7 +37,8 @@ UNKNOWN_VARIANCE = 1e6
 """Variance of unobserved quantities, in m^2 or rad^2.
 
 ROS has no value for "unknown". Filters interpret a large variance as no information and zero as
-certainty, and fail on NaN.
+certainty, and fail on NaN. An unknown orientation is the identity with this variance: tf and RViz
+refuse quaternions that are not of unit length.
 """
 
 OFFERED_QOS = "[]"

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.errors import InputError
-from locatk.core.trajectory import Trajectory
+from locatk.core.printable import spreadsheet_text
+from locatk.core.trajectory import Trajectory, has_orientation
 from locatk.formats.importers.trajectory_csv import COLUMNS, SIGMA_AXES
 from locatk.formats.output import atomic_write
 from locatk.formats.tables.timestamps import format_epoch_seconds
@@ -20,8 +21,8 @@ from locatk.formats.tables.timestamps import format_epoch_seconds
 def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool = False) -> None:
     """Write poses as CSV (:data:`COLUMNS`), one row a pose, device after device.
 
-    Unknown sigmas and probabilities are empty cells. Numbers have the fewest digits that read
-    back equal.
+    Unknown orientations, sigmas and probabilities are empty cells. Numbers have the fewest digits
+    that read back equal.
 
     Raises
     ------
@@ -42,18 +43,20 @@ def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool
 
 
 def _csv_lines(trajectory: Trajectory) -> Iterator[str]:
-    device = trajectory.device
+    device = spreadsheet_text(trajectory.device)
     # The csv module of Python 3.11 leaves a carriage return unquoted and reads it as a line end.
     if any(character in device for character in ',"\r\n'):
         device = '"' + device.replace('"', '""') + '"'
-    poses = np.hstack([trajectory.position, trajectory.quaternion]).tolist()
+    quaternion = np.where(has_orientation(trajectory)[:, None], trajectory.quaternion, np.nan)
     probability = trajectory.probability
     if probability is None:
         probability = np.full(len(trajectory), np.nan)
-    trust = np.column_stack([trajectory.sigma[:, SIGMA_AXES], probability]).tolist()
-    for time_ns, pose, values in zip(trajectory.time_ns.tolist(), poses, trust, strict=True):
+    rows = np.column_stack(
+        [trajectory.position, quaternion, trajectory.sigma[:, SIGMA_AXES], probability]
+    ).tolist()
+    for time_ns, values in zip(trajectory.time_ns.tolist(), rows, strict=True):
         cells = ("" if value != value else repr(value) for value in values)
-        yield ",".join([format_epoch_seconds(time_ns), device, *map(repr, pose), *cells]) + "\n"
+        yield ",".join([format_epoch_seconds(time_ns), device, *cells]) + "\n"
 
 
 def check_exportable(trajectory: Trajectory) -> None:

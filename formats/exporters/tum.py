@@ -1,6 +1,7 @@
 """Trajectories as TUM, which evo, ROS tools and most SLAM benchmarks read.
 
-A line is ``time x y z qx qy qz qw``: epoch seconds, metres, a unit quaternion.
+A line is ``time x y z qx qy qz qw``: epoch seconds, metres, a unit quaternion. The format has no
+empty values: an unknown orientation is the identity, 0 0 0 1.
 The reader is :mod:`locatk.formats.importers.tum`.
 """
 

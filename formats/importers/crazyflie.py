@@ -38,7 +38,7 @@ from locatk.formats.artifacts.kinds import (
     type_name,
 )
 from locatk.formats.artifacts.schema import Array, Key, Table, Values, unknown_keys
-from locatk.formats.files import read_bytes
+from locatk.formats.files import read_head
 
 TYPE = "lighthouse_system_configuration"
 VERSION = "1"
@@ -104,7 +104,7 @@ def read_config(path: str | os.PathLike[str]) -> Scene:
         It is not a system configuration of Lighthouse V2, or has a wrong value; the error names
         the key.
     """
-    return loads_config(read_bytes(path, MAX_FILE_BYTES + 1), file=path)
+    return loads_config(read_head(path, MAX_FILE_BYTES + 1), file=path)
 
 
 def loads_config(text: str | bytes, *, file: str | os.PathLike[str] = "<config>") -> Scene:

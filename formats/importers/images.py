@@ -15,9 +15,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
-from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
 from locatk.core.natural_order import natural_key
 from locatk.formats import images
+from locatk.formats.files import read_bytes, read_head
 from locatk.formats.sessions.frames import Shot
 from locatk.formats.tables.timestamps import UNDATED_START_NS
 
@@ -101,14 +102,11 @@ class ImageFiles:
         count = 0
         for number, (file, name) in enumerate(zip(self._files, names, strict=True)):
             try:
-                data = file.read_bytes()
+                data = read_bytes(file)
                 picture = images.decode(data)
                 check_size(picture.pixels, self._camera)
-            except InputError as error:
+            except (InputError, MissingDataError) as error:
                 self.warnings.append(f"{file}: {error.message}")
-                continue
-            except OSError as error:
-                self.warnings.append(f"{file}: cannot be read ({error.strerror})")
                 continue
             count += 1
             time_ns = UNDATED_START_NS + round(number * 1e9 / self._rate_hz)
@@ -209,7 +207,6 @@ def natural_path_key(path: Path) -> tuple[Any, Any]:
 
 def _head(file: Path) -> bytes:
     try:
-        with open(file, "rb") as stream:
-            return stream.read(MAGIC_BYTES)
-    except OSError:
+        return read_head(file, MAGIC_BYTES)
+    except LocatkError:
         return b""

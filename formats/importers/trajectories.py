@@ -8,7 +8,7 @@ from typing import Literal
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.files import read_bytes
+from locatk.formats.files import read_head
 from locatk.formats.importers.kitti import KITTI_COLUMNS, read_kitti
 from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.importers.tum import TUM_COLUMNS, read_tum
@@ -78,7 +78,7 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
     path = Path(path)
     if path.is_dir():
         raise InputError("a folder instead of a file", file=path, hint=KIND_HINT)
-    head = read_bytes(path, HEAD_BYTES)
+    head = read_head(path, HEAD_BYTES)
     if head.startswith(MCAP_MAGIC):
         return _read_mcap(path, role)
     kind = _kind_of_text(path, head)

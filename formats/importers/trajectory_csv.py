@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.printable import text_of_spreadsheet
 from locatk.core.trajectory import Trajectory
 from locatk.formats.tables.delimited import Table, read_table
 
@@ -52,8 +53,8 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     ----------
     path : path
         Columns ``qx`` to ``qw`` and the sigmas may be missing (all four of a kind), and so may
-        the probability; further columns are ignored. A sigma or probability that is empty or
-        ``nan`` is unknown.
+        the probability; further columns are ignored. A sigma, a probability or all four cells of a
+        quaternion that are empty or ``nan`` are unknown.
     frame : str
         Name of the frame, which is not part of the file.
 
@@ -78,7 +79,7 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
     if any(name in table.columns for name in QUATERNION_COLUMNS):
         table.require(*QUATERNION_COLUMNS)
-        quaternion = unit_quaternions(table, QUATERNION_COLUMNS)
+        quaternion = unit_quaternions(table, QUATERNION_COLUMNS, allow_missing=True)
     sigma = np.full((n, 4), np.nan)
     if any(name in table.columns for name in SIGMA_COLUMNS):
         table.require(*SIGMA_COLUMNS)
@@ -87,18 +88,20 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     probability = np.full(n, np.nan)
     if PROBABILITY_COLUMN in table.columns:
         probability = table.floats(PROBABILITY_COLUMN, low=0.0, high=1.0, allow_missing=True)
+    is_unknown = np.isnan(quaternion[:, 0])
+    quaternion[is_unknown], sigma[is_unknown, 3] = (0.0, 0.0, 0.0, 1.0), np.nan
     time_ns = table.epoch_times_ns("time_s")
 
     trajectories = []
-    devices = np.array(table.columns["device"], object)
-    for device in dict.fromkeys(table.columns["device"]):
-        rows = np.flatnonzero(devices == device)
+    cells = np.array(table.columns["device"], object)
+    for cell in dict.fromkeys(table.columns["device"]):
+        rows = np.flatnonzero(cells == cell)
         check_ascending(table, time_ns, rows)
         covariance = _diagonal_covariance(sigma[rows])
         is_known = np.isfinite(probability[rows]).any()
         trajectories.append(
             Trajectory(
-                device,
+                text_of_spreadsheet(cell),
                 frame,
                 time_ns[rows],
                 position[rows],
@@ -110,8 +113,10 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     return trajectories
 
 
-def unit_quaternions(table: Table, names: Sequence[str]) -> Array:
+def unit_quaternions(table: Table, names: Sequence[str], *, allow_missing: bool = False) -> Array:
     """Return the quaternions (n, 4) in the columns ``names`` (x, y, z, w), normalised.
+
+    Those of which all cells are missing are ``nan`` if that is allowed.
 
     Raises
     ------
@@ -119,7 +124,15 @@ def unit_quaternions(table: Table, names: Sequence[str]) -> Array:
         A cell is not a number, or a quaternion is further than :data:`MAX_NORM_ERROR` from unit
         length.
     """
-    quaternion = np.stack([table.floats(name) for name in names], axis=1)
+    columns = [table.floats(name, allow_missing=allow_missing) for name in names]
+    quaternion = np.stack(columns, axis=1)
+    is_partial = np.isnan(quaternion).any(axis=1) & ~np.isnan(quaternion).all(axis=1)
+    if is_partial.any():
+        table.fail(
+            int(np.argmax(is_partial)),
+            "an incomplete quaternion",
+            "Leave all of qx qy qz qw empty if the orientation is unknown",
+        )
     length = np.linalg.norm(quaternion, axis=1)
     is_wrong = np.abs(length - 1) > MAX_NORM_ERROR
     if is_wrong.any():

@@ -16,6 +16,7 @@ import numpy as np
 
 from locatk.core.dots.camera import Camera
 from locatk.core.errors import FormatError, InputError
+from locatk.formats.files import check_regular, open_binary, read_head
 from locatk.formats.importers.images import check_size
 from locatk.formats.sessions.frames import Shot
 from locatk.formats.tables.timestamps import UNDATED_START_NS
@@ -137,8 +138,8 @@ def is_cut(path: Path) -> bool:
     MP4 and MOV (boxes), MKV and WebM (segment) and AVI (RIFF) contain their size. False for
     others, and if a live recording left the size open.
     """
-    size = path.stat().st_size
-    with open(path, "rb") as stream:
+    size = check_regular(path)
+    with open_binary(path) as stream:
         head = stream.read(HEAD_BYTES)
         if head[:4] == b"RIFF":
             claimed = int.from_bytes(head[4:8], "little")
@@ -161,8 +162,7 @@ def is_cut(path: Path) -> bool:
 
 
 def _is_matroska(path: Path) -> bool:
-    with open(path, "rb") as stream:
-        return stream.read(len(EBML_MAGIC)) == EBML_MAGIC
+    return read_head(path, len(EBML_MAGIC)) == EBML_MAGIC
 
 
 def _segment_end(head: bytes) -> int:
@@ -187,11 +187,7 @@ def _element_end(head: bytes, position: int) -> int | None:
 
 def _is_text(path: Path) -> bool:
     """Return whether a file is plain text, which FFmpeg would render as a video of a terminal."""
-    try:
-        with open(path, "rb") as stream:
-            head = stream.read(TEXT_CHECK_BYTES)
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
+    head = read_head(path, TEXT_CHECK_BYTES)
     return all(byte > 31 or byte in b"\t\n\v\f\r\x1b" for byte in head)
 
 

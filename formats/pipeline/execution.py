@@ -17,6 +17,7 @@ import signal
 import sys
 import tempfile
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import (
@@ -39,6 +40,13 @@ from locatk.formats.pipeline.file_access import short_reason
 
 Job = TypeVar("Job")
 T = TypeVar("T")
+
+MAX_FAILED_STARTS = 3
+"""Number of times in a row that no worker can be started, before all jobs are given up."""
+
+RESTART_DELAY_S = 0.5
+"""Time after which a worker is started again [s]: a killed fork server takes some milliseconds to
+end."""
 
 MAX_DEATHS = 2
 """Number of processes that a job may kill while it runs alone, before it is given up."""
@@ -97,7 +105,7 @@ class LostJob:
 
 
 class _BrokenPool(Exception):
-    """A worker died."""
+    """A worker died, or could not be started."""
 
 
 class _Cancelled(Exception):
@@ -134,6 +142,7 @@ def run_jobs(
     queue = deque(range(len(jobs)))
     suspects: deque[int] = deque()
     deaths: Counter[int] = Counter()
+    failed_starts = 0
     while queue or suspects:
         source = suspects or queue
         width = 1 if suspects else (pool.width or len(jobs))
@@ -142,20 +151,28 @@ def run_jobs(
             with pool.open(width) as executor:
                 while source or running:
                     while source and len(running) < width:
-                        running[executor.submit(function, jobs[source[0]])] = source[0]
+                        running[_submit(executor, function, jobs[source[0]])] = source[0]
                         source.popleft()
                     done, _ = wait(running, return_when=FIRST_COMPLETED)
                     broken = [f for f in done if isinstance(_exception(f), BrokenExecutor)]
                     for future in done.difference(broken):
-                        index = running.pop(future)
+                        index, failed_starts = running.pop(future), 0
                         if not pool.detects_deaths:
                             clean(jobs[index])
                         error = _exception(future)
                         yield index, future.result() if error is None else _lost_job(error)
                     if broken:
                         raise _BrokenPool
-        except (_BrokenPool, BrokenExecutor):
+        except (_BrokenPool, BrokenExecutor) as error:
             interrupted = sorted(running.values())
+            failed_starts += not interrupted
+            if failed_starts >= MAX_FAILED_STARTS:
+                hint = "Check the limit of processes (`ulimit -u`), or solve with --jobs 1"
+                lost = LostJob(f"no process could be started ({short_reason(error)})", hint)
+                yield from ((index, lost) for index in (*suspects, *queue))
+                return
+            if not interrupted:
+                time.sleep(RESTART_DELAY_S)
             for index in interrupted:
                 clean(jobs[index])
             if len(interrupted) == 1:
@@ -169,6 +186,14 @@ def run_jobs(
             for index in running.values():
                 clean(jobs[index])
             raise
+
+
+def _submit(executor: Executor, function: Callable[[Job], Any], job: Job) -> Future[Any]:
+    """Submit a job, which may start a worker; raise _BrokenPool if that fails."""
+    try:
+        return executor.submit(function, job)
+    except (EOFError, OSError) as error:  # The fork server died, or processes are limited.
+        raise _BrokenPool(short_reason(error)) from error
 
 
 def in_order(results: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, list[Any]]]:

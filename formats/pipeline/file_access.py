@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.errors import InputError, LocatkError, MissingDataError
-from locatk.formats.output import check_output, output_exists_error
+from locatk.formats.output import PART_SUFFIX, check_output, output_exists_error, remove_stale_parts
 from locatk.formats.pipeline.file_names import file_name, is_url, is_web
 from locatk.formats.sessions.mcap_file import DamageError
 
@@ -27,8 +27,6 @@ MAX_REQUESTS = 16
 
 MAX_REASON_CHARACTERS = 200
 """Length of the part of a message that comes from another library."""
-
-_PARTIAL_SUFFIX = ".part"
 
 
 @contextlib.contextmanager
@@ -94,7 +92,7 @@ def upload(path: Path, url: str, *, overwrite: bool = False) -> None:
             return
         folder, _, name = key.rpartition("/")
         store.makedirs(folder, exist_ok=True)
-        partial = f"{folder}/.{name[:50]}.{secrets.token_hex(4)}{_PARTIAL_SUFFIX}"
+        partial = f"{folder}/.{name[:50]}.{secrets.token_hex(4)}{PART_SUFFIX}"
         try:
             store.put_file(str(path), partial)
             store.mv(partial, key)
@@ -218,9 +216,4 @@ def remove_partial_files(location: str) -> None:
     """Remove the unfinished output that a killed process left for ``location``."""
     if is_url(location):
         return
-    target = Path(os.path.realpath(location))
-    prefix = f".{target.name[:50]}."  # As locatk.formats.output names temporary files.
-    with contextlib.suppress(OSError), os.scandir(target.parent) as entries:
-        for entry in entries:
-            if entry.name.startswith(prefix) and entry.name.endswith(_PARTIAL_SUFFIX):
-                os.unlink(entry.path)
+    remove_stale_parts(Path(os.path.realpath(location)))

@@ -66,8 +66,8 @@ class SolveReport:
         As in :class:`locatk.core.solution.Solution`.
     losses : tuple of SolverWarning
         Devices and observations that are unsolved; the codes are ``no_pose``,
-        ``not_localised``, ``provisional``, ``not_read``, ``refused``, ``misread`` and
-        ``few_poses``.
+        ``not_localised``, ``provisional``, ``not_read``, ``refused``, ``misread``,
+        ``few_poses`` and ``doubled_channel``.
     is_metric : bool
         False if the poses are in units of a scene without scale.
     """
@@ -205,6 +205,9 @@ def find_losses(solution: Solution) -> tuple[SolverWarning, ...]:
         losses += _refused_landmarks(solution.detections)
     elif solution.poses:
         losses += _minority_of_poses(solution)
+    if unused := solution.rejected.get("sweep_of_doubled_channel"):
+        text = f"{_count(unused, 'sweep')} of channels with more than one station not used"
+        losses.append(SolverWarning("doubled_channel", text))
     return tuple(losses)
 
 

@@ -19,7 +19,7 @@ from pikepdf import Array, Dictionary, Name, Pdf, Stream
 
 from locatk.core.drawing import MM_PER_POINT
 from locatk.core.errors import FormatError, InputError
-from locatk.formats.files import read_bytes
+from locatk.formats.files import read_head
 from locatk.formats.printing.separation.content import DAMAGE_ERRORS, BlackRemover
 from locatk.formats.printing.separation.detection import BlackFinder
 
@@ -28,6 +28,12 @@ SIZE_TOLERANCE_MM = 0.1
 
 PRINT_FLAG, HIDDEN_FLAG = 4, 2
 """Flags of annotations (ISO 32000-1 table 165)."""
+
+MAX_STREAM_BYTES = 1 << 30
+"""Largest decompressed stream of a document [bytes]; an A0 page in CMYK at 400 dpi has 0.99e9.
+
+A page of some kilobytes can claim any size.
+"""
 
 
 @dataclass(frozen=True)
@@ -287,8 +293,9 @@ def _plain(value: float) -> float | int:
 @contextmanager
 def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
     """Open a document; errors while it is processed are reported as damage, too."""
-    if b"%PDF-" not in read_bytes(path, 1024):
+    if b"%PDF-" not in read_head(path, 1024):
         raise FormatError("not a PDF", file=path, hint="Save the document as PDF")
+    _limit_streams()
     try:
         # A repair may lose pages without a message.
         with Pdf.open(os.fspath(path), attempt_recovery=False) as pdf:
@@ -307,6 +314,18 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
             file=path,
             hint="Print it into a new PDF from a viewer, check that it is complete, and use that",
         ) from error
+
+
+def _limit_streams() -> None:
+    """Limit the memory that a stream may take; old versions of pikepdf have no limits."""
+    if hasattr(pikepdf.settings, "set_qpdf_limits"):
+        pikepdf.settings.set_qpdf_limits(
+            flate_max_memory=MAX_STREAM_BYTES,
+            png_max_memory=MAX_STREAM_BYTES,
+            tiff_max_memory=MAX_STREAM_BYTES,
+            run_length_max_memory=MAX_STREAM_BYTES,
+            dct_max_memory=MAX_STREAM_BYTES,
+        )
 
 
 def _encrypted(path: str | os.PathLike[str]) -> FormatError:

@@ -119,7 +119,9 @@ def _draw_frame(image: Image, sheet_codec: Codec | None, camera: Camera | None) 
 def _decoded_dots(image: Image, sheet_codec: Codec, camera: Camera | None) -> NDArray[np.float64]:
     """Return the pixels (n, 2) of the decoded dots of a frame."""
     try:
-        decoded = next(dot_correspondences(image[None], sheet_codec, camera), None)
+        decoded = next(
+            dot_correspondences(image[None], sheet_codec, camera, other_codec_odds=0), None
+        )
     except InputError:
         decoded = None
     return np.zeros((0, 2)) if decoded is None else decoded.pixels

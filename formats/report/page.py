@@ -18,6 +18,7 @@ from plotly.graph_objects import Figure
 from plotly.io.json import to_json_plotly
 from plotly.offline import get_plotlyjs
 
+from locatk.core.printable import escape_controls
 from locatk.formats.report.panels import Panel, Picture, Table
 from locatk.formats.report.style import CONFIG, SCRIPT, STYLE, TEMPLATE
 
@@ -65,7 +66,7 @@ def document(title: str, body: Sequence[str]) -> str:
 
 def text(plain: object) -> str:
     """Escape text for HTML."""
-    return html.escape(str(plain))
+    return html.escape(escape_controls(str(plain), keep="\n"))
 
 
 def paragraph(plain: str, style: str = "") -> str:

@@ -10,6 +10,8 @@ from typing import Any
 
 from plotly.graph_objects import Figure
 
+from locatk.core.printable import escape_controls
+
 
 @dataclass(frozen=True)
 class Table:
@@ -72,7 +74,7 @@ def join_names(names: Sequence[str], limit: int = 5) -> str:
 
 def escape(text: object) -> str:
     """Escape text for plotly, which interprets names of devices as HTML."""
-    return html.escape(str(text), quote=False)
+    return html.escape(escape_controls(str(text), keep="\n"), quote=False)
 
 
 def reason_text(reason: str | None) -> str:

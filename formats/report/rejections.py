@@ -164,6 +164,7 @@ def _lighthouse_reasons() -> dict[str, Reason]:
         "repeated_in_rotation": "The same plane was reported twice in one rotation.",
         "spike": "A single angle deviates from a smooth sequence by more than "
         f"{math.degrees(epochs.SPIKE_RAD):g} degrees.",
+        "sweep_of_doubled_channel": "More than one station sends on the channel.",
         "station_not_in_scene": "The station is not in the given scene.",
         "station_not_solved": "The station has too few positions in common with the others to be "
         "located.",
@@ -191,16 +192,20 @@ def _lighthouse_reasons() -> dict[str, Reason]:
 
 def _dots_reasons() -> dict[str, Reason]:
     # OpenCV and scipy, which these modules need, take 0.1 s and 0.5 s to import.
-    from locatk.core.dots import solver
     from locatk.core.dots.detection import lattice
     from locatk.core.dots.identification import decoding
+    from locatk.core.dots.localization import recordings
     from locatk.core.dots.published import localization as published
 
     frames = {
         "unreadable_frame": "The image is damaged or truncated.",
         "not_of_the_cameras_size": "The size of the frame differs from the camera calibration.",
         "off_sheet": "A position was decoded, but no sheet of the manifest is within "
-        f"{solver.SHEET_SLACK_PITCHES:g} pitches of it.",
+        f"{recordings.SHEET_SLACK_PITCHES:g} pitches of it.",
+        "mirrored": "The frame is mirrored: the pattern is decoded if it is mirrored back. Its "
+        "heading would be wrong.",
+        "inverted": "The frame is inverted, with light dots on dark paper.",
+        "mirrored_and_inverted": "The frame is mirrored and inverted.",
         "too_few_dots": f"Fewer than {lattice.MIN_LATTICE_DOTS} dots were detected: no pattern in "
         "view, out of focus, or motion blur.",
         "no_grid": "Dots were detected, but no regular grid among them.",

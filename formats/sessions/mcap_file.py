@@ -62,6 +62,13 @@ FOOTER_BYTES = RECORD_HEAD.size + 20
 MAX_RUN_BYTES = 4 << 20
 """A run of messages outside chunks is split at this size, which bounds the memory of a reader."""
 
+MAX_RECORD_BYTES = 1 << 30
+"""Largest record that is read, and largest decompressed chunk.
+
+Chunks have some megabytes (the specification recommends it), and compressed zeros of some
+kilobytes can claim any size. Attachments may be larger if they are copied instead of read.
+"""
+
 _FOOTER = struct.Struct("<BQQQI")
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 
@@ -382,6 +389,8 @@ def decompress(content: bytes, offset: int) -> bytes:
     """
     chunk = parse(records.Chunk.read, content, offset)
     size, data = chunk.uncompressed_size, chunk.data
+    if size > MAX_RECORD_BYTES:
+        raise DamageError(f"a chunk claims {size:,} bytes", offset)
     try:
         if chunk.compression == "lz4":
             # The decompressor stops one byte after the stated size, if the data are longer.
@@ -463,6 +472,8 @@ def read_bytes_at(stream: IO[bytes], offset: int, length: int) -> bytes:
     # A damaged length may be any number: compare before memory is allocated.
     if offset + length > stream.seek(0, os.SEEK_END):
         raise DamageError("the file is cut short", offset)
+    if length > MAX_RECORD_BYTES:
+        raise DamageError(f"a record of {length:,} bytes", offset)
     stream.seek(offset)
     data = stream.read(length)
     if len(data) != length:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shlex
-import stat
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +15,8 @@ from typing import IO, TypeVar
 
 from google.protobuf.message import DecodeError, Message
 
-from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.errors import FormatError
+from locatk.formats.files import open_binary
 from locatk.formats.sessions import mcap_file
 from locatk.formats.sessions.mcap_file import (
     SESSION_RECORD,
@@ -315,18 +315,8 @@ def open_mcap(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     FormatError
         It is not a regular file, or its content is damaged.
     """
-    try:
-        # Opening a pipe would block, and nothing in it can be read twice.
-        if not stat.S_ISREG(mode := os.stat(path).st_mode) and not stat.S_ISDIR(mode):
-            raise FormatError("not a regular file", file=path)
-        with open(path, "rb") as stream, damage_as_format_error(path):
-            yield stream
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingDataError("no such file", file=path) from None
-    except IsADirectoryError:
-        raise FormatError("a folder, not an MCAP file", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from error
+    with open_binary(path) as stream, damage_as_format_error(path):
+        yield stream
 
 
 @contextmanager

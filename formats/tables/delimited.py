@@ -35,7 +35,8 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.errors import FormatError, InputError
+from locatk.formats.files import MAX_FILE_BYTES, read_text
 from locatk.formats.tables.timestamps import (
     parse_decimal_time,
     parse_decimal_times,
@@ -217,33 +218,6 @@ def _first_failing(convert: Callable[[str], object], cells: Sequence[str]) -> in
 # ---- files
 
 
-def read_text(path: Path) -> str:
-    """Read a whole file as UTF-8 text.
-
-    Raises
-    ------
-    MissingDataError
-        The file is missing or not readable.
-    FormatError
-        The file is not UTF-8.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise MissingDataError(
-            f"cannot read: {error.strerror or error}", file=path, hint="Check the path"
-        ) from error
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise FormatError(
-            "bytes that are not UTF-8 text",
-            file=path,
-            where=data.count(b"\n", 0, error.start) + 1,
-            hint="Export the table as UTF-8 CSV",
-        ) from error
-
-
 def read_table(path: Path) -> Table:
     """Read a CSV file with a header; blank lines are ignored.
 
@@ -255,7 +229,7 @@ def read_table(path: Path) -> Table:
         The file is not UTF-8 or empty, its quotes are broken, two columns have the same name, or
         rows differ in length.
     """
-    text = read_text(path)
+    text = read_text(path, MAX_FILE_BYTES)
     # The csv module knows no NUL, and a crash can leave zeros at the end of a file.
     if "\0" in text:
         raise FormatError(
@@ -322,7 +296,7 @@ def read_number_rows(
     MissingDataError, FormatError
         The file is missing, is not text, has no rows, or has rows of another length.
     """
-    text = read_text(path)
+    text = read_text(path, MAX_FILE_BYTES)
     table = _plain_rows(path, text, names, time_column)
     return table or _rows_by_word(path, text, names, hint)
 

@@ -307,6 +307,127 @@ def test_termination_cleans_up(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="streams of POSIX")
+@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", "2>/dev/full"])
+def test_results_are_written_without_standard_streams(
+    session: Path, tmp_path: Path, closed: str
+) -> None:
+    output = tmp_path / "truth.tum"
+    command = f"export {session} --format tum -o {output} {closed}"
+    done = subprocess.run(
+        f"{sys.executable} -m locatk.cli {command}", shell=True, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(output.read_text().splitlines()) == 20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_result_that_cannot_be_printed_is_an_error(session: Path) -> None:
+    done = subprocess.run(
+        f"{sys.executable} -m locatk.cli info {session} > /dev/full",
+        shell=True,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith(
+        "Error: the standard output cannot be written (No space left on device). Hint: "
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="streams of POSIX")
+def test_closed_streams_do_not_receive_files(tmp_path: Path) -> None:
+    """A file that is opened does not get the number of a closed stream."""
+    code = (
+        "from locatk.cli import app\n"
+        "app.app = lambda **_: print(open('out', 'w').fileno(), file=open('number', 'w'))\n"
+        "app.main()\n"
+    )
+    command = f'{sys.executable} -c "$CODE" <&- >&- 2>&-'
+    subprocess.run(command, shell=True, cwd=tmp_path, env={**os.environ, "CODE": code}, check=True)
+    assert int((tmp_path / "number").read_text()) > 2
+
+
+@pytest.mark.slow
+def test_an_encoding_without_the_character_is_no_error(tmp_path: Path, session: Path) -> None:
+    named = session.rename(tmp_path / "机.mcap")
+    done = subprocess.run(
+        [sys.executable, "-m", "locatk.cli", "info", str(named)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONIOENCODING": "latin-1"},
+    )
+    assert done.returncode == 0
+    assert r"\u673a.mcap" in done.stdout
+
+
+HOSTILE = "red\x1b]0;x\x07\x9b2J\u202eder\u200b\rgo"
+
+
+@pytest.mark.parametrize(
+    "print_text",
+    [
+        console.say,
+        console.detail,
+        console.warn,
+        console.result,
+        lambda text: console.result(console.table(["device"], [[text]])),
+        lambda text: console.result(console.labelled([("device", text)])),
+        lambda text: failures.report(errors.LocatkError("bad", file=text, hint=text)),
+        lambda text: failures.report(failures.Incomplete(text)),
+        lambda text: failures.report(ValueError(text)),
+        lambda text: failures.report(click.UsageError(text)),
+    ],
+)
+def test_terminals_get_no_control_characters(
+    print_text: Callable[[str], object],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    console.set_verbosity(1)
+    try:
+        print_text(HOSTILE)
+    finally:
+        console.reset()
+    printed = "".join(capsys.readouterr())
+    assert r"\x1b]0;x\x07" in printed
+    assert r"\u202e" in printed
+    assert printed.replace("\n", "").isprintable()
+
+
+def test_the_end_of_a_stream_is_not_an_interrupt(
+    locatk: Run, monkeypatch: pytest.MonkeyPatch, session: Path
+) -> None:
+    """click takes EOFError for Ctrl-D."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise EOFError("pickle cut short")
+
+    monkeypatch.setattr("locatk.formats.sessions.reader.Session.open", fail)
+    result = locatk("info", session)
+    assert result.exit_code == 1
+    assert "internal error, EOFError: pickle cut short" in result.stderr
+
+
+def test_a_warning_or_cell_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    console.warn("run\nError: fake.mcap")
+    console.result(console.table(["device"], [["red\n-----"], ["green"]]))
+    printed = capsys.readouterr()
+    assert printed.err.count("\n") == 1
+    assert printed.out.count("\n") == 3
+
+
+def test_json_has_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
+    console.emit_json({"device": HOSTILE})
+    line = capsys.readouterr().out
+    assert line.rstrip("\n").isprintable()
+    assert json.loads(line) == {"device": HOSTILE}
+
+
 def test_no_color_is_honoured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     assert "\x1b[" in console.colour("x", "red")

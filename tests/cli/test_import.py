@@ -235,7 +235,7 @@ def test_losses_give_exit_status_3(locatk, tmp_path: Path, asked: list[Any]) -> 
         (["saleae", "--truth", "again"], "--truth means nothing"),
         (["saleae", "--channel", "-1"], "-1"),
         (["saleae", "--method", "bundle"], "bundle"),
-        (["crazyflie-config"], "ends in .toml"),
+        (["crazyflie-config"], "end it in .toml"),
     ],
 )
 def test_usage(locatk, tmp_path: Path, asked: list[Any], arguments: list[str], words: str) -> None:

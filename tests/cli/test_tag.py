@@ -144,7 +144,7 @@ def test_outputs_are_not_overwritten_without_the_option(locatk, tmp_path: Path, 
     assert (tag.read_bytes(), bom.read_text()) == (before, "mine")
     assert design(locatk, tag, "--spacing", 50, "--overwrite").exit_code == 0
     assert read_tags(tag).spacing_m == 0.05
-    same = design(locatk, tmp_path / "x.toml", "--bom", tmp_path / "x.toml")
+    same = design(locatk, tmp_path / "x", "--bom", tmp_path / "x")
     assert "one file" in same.stderr
 
 

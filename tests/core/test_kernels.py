@@ -48,6 +48,8 @@ def find_dots() -> Arguments:
         "taps": np.array([0.1, 0.2, 0.4], np.float32),
         "block": 4,
         "window": 7,
+        "slope_reach": 3,
+        "max_slope": 0.1,
         "min_contrast": 1.5,
         "contrast_fraction": 0.45,
         "min_dots": 2,

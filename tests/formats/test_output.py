@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
 from locatk.formats import output
-from locatk.formats.output import atomic_write, check_output
+from locatk.formats.output import PART_SUFFIX, atomic_write, check_output, remove_stale_parts
 
 
 def names(folder: Path) -> list[str]:
@@ -150,3 +152,52 @@ def test_errors_about_other_files_pass(tmp_path: Path) -> None:
         write()
     assert not isinstance(caught.value, LocatkError)
     assert names(tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="locks of POSIX")
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    path = tmp_path / "x.bin"
+    code = (
+        "import os, signal\n"
+        "from locatk.formats.output import atomic_write\n"
+        f"with atomic_write({str(path)!r}) as stream:\n"
+        "    stream.write(b'half'); stream.flush()\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", code])
+    [left] = tmp_path.iterdir()
+    assert left.name.endswith(PART_SUFFIX)
+    with atomic_write(path) as stream:
+        stream.write(b"whole")
+    assert [each.name for each in tmp_path.iterdir()] == ["x.bin"]
+    assert path.read_bytes() == b"whole"
+
+
+def test_the_output_of_a_running_process_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "x.bin"
+    with atomic_write(path, overwrite=True) as first:
+        first.write(b"1")
+        with atomic_write(path, overwrite=True) as second:
+            second.write(b"2")
+        assert path.read_bytes() == b"2"
+    assert path.read_bytes() == b"1"
+    assert [each.name for each in tmp_path.iterdir()] == ["x.bin"]
+
+
+def test_an_output_that_was_taken_for_stale_is_created_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = output._lock, []
+
+    def lock_late(descriptor: int, *, wait: bool = False) -> bool:
+        calls.append(wait)
+        if len(calls) == 1:  # between creation and lock
+            remove_stale_parts(tmp_path / "x.bin")
+        return real(descriptor, wait=wait)
+
+    monkeypatch.setattr(output, "_lock", lock_late)
+    with atomic_write(tmp_path / "x.bin") as stream:
+        stream.write(b"whole")
+    assert calls == [True, False, True]
+    assert (tmp_path / "x.bin").read_bytes() == b"whole"

@@ -34,8 +34,8 @@ from locatk.core.dots.calibration.camera_views import (
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
+from locatk.core.dots.localization.recordings import OTHER_SIZE
 from locatk.core.dots.sheet import Manifest
-from locatk.core.dots.solver import OTHER_SIZE
 from locatk.core.errors import DegenerateError, InputError
 
 USUAL_FOCAL_DIAGONALS = 1.56

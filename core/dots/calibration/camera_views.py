@@ -15,8 +15,8 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.localization.frames import dot_correspondences, localize_frames
+from locatk.core.dots.localization.recordings import OFF_SHEET, SHEET_SLACK_PITCHES, UNREADABLE
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest
-from locatk.core.dots.solver import OFF_SHEET, SHEET_SLACK_PITCHES, UNREADABLE
 from locatk.core.errors import DegenerateError, InputError
 
 Array = NDArray[np.float64]
@@ -127,7 +127,8 @@ def _localizable(
     for shape in {image.shape for image in images.values()}:
         if camera is None or camera.size == shape[::-1]:
             batch = [index for index, image in images.items() if image.shape == shape]
-            localized = localize_frames(np.stack([images[k] for k in batch]), code, camera)
+            stack = np.stack([images[k] for k in batch])
+            localized = localize_frames(stack, code, camera, other_codec_odds=0)
             indices += [batch[k] for k in np.flatnonzero(localized.accepted)]
     return sorted(indices)
 
@@ -141,7 +142,7 @@ def _measure_dots(
 ) -> CalibrationFrame | str:
     """Return the dots of a frame with their positions on its sheet, or a reason."""
     height, width = image.shape
-    for dots in dot_correspondences(image[None], code, camera):
+    for dots in dot_correspondences(image[None], code, camera, other_codec_odds=0):
         middle = dots.origin + dots.grid.mean(axis=0)
         number = int(manifest.find(middle[None], [[-1, -1]], slack=SHEET_SLACK_PITCHES)[0])
         if number < 0:

@@ -1,6 +1,7 @@
 """Codecs of the dot pattern: positions to symbols and back."""
 
 from locatk.core.dots.codec.pattern import (
+    CODEC_NAMES,
     DOT_DIRECTIONS,
     MAIN_SEQUENCE,
     MAIN_SEQUENCE_LENGTH,
@@ -12,6 +13,7 @@ from locatk.core.dots.codec.pattern import (
 )
 
 __all__ = [
+    "CODEC_NAMES",
     "DOT_DIRECTIONS",
     "MAIN_SEQUENCE",
     "MAIN_SEQUENCE_LENGTH",

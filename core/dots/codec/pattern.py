@@ -19,6 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.dots.codec import sequences
 from locatk.core.errors import InputError
 
+CODEC_NAMES = tuple(sequences.FOURTH_DIGITS)
+
 MAIN_SEQUENCE_LENGTH = len(sequences.MAIN_DIGITS)
 """Length of the main sequence, and number of sections per axis."""
 

@@ -30,6 +30,13 @@ PAPER_BLOCK_PX = 4
 PAPER_WINDOW_BLOCKS = 7
 """Side of the window over which blocks are averaged then: about two pitches."""
 
+SLOPE_REACH_BLOCKS = 3
+"""Distance of the blocks before and after a dot whose difference is the slope of the light there;
+their windows overlap by one block."""
+
+MAX_PAPER_SLOPE_PER_PX = 0.1
+"""Largest change of the light from pixel to pixel, relative to it; a steeper one is an edge."""
+
 MIN_CONTRAST_LEVELS = 1.5
 """Least contrast of a dot after smoothing [grey levels]."""
 
@@ -81,7 +88,8 @@ def detect_dots(images: NDArray[np.uint8], max_dots: int = 4096) -> DetectedDots
         np.ascontiguousarray(images, np.uint8),
         *(n, h, w),
         _smoothing_taps(),
-        *(PAPER_BLOCK_PX, PAPER_WINDOW_BLOCKS, MIN_CONTRAST_LEVELS, MIN_CONTRAST_FRACTION),
+        *(PAPER_BLOCK_PX, PAPER_WINDOW_BLOCKS, SLOPE_REACH_BLOCKS, MAX_PAPER_SLOPE_PER_PX),
+        *(MIN_CONTRAST_LEVELS, MIN_CONTRAST_FRACTION),
         *(MIN_PATTERN_DOTS, MAX_DIRT_SPLITS, max_dots),
         xy,
         counts,
@@ -99,6 +107,13 @@ def _smoothing_taps() -> NDArray[np.float32]:
         : SMOOTHING_RADIUS_PX + 1, 0
     ]
     return taps.astype(np.float32)
+
+
+@functools.cache
+def _smoothing_variance() -> np.float32:
+    """Return the variance of the smoothing kernel [px^2]."""
+    distance = np.arange(SMOOTHING_RADIUS_PX, -1, -1)
+    return np.float32(2 * (_smoothing_taps() * distance**2).sum())
 
 
 def detect_dots_numpy(images: NDArray[np.uint8], max_dots: int = 4096) -> DetectedDots:
@@ -137,28 +152,39 @@ def detect_dots_numpy(images: NDArray[np.uint8], max_dots: int = 4096) -> Detect
     index, frame, row, column = index[keep], frame[keep], row[keep], column[keep]
     light, contrast = light[keep], contrast[keep]
 
-    relative = contrast / light
-    keep = relative > (MIN_CONTRAST_FRACTION * _median_dots(relative, frame, n))[frame]
-    index, frame, light, contrast = index[keep], frame[keep], light[keep], contrast[keep]
-    slope_y, slope_x = _paper_slopes(paper)
-    x = column[keep] + _subpixel_offset(flat, index, 1, light, contrast, slope_x[frame])
-    y = row[keep] + _subpixel_offset(flat, index, w, light, contrast, slope_y[frame])
+    ink = contrast / light
+    keep = ink > (MIN_CONTRAST_FRACTION * _median_dots(ink, frame, n))[frame]
+    index, frame, row, column = index[keep], frame[keep], row[keep], column[keep]
+    light, ink = light[keep], ink[keep]
+    block_row = np.minimum(row // block, rows - 1)
+    block_column = np.minimum(column // block, columns - 1)
+    slope_x = _paper_slopes(paper[frame, block_row], block_column, light)
+    slope_y = _paper_slopes(paper.swapaxes(1, 2)[frame, block_column], block_row, light)
+    x = column + _subpixel_offset(flat, index, 1, light, ink, slope_x)
+    y = row + _subpixel_offset(flat, index, w, light, ink, slope_y)
     return _pad(frame, x, y, ((w - 1) / 2, (h - 1) / 2), n, max_dots)
 
 
-def _paper_slopes(paper: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the gradients (n,) of the paper's brightness, down and to the right [levels / px].
+def _paper_slopes(
+    lines: NDArray[np.float32], block: NDArray[np.intp], light: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the slopes (n,) of the paper's brightness about blocks, relative to it [1 / px].
 
-    They are those of a plane through the whole frame: light from one side would displace the tops
-    of all dots.
+    ``lines`` (n, blocks) are those with the blocks. The blocks whose difference is taken are moved
+    inwards where the windows over which they are averaged would leave the image.
     """
-    slopes = []
-    for axis in (1, 2):
-        steps = np.arange(paper.shape[axis]) - (paper.shape[axis] - 1) / 2
-        profile = paper.mean(axis=3 - axis) @ steps
-        slope = profile / max(float(steps @ steps), 1.0) / PAPER_BLOCK_PX
-        slopes.append(slope.astype(np.float32))
-    return slopes[0], slopes[1]
+    count = lines.shape[1]
+    first = PAPER_WINDOW_BLOCKS // 2 + SLOPE_REACH_BLOCKS
+    middle = np.minimum(np.maximum(block, first), count - 1 - first)
+    before = np.maximum(middle - SLOPE_REACH_BLOCKS, 0)
+    after = np.minimum(middle + SLOPE_REACH_BLOCKS, count - 1)
+    order = np.arange(len(lines))
+    difference = lines[order, np.maximum(after, 0)] - lines[order, np.minimum(before, count - 1)]
+    steps = ((after - before) * PAPER_BLOCK_PX).astype(np.float32)
+    slope = np.where(steps > 0, difference / np.maximum(steps, np.float32(1)) / light, 0)
+    limit = np.float32(MAX_PAPER_SLOPE_PER_PX)
+    result: NDArray[np.float32] = np.clip(slope, -limit, limit).astype(np.float32)
+    return result
 
 
 def _median_dots(
@@ -197,16 +223,23 @@ def _subpixel_offset(
     index: NDArray[np.intp],
     stride: int,
     light: NDArray[np.float32],
-    contrast: NDArray[np.float32],
+    ink: NDArray[np.float32],
     slope: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Return the offset, within half a pixel, of the top of a Gaussian through three samples."""
-    floor = 0.05 * contrast
-    before = np.log(np.maximum(light - slope - flat[index - stride], floor))
-    after = np.log(np.maximum(light + slope - flat[index + stride], floor))
-    curvature = 2 * np.log(contrast) - before - after
+    """Return the offset, within a pixel, of the top of a Gaussian through three samples of ink.
+
+    Ink is the fraction of the light that the paper loses. Light that varies by ``slope`` per pixel,
+    relative to its brightness, was multiplied with the ink before the smoothing. Therefore the
+    smoothed ink is displaced by the slope times the variance of the smoothing kernel towards the
+    dark. The darkest pixel is displaced further, so that the offset may exceed half a pixel.
+    """
+    floor = np.float32(0.05) * ink
+    one = np.float32(1)
+    before = np.log(np.maximum(one - flat[index - stride] / (light * (one - slope)), floor))
+    after = np.log(np.maximum(one - flat[index + stride] / (light * (one + slope)), floor))
+    curvature = 2 * np.log(ink) - before - after
     offset = 0.5 * (after - before) / np.maximum(curvature, 1e-6)
-    result: NDArray[np.float32] = np.clip(offset, -0.5, 0.5)
+    result: NDArray[np.float32] = np.clip(offset + _smoothing_variance() * slope, -1, 1)
     return result
 
 

@@ -42,16 +42,21 @@ from locatk.core.dots.identification.phase_voting import (
     rotate_to_print,
     rotation_scores,
 )
+from locatk.core.dots.identification.rival_codecs import PrintedWindows, rival_likelihood
 from locatk.core.errors import InputError
 
 MIN_CONFIDENCE = 0.999
 """Least confidence of an accepted result."""
 
+MIN_CODE_CONFIDENCE = 0.5
+"""Confidence below which a window contains no position of the codec; between this and the threshold
+the position is doubtful."""
+
 MIN_LOG_ODDS = math.log(MIN_CONFIDENCE / (1 - MIN_CONFIDENCE))
 """Log odds of :data:`MIN_CONFIDENCE`."""
 
-FOREIGN_CODEC_ODDS = 0.01
-"""Prior odds that the sheet is one of another codec."""
+OTHER_CODEC_ODDS = 0.01
+"""Prior odds that the sheet is one of another codec, if nothing but its dots is known."""
 
 UNLISTED_RIVALS_FACTOR = 3.0
 """Ratio of the likelihood of all rivals of a position to that of those in the list."""
@@ -122,7 +127,13 @@ class DecodedWindows:
     border: NDArray[np.bool_]
 
 
-def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWindows:
+def identify_windows(
+    column_bits: Bits,
+    row_bits: Bits,
+    codec: Codec,
+    *,
+    other_codec_odds: float = OTHER_CODEC_ODDS,
+) -> DecodedWindows:
     """Decode position, section and rotation of n windows.
 
     Parameters
@@ -132,6 +143,8 @@ def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> Decoded
         (column bit 1), and right or down (row bit 1); 0 without a dot. Bits of symbols that are
         certain: plus or minus 4.
     codec : Codec
+    other_codec_odds : float
+        Prior odds that the sheet is one of another known codec; 0 if its codec is certain.
 
     Raises
     ------
@@ -141,14 +154,22 @@ def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> Decoded
     _, rows, columns = column_bits.shape
     if max(rows, columns) > MAX_WINDOW_LINES:
         raise InputError(f"a window of {columns} x {rows} positions, more than {MAX_WINDOW_LINES}")
-    if not MIN_EXACT_LINES <= min(rows, columns) <= max(rows, columns) <= MAX_SMALL_WINDOW_LINES:
-        return _decode_soft(column_bits, row_bits, codec)
-    result = _decode_exact(column_bits, row_bits, codec)
-    doubtful = np.flatnonzero(result.confidence < MIN_CONFIDENCE)
+    if MIN_EXACT_LINES <= min(rows, columns) <= max(rows, columns) <= MAX_SMALL_WINDOW_LINES:
+        result = _decode_exact(column_bits, row_bits, codec)
+        doubtful = np.flatnonzero(result.confidence < MIN_CONFIDENCE)
+    else:
+        result = _decode_soft(column_bits, row_bits, codec)
+        doubtful = np.empty(0, np.intp)
     if len(doubtful):
         soft = _decode_soft(column_bits[doubtful], row_bits[doubtful], codec)
         for field in fields(DecodedWindows):
             getattr(result, field.name)[doubtful] = getattr(soft, field.name)
+    if other_codec_odds:
+        decoded = np.flatnonzero(result.confidence >= MIN_CODE_CONFIDENCE)
+        printed = _as_printed(result, column_bits, row_bits, decoded)
+        rivals = rival_likelihood(printed, result.corrected[decoded], codec)
+        confidence = result.confidence[decoded]
+        result.confidence[decoded] = confidence / (1 + confidence * other_codec_odds * rivals)
     return result
 
 
@@ -238,7 +259,7 @@ def resolve_doubts(
         alternatives = (
             UNLISTED_RIVALS_FACTOR * rivals
             + np.exp(-estimates.log_odds)
-            + FOREIGN_CODEC_ODDS * np.exp(-estimates.order_log_odds)
+            + OTHER_CODEC_ODDS * np.exp(-estimates.order_log_odds)
         )
     result: NDArray[np.float64] = (1 / (1 + alternatives)).prod(axis=1)
     return result
@@ -258,10 +279,7 @@ def as_decoded(
         ~wraps & (estimates.last >= 0) & (position + estimates.last >= SECTION_LENGTH)
     )
     corner = np.where(wraps, position - SECTION_LENGTH, position)
-    # The padding is below and to the right in the image; this is its width on the printed left and
-    # top, by rotation.
-    rows, columns = padding
-    before = np.array([[0, 0], [rows, 0], [columns, rows], [0, columns]])[estimates.rotation]
+    before = _printed_padding(estimates.rotation, padding)
     border = crosses[:, 0] | crosses[:, 1]
     return DecodedWindows(
         x=corner[:, 0] + before[:, 0],
@@ -273,6 +291,36 @@ def as_decoded(
         confidence=np.where(border, 0.0, confidence),
         border=border,
     )
+
+
+def _as_printed(
+    decoded: DecodedWindows, column_bits: Bits, row_bits: Bits, chosen: NDArray[np.intp]
+) -> PrintedWindows:
+    """Return the ``chosen`` (m,) windows as printed, squared, with the phases of their corner."""
+    _, rows, columns = column_bits.shape
+    length = max(rows, columns)
+    rotation = decoded.rotation[chosen]
+    column, row = rotate_to_print(
+        _pad_to_square(column_bits[chosen]), _pad_to_square(row_bits[chosen]), rotation
+    )
+    corner = np.column_stack([decoded.x[chosen], decoded.y[chosen]])
+    corner -= _printed_padding(rotation, (length - rows, length - columns))
+    return PrintedWindows(
+        lines=(column.transpose(0, 2, 1), row),
+        position=corner % SECTION_LENGTH,
+        shift=(decoded.section[chosen] + corner[:, ::-1]) % MAIN_SEQUENCE_LENGTH,
+    )
+
+
+def _printed_padding(rotation: Integers, padding: tuple[int, int]) -> Integers:
+    """Return the width (n, 2) on the printed left and top of rows and columns of padding.
+
+    In the image they are below and on the right.
+    """
+    rows, columns = padding
+    widths = np.array([[0, 0], [rows, 0], [columns, rows], [0, columns]])
+    result: Integers = widths[rotation]
+    return result
 
 
 def _pad_to_square(bits: Bits) -> Bits:

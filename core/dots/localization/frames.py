@@ -21,7 +21,9 @@ from locatk.core.dots.codec import Codec
 from locatk.core.dots.detection.blobs import detect_dots
 from locatk.core.dots.detection.lattice import MIN_LATTICE_DOTS, DotLattices, fit_lattices
 from locatk.core.dots.identification.decoding import (
+    MIN_CODE_CONFIDENCE,
     MIN_CONFIDENCE,
+    OTHER_CODEC_ODDS,
     DecodedWindows,
     identify_windows,
 )
@@ -44,10 +46,6 @@ size, those of twice their size at half size, and so on."""
 MIN_TRIED_LEVELS = 4
 """Number of sizes that are tried, each half of the previous one; more if the preferred one is
 smaller still."""
-
-MIN_CODE_CONFIDENCE = 0.5
-"""Confidence below which a frame contains no position of the codec; between this and the threshold
-the position is doubtful."""
 
 TOO_FEW_DOTS = "too_few_dots"
 NO_GRID = "no_grid"
@@ -75,6 +73,7 @@ class LocalizedFrames:
     dots, corrected : (n,) int64 ndarray
         Dots on the grid, and wrong bits among theirs.
     confidence : (n,) float64 ndarray
+        Probability that the position is right.
     rejected : (n,) object ndarray of str
         Reason of rejection; ``""`` if the frame is localized.
     """
@@ -103,6 +102,11 @@ class LocalizedFrames:
         for field in fields(LocalizedFrames):
             getattr(self, field.name)[indices[better]] = getattr(part, field.name)[better]
 
+    def replace(self, index: int, part: LocalizedFrames) -> None:
+        """Store the single frame of ``part`` at ``index``."""
+        for field in fields(LocalizedFrames):
+            getattr(self, field.name)[index] = getattr(part, field.name)[0]
+
 
 def unlocalized_frames(n: int, reason: str) -> LocalizedFrames:
     """Return n frames that are all rejected for ``reason``."""
@@ -124,11 +128,14 @@ def localize_frames(
     camera: Camera | None = None,
     *,
     min_confidence: float = MIN_CONFIDENCE,
+    other_codec_odds: float = OTHER_CODEC_ODDS,
 ) -> LocalizedFrames:
     """Estimate position and heading of grey frames (n, h, w) of one camera.
 
     Without a ``camera`` its centre is the middle of the frame, and the distortion of its lens is
-    estimated in each frame.
+    estimated in each frame. ``other_codec_odds`` are the prior odds that the sheet is one of
+    another known codec, which may have the same dots at another position; 0 if the codec is
+    certain.
 
     Raises
     ------
@@ -144,7 +151,9 @@ def localize_frames(
     for start in range(0, n, FRAMES_PER_BATCH):
         remaining = np.arange(start, min(start + FRAMES_PER_BATCH, n))
         for level in _levels(height, width):
-            part, _, _ = _localize_batch(images[remaining], codec, camera, level, min_confidence)
+            part, _, _ = _localize_batch(
+                images[remaining], codec, camera, level, min_confidence, other_codec_odds
+            )
             result.update(remaining, part)
             remaining = remaining[~result.accepted[remaining]]
             if not len(remaining):
@@ -153,7 +162,12 @@ def localize_frames(
 
 
 def _localize_batch(
-    images: Images, codec: Codec, camera: Camera | None, level: int, min_confidence: float
+    images: Images,
+    codec: Codec,
+    camera: Camera | None,
+    level: int,
+    min_confidence: float,
+    other_codec_odds: float,
 ) -> tuple[LocalizedFrames, DotLattices, DecodedWindows]:
     """Localize frames (n, h, w) at a size that is halved ``level`` times."""
     n, height, width = images.shape
@@ -167,7 +181,8 @@ def _localize_batch(
     lattices = fit_lattices(points, dots.valid, lens=camera is None)
 
     half = window_half_width(lattices)
-    windows = identify_windows(*soft_bits(lattices, half), codec)
+    bits = soft_bits(lattices, half)
+    windows = identify_windows(*bits, codec, other_codec_odds=other_codec_odds)
     poses = localize_windows(lattices, half, windows, codec)
     rejected = np.full(n, "", object)
     rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
@@ -228,24 +243,32 @@ class DotCorrespondences:
         In the frame, with distortion.
     grid : (m, 2) float64 ndarray
         Grid coordinates of the dot itself, with its offset, relative to :attr:`origin`.
-    origin : (2,) int64 ndarray
+    origin, section : (2,) int64 ndarray
     """
 
     pixels: NDArray[np.float64]
     grid: NDArray[np.float64]
     origin: NDArray[np.int64]
+    section: NDArray[np.int64]
 
 
 def dot_correspondences(
-    images: Images, codec: Codec, camera: Camera | None = None
+    images: Images,
+    codec: Codec,
+    camera: Camera | None = None,
+    *,
+    other_codec_odds: float = OTHER_CODEC_ODDS,
 ) -> Iterator[DotCorrespondences]:
-    """Yield the dots of each frame of ``images`` (n, h, w) that can be localized."""
+    """Yield the dots of each frame of ``images`` (n, h, w) that can be localized.
+
+    ``other_codec_odds`` are those of :func:`localize_frames`.
+    """
     _, height, width = images.shape
     centre, half_diagonal = _normalization(height, width, camera)
     for image in images:
         for level in _levels(height, width):
             frame, lattices, windows = _localize_batch(
-                image[None], codec, camera, level, MIN_CONFIDENCE
+                image[None], codec, camera, level, MIN_CONFIDENCE, other_codec_odds
             )
             if not frame.accepted[0]:
                 continue
@@ -254,5 +277,7 @@ def dot_correspondences(
             pixels = lattices.points[0, used] * half_diagonal + centre
             if camera is not None:
                 pixels = camera.distort(pixels)
-            yield DotCorrespondences(pixels, dots.target[0, used], dots.origin[0])
+            yield DotCorrespondences(
+                pixels, dots.target[0, used], dots.origin[0], windows.section[0]
+            )
             break

@@ -90,9 +90,10 @@ class PrintedPaper:
         self, number: int, middle_m: Array, radius_m: float
     ) -> Iterator[tuple[Array, Array]]:
         """Yield centres and radii in metres of the dots, then of the dust, of one sheet."""
-        sheet, to_metres = self.manifest.sheets[number], self.manifest.jacobian(number)
+        sheet, middle = self.manifest.sheets[number], self.manifest.to_grid(number, middle_m)
+        # Within a frame a distortion is linear.
+        to_metres = self.manifest.jacobian(number, middle)
         to_grid = np.linalg.inv(to_metres)
-        middle = self._to_grid(number, middle_m)
         half_width = radius_m * np.linalg.norm(to_grid, axis=1) + 1.0
         low = np.maximum(np.floor(middle - half_width).astype(np.int64), sheet.origin)
         last = np.array(sheet.origin) + sheet.size - 1
@@ -127,20 +128,12 @@ class PrintedPaper:
             specks = (offsets[is_dusty] + position - 0.5) @ to_metres.T
             yield specks, (low_radius + (high_radius - low_radius) * size) * pitch_m
 
-    def _to_grid(self, number: int, position_m: Array) -> Array:
-        """Convert positions (..., 2) in the frame to fractional grid coordinates of a sheet."""
-        origin = np.array(self.manifest.sheets[number].origin)
-        start = self.manifest.to_metres(number, origin)
-        to_grid = np.linalg.inv(self.manifest.jacobian(number))
-        result: Array = origin + (position_m - start) @ to_grid.T
-        return result
-
     def _is_covered(self, number: int, position_m: Array) -> NDArray[np.bool_]:
         """Return a mask of points (n, 2) that the printed area of a later sheet covers."""
         is_covered = np.zeros(len(position_m), bool)
         for later in self.sheets[self.sheets.index(number) + 1 :]:
             sheet = self.manifest.sheets[later]
-            relative = self._to_grid(later, position_m) - sheet.origin + 0.5
+            relative = self.manifest.to_grid(later, position_m) - sheet.origin + 0.5
             is_covered |= ((relative >= 0) & (relative < sheet.size)).all(axis=1)
         return is_covered
 

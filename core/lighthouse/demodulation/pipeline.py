@@ -45,6 +45,10 @@ from locatk.core.lighthouse.demodulation.soft_bits import (
     is_mocap_flash,
     split_bursts,
 )
+from locatk.core.lighthouse.doubled_channels import (
+    DOUBLED_CHANNEL_HINT,
+    doubled_channel_message,
+)
 from locatk.core.lighthouse.epochs import MAX_PLANE_DELAY_TURNS, MIN_PLANE_DELAY_TURNS
 from locatk.core.lighthouse.recording import UNKNOWN, Edges, StationReport
 from locatk.core.solution import SolverWarning
@@ -186,24 +190,19 @@ def _light_warnings(rotor_set: RotorSet, mocap_flashes: int) -> list[SolverWarni
     """Return warnings about the light as a whole."""
     warnings = []
     if rotor_set.doubled_channels:
-        warnings.append(SolverWarning("doubled_channel", _doubled_message(rotor_set)))
+        message = doubled_channel_message(rotor_set.doubled_channels)
+        warnings.append(SolverWarning("doubled_channel", message))
     if mocap_flashes:
         message = f"{mocap_flashes} flashes of motion capture cameras were removed"
         warnings.append(SolverWarning("mocap_flashes", message))
     return warnings
 
 
-def _doubled_message(rotor_set: RotorSet) -> str:
-    """Format the message about channels with more than one station."""
-    listed = ", ".join(map(str, rotor_set.doubled_channels))
-    return f"more than one station sends on channel {listed}; its sweeps are not used"
-
-
 def _no_station_error(photodiodes: Sequence[ValidatedBursts], rotor_set: RotorSet) -> InputError:
     """Return the error for a recording without an accepted burst."""
     if rotor_set.doubled_channels:
         return InputError(
-            _doubled_message(rotor_set), hint="Set each station to a channel of its own"
+            doubled_channel_message(rotor_set.doubled_channels), hint=DOUBLED_CHANNEL_HINT
         )
     number = sum(len(each.bursts) for each in photodiodes)
     return InputError(

@@ -29,6 +29,7 @@ from locatk.core.lighthouse.channels import (
     channel_of,
     period_ticks,
 )
+from locatk.core.lighthouse.doubled_channels import count_phase_conflicts
 
 Array = NDArray[np.float64]
 
@@ -194,7 +195,17 @@ def find_rotors(
         segments, excluded = _select_disjoint(_link_segments(zero[order], period, rate_hz))
         if not segments:
             continue
-        if excluded > MAX_SECOND_ROTOR_FRACTION * sum(map(len, segments)):
+        # Two rotors whose phases cross during the recording are linked to one segment.
+        conflicts, paired = count_phase_conflicts(
+            tick[rows] / rate_hz,
+            rotor_zero_ticks(tick[rows], index[rows], channel, period) / rate_hz,
+            period / rate_hz,
+        )
+        # Of two rotors, the bursts of both are in conflict.
+        if (
+            excluded > MAX_SECOND_ROTOR_FRACTION * sum(map(len, segments))
+            or conflicts > 2 * MAX_SECOND_ROTOR_FRACTION * paired
+        ):
             doubled.append(channel)
             continue
         rows = rows[order]

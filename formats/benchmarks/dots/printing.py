@@ -81,7 +81,7 @@ def codec_figures() -> list[Figure]:
     table, size = codec("anoto"), default_sheet("A0").sheets[0].size
     rng = np.random.default_rng(FIRST_SEED)
     truth, symbols = random_windows(table, DECODED_WINDOWS, rng)
-    correct = is_correct(identify_windows(*soft_bits(symbols), table), truth)
+    correct = is_correct(identify_windows(*soft_bits(symbols), table, other_codec_odds=0), truth)
     rows = [
         Figure("A0 encoded", None, "s",
                f"{size[0]} x {size[1]} dots in the middle of the plane, processor time, best of 5",
@@ -121,7 +121,7 @@ def time_decoding(windows: int) -> Duration:
     table = codec("anoto")
     _, symbols = random_windows(table, windows, np.random.default_rng(FIRST_SEED))
     bits = soft_bits(symbols)
-    return time_call(lambda: identify_windows(*bits, table))
+    return time_call(lambda: identify_windows(*bits, table, other_codec_odds=0))
 
 
 def _flipped_rows(
@@ -134,7 +134,9 @@ def _flipped_rows(
     """Decode windows with inverted bits (mask (n, 128)), all of equal likelihood ratio."""
     signs = np.where(flipped, -1, 1).astype(np.float32).reshape(-1, 2, WINDOW_DOTS, WINDOW_DOTS)
     column, row = soft_bits(symbols)
-    decoded = identify_windows(column * signs[:, 0], row * signs[:, 1], codec("anoto"))
+    decoded = identify_windows(
+        column * signs[:, 0], row * signs[:, 1], codec("anoto"), other_codec_odds=0
+    )
     accepted = decoded.confidence >= MIN_CONFIDENCE
     correct = is_correct(decoded, truth)
     n_correct, n_wrong = int((correct & accepted).sum()), int((~correct & accepted).sum())
@@ -282,7 +284,7 @@ def raster_figures(paper: str, manifest: Manifest, pdf: bytes) -> list[Figure]:
         0, (columns - WINDOW_DOTS + 1, rows - WINDOW_DOTS + 1), (RASTER_WINDOWS, 2)
     )
     windows = np.stack([read[y:, x:][:WINDOW_DOTS, :WINDOW_DOTS] for x, y in corners])
-    decoded = identify_windows(*soft_bits(windows), codec(manifest.codec))
+    decoded = identify_windows(*soft_bits(windows), codec(manifest.codec), other_codec_odds=0)
     truth = np.c_[corners + sheet.origin, np.zeros(len(corners), np.int64)]
     correct = is_correct(decoded, truth) & (decoded.confidence >= MIN_CONFIDENCE)
     return [

@@ -35,6 +35,7 @@ from locatk.core.dots.solver import METHODS, SolveOptions, solve
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.paper_sizes import paper_size
 from locatk.formats import images as image_files
+from locatk.formats.benchmarks.dots.disturbances import disturbance_figures
 from locatk.formats.benchmarks.dots.printing import codec_figures, default_sheet, print_figures
 from locatk.formats.benchmarks.figures import Duration, Figure, measure_or_explain
 from locatk.formats.benchmarks.timing import (
@@ -157,6 +158,7 @@ def figures(data: Path) -> list[Figure]:
         *codec_figures(),
         *print_figures(),
         *condition_figures(),
+        *disturbance_figures(),
         *decoy_figures(),
         *paper_method_figures(),
         *speed_figures(),
@@ -234,7 +236,9 @@ def condition_figures() -> list[Figure]:
         images, grid, heading = render(
             condition, CONDITION_FRAMES, FIRST_SEED + 100 + number, manifest
         )
-        located = localize_frames(images, codec(manifest.codec), condition.camera)
+        located = localize_frames(
+            images, codec(manifest.codec), condition.camera, other_codec_odds=0
+        )
         score = score_frames(located, grid, heading)
         rows += _condition_rows(condition, score)
         accepted, wrong = accepted + score.accepted, wrong + score.wrong
@@ -347,14 +351,14 @@ def time_batch(frames: int) -> Duration:
     """Time the localization of a batch of frames."""
     images, _, _ = render(CONDITIONS[1], frames, FIRST_SEED + 400, default_sheet("A0"))
     table = codec("anoto")
-    return time_call(lambda: localize_frames(images, table), 3)
+    return time_call(lambda: localize_frames(images, table, other_codec_odds=0), 3)
 
 
 def time_single(frames: int) -> Duration:
     """Time the localization of single frames; the median counts."""
     images, _, _ = render(CONDITIONS[1], frames, FIRST_SEED + 401, default_sheet("A0"))
     table = codec("anoto")
-    calls = [partial(localize_frames, image[None], table) for image in images]
+    calls = [partial(localize_frames, image[None], table, other_codec_odds=0) for image in images]
     seconds, factor = time_each(calls, 3)
     return Duration(float(np.median(seconds)), factor)
 
@@ -377,7 +381,7 @@ def published_frame_figures(path: Path) -> list[Figure]:
         image = image_files.grey(image_files.decode(path.read_bytes()).pixels)
         for quarter in range(4):
             rotated = np.ascontiguousarray(np.rot90(image, quarter))
-            located = localize_frames(rotated[None], codec("libdots"))
+            located = localize_frames(rotated[None], codec("libdots"), other_codec_odds=0)
             error, heading_error = math.nan, math.nan
             if located.accepted[0]:
                 error = float(np.abs(located.grid[0] - FRAME_BMP_CENTRE).max())

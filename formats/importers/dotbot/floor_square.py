@@ -35,8 +35,9 @@ from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.published.scene import paper_image_points
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
 from locatk.core.trajectory import Trajectory
+from locatk.formats.files import read_text
 from locatk.formats.importers.dotbot.count_rows import PLANE_COLUMNS, TIME_COLUMN, CountRows
-from locatk.formats.tables.delimited import read_table, read_text
+from locatk.formats.tables.delimited import read_table
 from locatk.formats.tables.timestamps import parse_iso_time
 
 Array = NDArray[np.float64]

@@ -39,10 +39,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.clock_sync import TickClock
-from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.errors import FormatError, MissingDataError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
+from locatk.formats.files import open_binary
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.tables.timestamps import parse_iso_time
 
@@ -224,20 +225,15 @@ def _read(path: Path, log: _Log) -> None:
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield lines with their numbers and ends; lines longer than any record are empty."""
-    try:
-        with open(path, "rb") as stream:
-            number = 0
-            while line := stream.readline(MAX_LINE_BYTES):
-                number += 1
-                if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
-                    while line and not line.endswith(b"\n"):
-                        line = stream.readline(MAX_LINE_BYTES)
-                    line = b"\n"
-                yield number, line
-    except (FileNotFoundError, NotADirectoryError):
-        raise MissingDataError("no such file", file=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", file=path) from None
+    with open_binary(path) as stream:
+        number = 0
+        while line := stream.readline(MAX_LINE_BYTES):
+            number += 1
+            if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
+                while line and not line.endswith(b"\n"):
+                    line = stream.readline(MAX_LINE_BYTES)
+                line = b"\n"
+            yield number, line
 
 
 def _fields(line: bytes) -> _Fields:

@@ -23,10 +23,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import FormatError, InputError, MissingDataError
+from locatk.core.errors import FormatError, InputError
 from locatk.core.geometry import matrix_from_quaternion, rigid_inverse, se3, transform_points
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import Receiver
+from locatk.formats.files import read_bytes
 
 Array = NDArray[np.float64]
 
@@ -192,13 +193,7 @@ def read_stored_calibrations(path: Path) -> dict[int, Calibration]:
         The file is not readable, has no station, or a station has an invalid value.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_CONFIGURATION_BYTES).decode("utf-8", "replace")
-    except FileNotFoundError:
-        raise MissingDataError("the configuration is missing", file=path) from None
-    except OSError as error:
-        raise FormatError(error.strerror or "cannot be read", file=path) from None
+    text = read_bytes(path, MAX_CONFIGURATION_BYTES).decode("utf-8", "replace")
     blocks = _BLOCK.findall(text)
     if not blocks:
         raise FormatError("not a configuration of libsurvive with a station", file=path)

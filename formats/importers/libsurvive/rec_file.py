@@ -33,7 +33,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import FormatError, MissingDataError
+from locatk.core.errors import FormatError
+from locatk.formats.files import open_binary
 
 MAX_BYTES = 1 << 29
 MAX_LINES = 1 << 24
@@ -232,16 +233,11 @@ class LineBlocks:
             yield rest + b"\n"
 
     def _decoded(self) -> Iterator[bytes]:
-        try:
-            with self.path.open("rb") as file:
-                is_gzip = file.read(2) == b"\x1f\x8b"
-                file.seek(0)
-                raw = iter(lambda: file.read(BLOCK_BYTES), b"")
-                yield from self._decompressed(raw) if is_gzip else raw
-        except FileNotFoundError:
-            raise MissingDataError("the recording is missing", file=self.path) from None
-        except OSError as error:
-            raise FormatError(error.strerror or "cannot be read", file=self.path) from None
+        with open_binary(self.path) as file:
+            is_gzip = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            raw = iter(lambda: file.read(BLOCK_BYTES), b"")
+            yield from self._decompressed(raw) if is_gzip else raw
 
     def _decompressed(self, compressed: Iterator[bytes]) -> Iterator[bytes]:
         decompressor = zlib.decompressobj(31)

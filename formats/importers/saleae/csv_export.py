@@ -32,12 +32,12 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
+from locatk.formats.files import open_binary
 from locatk.formats.importers.saleae.digital_lines import (
     DigitalLine,
     EdgeSegment,
     Ticks,
     clean_name,
-    readable,
 )
 from locatk.formats.tables.delimited import parse_numbers
 from locatk.formats.tables.timestamps import is_iso_time, parse_iso_times
@@ -109,7 +109,7 @@ def read_csv_export(path: Path) -> list[DigitalLine]:
         A cell is not a time or level, or times do not ascend.
     """
     path = Path(path)
-    with readable(path), path.open("rb") as stream:
+    with open_binary(path) as stream:
         return _read_lines(path, stream)
 
 

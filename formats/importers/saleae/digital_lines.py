@@ -11,15 +11,13 @@ three bits or longer. Bus traffic has no pauses between bursts.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import InputError, LocatkError, MissingDataError
+from locatk.core.errors import InputError
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, Edges
 
 Ticks = NDArray[np.int64]
@@ -235,17 +233,3 @@ def estimate_resolution(tick: Ticks) -> float:
 def clean_name(text: str) -> str:
     """Return a name for one line of a terminal: printable, with at most 60 characters."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:60]
-
-
-@contextmanager
-def readable(path: Path) -> Iterator[None]:
-    """Raise errors of reading a file as MissingDataError."""
-    try:
-        yield
-    except LocatkError:
-        raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise MissingDataError(
-            f"cannot read: {reason}", file=path, hint="Check the path"
-        ) from error

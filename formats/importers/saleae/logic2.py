@@ -45,12 +45,12 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, LocatkError
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
+from locatk.formats.files import open_binary
 from locatk.formats.importers.saleae.digital_lines import (
     DigitalLine,
     EdgeSegment,
     Ticks,
     clean_name,
-    readable,
 )
 
 MAGIC = b"<SALEAE>"
@@ -436,7 +436,7 @@ def _nanoseconds(source: Source, seconds: NDArray[np.float64]) -> Ticks:
 def _opened(path: Path, member: str) -> Iterator[Source]:
     """Open a binary file, or a member of an archive; errors of either are LocatkErrors."""
     if not member:
-        with readable(path), path.open("rb") as stream:
+        with open_binary(path) as stream:
             yield Source(stream, path)
         return
     with _archive(path, member) as archive, archive.open(member) as stream:
@@ -478,7 +478,7 @@ def read_binary(path: Path) -> DigitalLine:
 def _archive(path: Path, where: str | None = None) -> Iterator[zipfile.ZipFile]:
     """Open an archive; any error in it is a FormatError."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_binary(path) as stream, zipfile.ZipFile(stream) as archive:
             yield archive
     except LocatkError:
         raise

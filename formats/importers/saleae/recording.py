@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from locatk.core.errors import FormatError, InputError
+from locatk.core.errors import InputError
 from locatk.core.lighthouse.channels import channel_of
 from locatk.core.lighthouse.demodulation import (
     DecodedSweeps,
@@ -31,6 +31,7 @@ from locatk.core.lighthouse.demodulation import (
 from locatk.core.lighthouse.published.light_decoding import decode_recording
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, Edges, StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.formats.files import read_head
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.saleae.csv_export import read_csv_export
 from locatk.formats.importers.saleae.digital_lines import (
@@ -38,7 +39,6 @@ from locatk.formats.importers.saleae.digital_lines import (
     DigitalLine,
     RunStatistics,
     estimate_resolution,
-    readable,
 )
 from locatk.formats.importers.saleae.logic2 import MAGIC, read_binary, read_capture_file
 
@@ -299,13 +299,7 @@ def read_capture(path: Path, channels: Sequence[str | int] = ()) -> LightCapture
 
 def _open_capture(path: Path) -> tuple[str, list[DigitalLine]]:
     """Return the name of the format, detected from the content, and the lines."""
-    if path.is_dir():
-        raise FormatError("a folder instead of a capture", file=path, hint="Give the file itself")
-    with readable(path):
-        if path.exists() and not path.is_file():
-            raise FormatError("not a regular file", file=path, hint="Give a capture or its export")
-        with path.open("rb") as stream:
-            start = stream.read(8)
+    start = read_head(path, len(MAGIC))
     if start.startswith(ZIP_MAGICS):
         return "saleae-capture", read_capture_file(path)
     if start == MAGIC:

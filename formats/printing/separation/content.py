@@ -28,7 +28,7 @@ DAMAGE_ERRORS = (
     pikepdf.PdfError,
     pikepdf.DataDecodingError,
     pikepdf.models.PdfParsingError,
-    *(ValueError, TypeError, KeyError, IndexError, AttributeError),
+    *(ValueError, TypeError, KeyError, IndexError, AttributeError, RuntimeError),
 )
 """Exceptions raised when a damaged object is read."""
 

@@ -30,6 +30,7 @@ from locatk.formats.schemas import lighthouse_pb2, magnetics_pb2, poses_pb2, ser
 from locatk.formats.sessions.mcap_file import (
     CHANNELS_RECORD,
     MAGIC,
+    MAX_RECORD_BYTES,
     MAX_RUN_BYTES,
     MESSAGE_HEAD,
     RECORD_HEAD,
@@ -40,7 +41,6 @@ from locatk.formats.sessions.mcap_file import (
     parse,
 )
 from locatk.formats.sessions.recovery.validation import (
-    MAX_RECORD_BYTES,
     READERS,
     DamagedFile,
     Definition,

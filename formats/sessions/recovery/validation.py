@@ -26,6 +26,7 @@ from mcap.opcode import Opcode
 
 from locatk.formats.sessions.mcap_file import (
     MAGIC,
+    MAX_RECORD_BYTES,
     MESSAGE_HEAD,
     PARSE_ERRORS,
     RECORD_HEAD,
@@ -34,12 +35,6 @@ from locatk.formats.sessions.mcap_file import (
     iter_records,
     parse,
 )
-
-MAX_RECORD_BYTES = 1 << 30
-"""Largest record, and largest decompressed chunk, that is accepted.
-
-Attachments may be larger, because they are not held in memory here.
-"""
 
 MAX_HEAD_BYTES = 1 << 16
 """Largest name and media type of an attachment that are accepted."""

@@ -217,8 +217,8 @@ def test_nothing_is_overwritten_unasked(locatk, upright: Path, tmp_path: Path) -
     assert out.read_text() == "mine"
     before = upright.read_bytes()
     result = locatk("calibrate", "camera", upright, "-o", upright, "--overwrite")
-    assert result.exit_code == 1
-    assert "one of the inputs" in result.stderr
+    assert result.exit_code == 2
+    assert "end it in .toml" in result.stderr
     assert upright.read_bytes() == before
 
 

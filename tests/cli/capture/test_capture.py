@@ -320,6 +320,8 @@ def unopened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         (["/dev/x", "-o", "OUT", "--rotate", "1us"], ""),
         (["/dev/x", "-o", "OUT", "--rotate", "1B"], "too small"),
         (["/dev/x", "-o", "OUT", "--silence", "0"], "is not a time"),
+        (["/dev/x", "-o", "OUT", "--max-size", "0"], "is not a size"),
+        (["/dev/x", "-o", "OUT", "--reserve", "none"], "is not a size; examples: 0, 500MB"),
         (["/dev/x", "-o", "OUT", "--columns", "a,,b"], "distinct names"),
         (["/dev/x", "-o", "OUT", "--columns", "a,a"], "distinct names"),
         (["/dev/x", "-o", "OUT", "--baud", "0"], ""),
@@ -527,8 +529,8 @@ def test_on_a_terminal_the_line_stays_one(
 def test_a_reader_may_disconnect(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[str] = []
 
-    def broken(*_: object, **__: object) -> None:
-        heard.append("tried")
+    def broken(text: str, **_: object) -> None:
+        heard.append(text)
         raise BrokenPipeError(32, "Broken pipe")
 
     monkeypatch.setattr(click, "echo", broken)
@@ -537,7 +539,7 @@ def test_a_reader_may_disconnect(monkeypatch: pytest.MonkeyPatch) -> None:
     live.show(CaptureStatus(5.0, None, 1e6, 10.0, CaptureStatistics(), 10**6, 10**9))
     live.tell("two")
     live.wipe()
-    assert len(heard) == 1
+    assert len(heard) == 3
 
 
 @pytest.mark.slow

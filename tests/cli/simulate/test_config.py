@@ -101,7 +101,7 @@ def test_the_configuration_is_not_overwritten(locatk, tmp_path: Path) -> None:
     config = tmp_path / "sim.toml"
     config.write_text(polaris.CONFIG.dumps())
     result = locatk("simulate", "polaris", "--config", config, "-o", config, "--overwrite")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert config.read_text() == polaris.CONFIG.dumps()
 
 

@@ -184,5 +184,5 @@ def test_outputs_are_not_overwritten_without_the_option(locatk, tmp_path: Path) 
     sheet = tmp_path / "sheet.toml"
     sheets.write_manifest(sheet, simulate.sheet())
     result = locatk("simulate", "dots", "-o", sheet, "--sheet", sheet, "--overwrite")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert sheets.read_manifest(sheet) == simulate.sheet()

@@ -298,7 +298,7 @@ def test_outputs_are_not_overwritten_without_the_option(locatk, tmp_path: Path) 
     assert out.read_text() == "mine"
     assert locatk("simulate", "polaris", "-o", out, "--overwrite").exit_code == 0
     artifacts.write_tags(tag, SITE)
-    assert locatk("simulate", "polaris", tag, "-o", tag, "--overwrite").exit_code == 1
+    assert locatk("simulate", "polaris", tag, "-o", tag, "--overwrite").exit_code == 2
     assert artifacts.read_tags(tag) == SITE
 
 

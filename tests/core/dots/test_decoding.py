@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -20,12 +21,11 @@ from locatk.core.dots.codec import (
     sequences,
 )
 from locatk.core.dots.identification import decoding
-from locatk.core.dots.identification.decoding import (
-    MIN_CONFIDENCE,
-    DecodedWindows,
-    identify_windows,
-)
+from locatk.core.dots.identification.decoding import MIN_CONFIDENCE, DecodedWindows
 from locatk.core.errors import InputError
+
+identify_windows = functools.partial(decoding.identify_windows, other_codec_odds=0)
+"""The codec is certain, unless a test is about others."""
 
 CODECS = ("anoto", "libdots", "microdots")
 UP, LEFT, RIGHT, DOWN = range(4)

@@ -6,6 +6,7 @@ thresholds are those of the issue.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Callable
@@ -21,10 +22,9 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, codec
 from locatk.core.dots.detection.lattice import DotLattices
 from locatk.core.dots.identification.soft_bits import soft_bits
+from locatk.core.dots.localization import frames as localization
 from locatk.core.dots.localization.frames import (
     LocalizedFrames,
-    dot_correspondences,
-    localize_frames,
     unlocalized_frames,
 )
 from locatk.core.errors import InputError
@@ -32,6 +32,10 @@ from locatk.core.errors import InputError
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Shots = Callable[..., Any]
+
+localize_frames = functools.partial(localization.localize_frames, other_codec_odds=0)
+dot_correspondences = functools.partial(localization.dot_correspondences, other_codec_odds=0)
+"""The codec is certain: frames of a known sheet."""
 
 CORNER_SQUARE = 93.5**2 + 59.5**2
 TILT_10 = math.radians(10)

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
+from locatk.core.dots.localization import recordings
+from locatk.core.dots.localization.frames import localize_frames
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import InputError
@@ -182,6 +184,65 @@ def test_the_manifest_of_another_codec(shoot: Shoot) -> None:
     assert set(solution.rejected) <= {"no_code", "low_confidence", "off_sheet"}
     right = solve([frames_of(images)], Manifest((sheet,), codec="microdots"))
     assert right.poses == 8
+
+
+def test_the_other_codec_is_named_by_frames_off_the_sheet(shoot: Shoot) -> None:
+    # The fourth sequences of anoto and libdots are the same up to position 219 of 241.
+    start = 241 * 700_000
+    sheet = Sheet("s", (start, start), (241, 241), (0, 0), (140.0, 140.0), (8.0, 8.0))
+    images = [
+        shoot(at=(start + x, start + 100.0), codec="libdots", seed=x)
+        for x in (40, 80, 120, 160, 232, 233)
+    ]
+    confused = solve([frames_of(images)], Manifest((sheet,), codec="anoto"))
+    assert (confused.poses, confused.rejected) == (4, {"off_sheet": 2})
+    # In the place of another codec, a position off the sheet is no certain one.
+    off_sheet = confused.facts.frames[4:]
+    assert all(frame.confidence < 0.999 for frame in off_sheet)
+    (warning,) = (each for each in confused.warnings if each.code != "no_camera_model")
+    assert warning.code == "other_codec"
+    assert "'libdots'" in warning.message
+    right = solve([frames_of(images)], Manifest((sheet,), codec="libdots"))
+    assert right.poses == 6
+    assert [each.code for each in right.warnings] == ["no_camera_model"]
+
+
+ALTERED = {
+    "mirrored": lambda image: image[:, ::-1],
+    "inverted": lambda image: 255 - image,
+    "mirrored_and_inverted": lambda image: 255 - image[:, ::-1],
+}
+
+
+@pytest.mark.parametrize("reason", ALTERED)
+def test_mirrored_and_inverted_frames_are_named(shoot: Shoot, reason: str) -> None:
+    """Also if they are few among frames without a pattern, and those with one keep their poses."""
+    sheet = Sheet("s", (1000, 2000), (200, 200), (0, 0), (120.0, 120.0), (8.0, 8.0))
+    good = [shoot(at=(1050.0 + 11 * k, 2100.0), heading=k, seed=k) for k in range(10)]
+    blank = np.full((120, 188), 200, np.uint8)
+    images = [*good[:2], *[blank] * 20, *(ALTERED[reason](image) for image in good[2:])]
+    solution = solve([frames_of(images)], Manifest((sheet,)))
+    assert solution.poses == 2
+    assert solution.rejected == {reason: 8, "too_few_dots": 20}
+    (warning,) = (each for each in solution.warnings if each.code != "no_camera_model")
+    assert warning.code == f"{reason}_frames"
+    assert warning.message.startswith("8 frames")
+
+
+def test_other_causes_are_tried_on_a_sample_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = []
+
+    def count(images: Image, *args: Any, **options: Any) -> Any:
+        tried.append(len(images))
+        return localize_frames(images, *args, **options)
+
+    monkeypatch.setattr(recordings, "localize_frames", count)
+    noise = np.random.default_rng(4).integers(0, 256, (40, 60, 60)).astype(np.uint8)
+    solution = solve([frames_of(list(noise))], Manifest((PAGE,)))
+    assert sum(solution.rejected.values()) == 40
+    assert set(solution.rejected) <= {"no_grid", "too_few_dots", "no_code"}
+    # Three alterations and two other codecs.
+    assert sum(tried) == 40 + 5 * recordings.MAX_TRIED_FRAMES
 
 
 def test_cameras_by_themselves(shoot: Shoot) -> None:

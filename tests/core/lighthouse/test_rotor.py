@@ -182,6 +182,14 @@ def test_two_stations_on_a_channel_for_a_part_of_the_time() -> None:
     assert drawn.found().doubled_channels == (4,)
 
 
+@pytest.mark.parametrize("shift_s", [2e-4, 8e-4])
+def test_two_stations_on_a_channel_whose_phases_cross(shift_s: float) -> None:
+    drawn = Decoded()
+    drawn.station(4, 0, 60)
+    drawn.station(4, 0, 60, zero_s=0.003 + shift_s, ppm=-shift_s / 30 * 1e6)
+    assert drawn.found().doubled_channels == (4,)
+
+
 @pytest.mark.parametrize("ppm", [0.0, 1.0])
 def test_a_station_that_is_switched_off_and_on(ppm: float) -> None:
     drawn = Decoded()

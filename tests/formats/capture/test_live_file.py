@@ -13,7 +13,15 @@ import pytest
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
 from locatk.formats.capture import recording_files as live_file
-from locatk.formats.capture.recording_files import RESERVED_BYTES, DiskFullError, LiveFile
+from locatk.formats.capture.recording_files import (
+    MIN_RESERVED_BYTES,
+    RESERVED_BYTES,
+    DiskFullError,
+    FileContent,
+    LiveFile,
+    RecordingFiles,
+)
+from locatk.formats.sessions.reader import Session
 
 
 class Disk:
@@ -222,6 +230,48 @@ def test_a_nearly_full_disk_is_reported_in_time(tmp_path: Path, taken: Taken) ->
         fill(file, 1000)
     assert had - file.tell() >= 1000
     file.close()
+
+
+def test_a_small_disk_gives_what_it_has(tmp_path: Path, taken: Taken) -> None:
+    file = LiveFile(tmp_path / "run.mcap")
+    taken.answers = [errno.ENOSPC, 0]
+    file.make_room(2_000_000)
+    assert taken.ends == [2_000_000 + RESERVED_BYTES, 2_000_000 + RESERVED_BYTES // 2]
+    taken.answers = [errno.ENOSPC, 0]
+    file.write(bytes(2_000_000))
+    file.make_room(2_000_000)
+    assert taken.ends[-1] == file.tell() + 2_000_000 + MIN_RESERVED_BYTES
+    file.write(bytes(1_500_000))
+    taken.answers = [errno.ENOSPC]
+    with pytest.raises(DiskFullError):
+        file.make_room(2_000_000)
+    file.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_FSIZE of Linux")
+def test_a_disk_of_six_megabytes_is_used(tmp_path: Path) -> None:
+    """A limit of the file size, which needs no rights, refuses allocations like a full disk."""
+    import resource
+
+    path = tmp_path / "run.mcap"
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6 << 20, old[1]))
+    try:
+        made = RecordingFiles(path, FileContent())
+        with pytest.raises(DiskFullError):
+            log_for_ever(made)
+        made.finish({"ended": "full"})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    session = Session.open(path)
+    assert session.metadata()["capture"]["ended"] == "full"
+    assert 3 << 20 < path.stat().st_size <= 6 << 20
+
+
+def log_for_ever(made: RecordingFiles) -> None:
+    while True:
+        made.log(os.urandom(50_000).hex(), 1)
+        made.flush()
 
 
 def fill(file: LiveFile, promised: int) -> None:

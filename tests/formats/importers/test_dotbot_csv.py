@@ -325,7 +325,7 @@ def test_bad_input_names_file_and_line(write: Write, text: str, where: object, w
 def test_missing_files_and_mixed_layouts(write: Write, tmp_path: Path) -> None:
     with pytest.raises(MissingDataError):
         read_dotbot([tmp_path / "none.csv"])
-    with pytest.raises(MissingDataError):
+    with pytest.raises(InputError, match="a folder"):
         read_dotbot([tmp_path])
     with pytest.raises(MissingDataError):
         read_dotbot([])

@@ -273,7 +273,7 @@ def test_files_that_are_not_there(tmp_path: Path) -> None:
         read_dotbot_log([])
     with pytest.raises(MissingDataError, match="no such file"):
         read_dotbot_log([tmp_path / "pydotbot.log"])
-    with pytest.raises(LocatkError, match="cannot be read"):
+    with pytest.raises(LocatkError, match="a folder"):
         read_dotbot_log([tmp_path])
 
 

@@ -157,8 +157,8 @@ def test_csv_is_what_the_contract_says(tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_bytes().decode() == (
         "time_s,device,x_m,y_m,z_m,qx,qy,qz,qw,"
         "sigma_x_m,sigma_y_m,sigma_z_m,sigma_heading_rad,probability\n"
-        "1690218696.074800000,robot,0.5,-0.25,0.0,0.0,0.0,0.0,1.0,0.001,0.002,0.003,,\n"
-        "1690218696.174800001,robot,0.75,1.0,0.125,0.0,0.0,0.0,1.0,0.001,0.002,0.003,,\n"
+        "1690218696.074800000,robot,0.5,-0.25,0.0,,,,,0.001,0.002,0.003,,\n"
+        "1690218696.174800001,robot,0.75,1.0,0.125,,,,,0.001,0.002,0.003,,\n"
     )
 
 
@@ -302,7 +302,7 @@ def test_other_encodings_and_missing_files(tmp_path: Path) -> None:
     assert caught.value.where == 3
     with pytest.raises(FileNotFoundError):
         read_tum(tmp_path / "none.tum")
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(FormatError, match="a folder"):
         read_csv(tmp_path)
 
 

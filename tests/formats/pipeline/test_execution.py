@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import importlib
+import multiprocessing
 import os
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from multiprocessing import forkserver
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
+from locatk.formats.pipeline import execution
 from locatk.formats.pipeline.execution import (
+    MAX_FAILED_STARTS,
     LostJob,
     Pool,
     in_order,
@@ -117,3 +124,50 @@ def test_an_interrupt_ends_the_workers(module: ModuleType, tmp_path: Path) -> No
 def test_results_are_yielded_in_order() -> None:
     came = iter([(2, "c"), (0, "a"), (3, "d"), (1, "b")])
     assert list(in_order(came)) == [(1, []), (2, ["a"]), (3, []), (4, ["b", "c", "d"])]
+
+
+class _FailingExecutor(Executor):
+    """Executor whose fork server has died: the first ``failures`` submissions fail."""
+
+    failures = 0
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        if _FailingExecutor.failures:
+            _FailingExecutor.failures -= 1
+            raise EOFError
+        future: Future[Any] = Future()
+        future.set_result(function(*args, **kwargs))
+        return future
+
+
+@pytest.mark.parametrize("failures", [1, 2])
+def test_a_dead_fork_server_is_started_again(
+    failures: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(execution, "RESTART_DELAY_S", 0.0)
+    _FailingExecutor.failures = failures
+    results = dict(run_jobs(abs, [-1, -2, -3], Pool(lambda width: _FailingExecutor(), 2)))
+    assert results == {0: 1, 1: 2, 2: 3}
+
+
+def test_all_jobs_are_given_up_without_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(execution, "RESTART_DELAY_S", 0.0)
+    _FailingExecutor.failures = 1000
+    results = dict(run_jobs(abs, [-1, -2, -3], Pool(lambda width: _FailingExecutor(), 2)))
+    assert sorted(results) == [0, 1, 2]
+    assert {result.reason for result in results.values()} == {
+        "no process could be started (EOFError)"
+    }
+    assert 1000 - _FailingExecutor.failures == MAX_FAILED_STARTS
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    "forkserver" not in multiprocessing.get_all_start_methods(), reason="no fork server"
+)
+def test_a_killed_fork_server_loses_no_job(module: ModuleType, tmp_path: Path) -> None:
+    jobs = [(tmp_path, number, "late") for number in range(4)]
+    results = run_jobs(module.work, jobs, processes(2))
+    found = [next(results)]
+    os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)  # type: ignore[attr-defined]
+    assert dict([*found, *results]) == {n: n * n for n in range(4)}

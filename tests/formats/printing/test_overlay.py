@@ -520,3 +520,25 @@ def test_stamps_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         overlay(document, stamp((WIDTH, HEIGHT), (WIDTH, HEIGHT + 3)), strip_black=False)
     close = stamp((WIDTH + 0.1, HEIGHT), (WIDTH, HEIGHT - 0.1))
     assert isinstance(overlay(document, close, strip_black=False), OverlaidDocument)
+
+
+def test_a_stream_larger_than_the_limit_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not hasattr(pikepdf.settings, "set_qpdf_limits"):
+        pytest.skip("this version of pikepdf has no limits")
+    previous = pikepdf.settings.get_qpdf_limits()
+    monkeypatch.setattr("locatk.formats.printing.overlay.MAX_STREAM_BYTES", 1 << 20)
+    document = tmp_path / "bomb.pdf"
+    with Pdf.new() as pdf:
+        pdf.add_blank_page(page_size=(100, 100))
+        packed = zlib.compress(zlib.compress(b" " * (8 << 20), 9), 9)
+        content = Stream(pdf, packed)
+        content.Filter = Array([Name.FlateDecode, Name.FlateDecode])
+        pdf.pages[0].Contents = content
+        pdf.save(document)
+    try:
+        with pytest.raises(FormatError, match=r"damaged PDF \(.*memory limit exceeded"):
+            overlay(document, stamp((100, 100)), strip_black=True)
+    finally:
+        pikepdf.settings.set_qpdf_limits(**previous)

@@ -1,0 +1,309 @@
+"""``locatk calibrate sheet``: sheets of a floor as built, and the errors of their print."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console, options
+from locatk.cli.calibrate import recordings
+from locatk.cli.command import Command, section
+from locatk.core.errors import InputError
+
+if TYPE_CHECKING:
+    from locatk.core.dots.calibration.floor import FloorRecording, FloorReport
+    from locatk.core.dots.calibration.floor_frame import BuiltSheet
+    from locatk.core.dots.camera import Camera
+    from locatk.core.dots.sheet import Manifest
+    from locatk.core.trajectory import Trajectory
+
+MAX_SHEETS = 60
+"""Number of sheets listed as text; --json lists all."""
+
+
+@click.command("sheet", cls=Command, short_help="Fit tiles and sheets of a floor as built.")
+@options.sessions
+@options.output("Manifest to write (.toml), with the sheets as built.")
+@options.overwrite
+@section(
+    "Input",
+    options.input_option(
+        "--artifact",
+        "--manifest",
+        "artifact",
+        help="Manifest of the sheets (.toml) to use instead of the first session's.",
+    ),
+    options.input_option(
+        "--camera",
+        help="Camera (.toml) of all sessions.  [default: that of each session, or estimated from "
+        "its frames]",
+    ),
+    options.input_option(
+        "--truth",
+        many=True,
+        help="Poses of the camera from another system: a session with truth, or a TUM or CSV file. "
+        "Give one file for all sessions, or one for each in the same order.",
+    ),
+    click.option(
+        "--offset",
+        type=float,
+        default=0.0,
+        show_default=True,
+        metavar="SECONDS",
+        help="Time to add to the stamps of the frames to get those of the truth.",
+    ),
+)
+@options.as_json
+@options.verbosity
+def command(
+    sessions: tuple[Path, ...],
+    output: Path,
+    artifact: Path | None,
+    camera: Path | None,
+    truth: tuple[Path, ...],
+    offset: float,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Fit position and heading of the sheets of a floor from frames that cross their seams.
+
+    The floor consists of tiles (`locatk print pattern --tiles`), or of sheets that were glued
+    next to each other (`--count`), whose positions need not be known. Move the camera slowly
+    across each seam, at 5 places or more that are far from each other. `locatk solve
+    --artifact` then uses the sheets as built: all poses are in one frame, that of the first
+    sheet (of tiles, the one at the origin), and their covariance contains that of the sheets.
+
+    Frames alone determine neither the scale of the print nor its errors inside of a sheet.
+    With --truth (motion capture, a stage), both are estimated, as a smooth map for each
+    sheet, if the poses support it. The truth may be in any frame with z up, and of any point
+    of the body that carries the camera.
+
+    \b
+    Examples:
+      locatk calibrate sheet run.mcap -o floor-built.toml
+      locatk calibrate sheet day/*.mcap --artifact floor.toml --camera camera.toml -o built.toml
+      locatk calibrate sheet run.mcap --truth mocap.tum -o floor-built.toml --json
+      locatk solve later.mcap -o solved.mcap --artifact floor-built.toml
+    """
+    from locatk.core.dots.calibration.floor import calibrate_floor
+    from locatk.formats.artifacts import sheets
+
+    inputs = [*sessions, *(path for path in (artifact, camera) if path), *truth]
+    options.guard_output(output, overwrite=overwrite, inputs=inputs)
+    if len(truth) > 1 and len(truth) != len(sessions):
+        raise click.BadParameter(
+            f"{len(truth)} files for {len(sessions)} sessions.", param_hint="--truth"
+        )
+    manifest = sheets.read_manifest(artifact) if artifact else _attached(sessions[0])
+    given = sheets.read_camera(camera) if camera else None
+    found, left_out = _recordings(sessions, manifest, given, truth, offset, artifact is None)
+    if not found:
+        raise InputError("no session can be used", hint="The messages above name the reasons")
+    # Each frame is localized, and examined for seams.
+    with console.steps(2 * sum(len(each.frames) for each in found), "Calibrating") as advance:
+        report = calibrate_floor(found, manifest, advance)
+    sheets.write_manifest(output, report.manifest, overwrite=overwrite)
+    recordings.print_result(_text(output, report), report.notes, left_out)
+    if as_json:
+        console.emit_json(_entry(sessions, output, report, left_out))
+    recordings.check_all_used(left_out, "recording was", "recordings were")
+
+
+def _attached(path: Path) -> Manifest:
+    from locatk.formats.sessions import observations
+    from locatk.formats.sessions.reader import Session
+
+    manifest = observations.read_manifest(Session.open(path))
+    if manifest is None:
+        raise InputError(
+            "the session has no manifest of the sheets",
+            file=path,
+            hint="Give it with --artifact floor.toml",
+        )
+    return manifest
+
+
+def _recordings(
+    sessions: tuple[Path, ...],
+    manifest: Manifest,
+    camera: Camera | None,
+    truth: tuple[Path, ...],
+    offset: float,
+    is_checked: bool,
+) -> tuple[list[FloorRecording], dict[str, str]]:
+    """Read the cameras of all sessions; return them, and why others cannot be used, by name.
+
+    With ``is_checked``, each session must have the sheets of ``manifest``.
+    """
+    from locatk.core.dots.calibration.floor import FloorRecording
+    from locatk.formats.sessions import observations
+    from locatk.formats.sessions.reader import Session
+
+    found: list[FloorRecording] = []
+    left_out: dict[str, str] = {}
+    for index, path in enumerate(sessions):
+        with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
+            session = Session.open(path)
+            if is_checked and _attached(path) != manifest:
+                raise InputError(
+                    "the manifest differs from that of the first session",
+                    file=path,
+                    hint="Calibrate sessions of one floor, or give its manifest with --artifact",
+                )
+            own = camera or observations.read_camera(session)
+            tracks = _tracks(truth[min(index, len(truth) - 1)]) if truth else None
+            cameras = observations.read_frames(session)
+            for frames in cameras:
+                name = str(path) if len(cameras) == 1 else f"{path}: {frames.device}"
+                true = None if tracks is None else _track_of(frames.device, tracks, truth)
+                found.append(FloorRecording(name, frames, own, true, offset))
+    return found, left_out
+
+
+def _tracks(path: Path) -> list[Trajectory]:
+    from locatk.formats.importers import trajectories
+
+    return trajectories.read(path, role="truth")
+
+
+def _track_of(device: str, tracks: list[Trajectory], files: tuple[Path, ...]) -> Trajectory:
+    """Return the truth of a device: the one of its name, or the only one."""
+    named = [track for track in tracks if track.device == device]
+    if len(named or tracks) != 1:
+        raise InputError(
+            f"no truth of {device!r} among {', '.join(track.device for track in tracks)}",
+            file=files[0],
+            hint="Give a file with one trajectory, or with a trajectory of this name",
+        )
+    return (named or tracks)[0]
+
+
+def _text(output: Path, report: FloorReport) -> str:
+    """Format a table of the sheets, and how well the observations agree."""
+    header = ("sheet", "x [mm]", "y", "heading [deg]", "dx", "dy", "turn", "sigma", "", "frames")
+    rows = [_row(sheet, report.datum) for sheet in report.sheets[:MAX_SHEETS]]
+    lines = [
+        f"{len(report.sheets)} sheets from {report.seam_frames} frames with a seam, of "
+        f"{report.frames}:",
+        console.table(header, rows),
+    ]
+    if len(report.sheets) > MAX_SHEETS:
+        lines.append(f"{len(report.sheets) - MAX_SHEETS} more: see --json")
+    if report.seams:
+        worst = max(report.seams, key=lambda seam: seam.rms_mm)
+        lines.append(
+            f"seams: {len(report.seams)}; largest residual {1e3 * worst.rms_mm:.1f} um rms, "
+            f"between {worst.sheets[0]} and {worst.sheets[1]}"
+        )
+    if report.truth_frames:
+        lines.append(f"truth: {report.truth_frames} poses, {_scale_text(report)}")
+        mapped = sum(sheet.distortion is not None for sheet in report.sheets)
+        lines.append(
+            f"print: error of held-out poses {report.rms_rigid_mm:.3f} mm rms without maps"
+            + (f", {report.rms_mm:.3f} mm with maps of {mapped} sheets" if mapped else
+               "; the poses do not support maps")
+        )  # fmt: skip
+    if report.rejected:
+        lines.append(f"rejected: {report.rejected} frames that contradict the others")
+    if report.unplaced:
+        names = console.wrapped(f"without a position: {', '.join(report.unplaced)}, not seen")
+        lines.append(names)
+    return "\n".join([*lines, f"Wrote {output}"])
+
+
+def _row(sheet: BuiltSheet, datum: str) -> tuple[Any, ...]:
+    x, y, heading = sheet.pose.tolist()
+    dx, dy, turn = sheet.shift.tolist()
+    sigma = ("datum", "")
+    if sheet.id != datum:
+        sigma_x, sigma_y, sigma_heading = sheet.sigma.tolist()
+        position = math.hypot(sigma_x, sigma_y)
+        sigma = (f"{position:.4f} mm", f"{math.degrees(sigma_heading):.5f} deg")
+    return (
+        sheet.id,
+        f"{x:.3f}",
+        f"{y:.3f}",
+        f"{math.degrees(heading):.4f}",
+        *("-" if math.isnan(value) else f"{value:+.3f}" for value in (dx, dy)),
+        "-" if math.isnan(turn) else f"{math.degrees(turn):+.4f}",
+        *sigma,
+        sheet.seam_frames + sheet.truth_frames,
+    )
+
+
+def _scale_text(report: FloorReport) -> str:
+    (x, y), (sigma_x, sigma_y) = report.scale, report.sigma_scale
+    return f"scale of the print {x:.5f} (sigma {sigma_x:.5f}), {y:.5f} (sigma {sigma_y:.5f})"
+
+
+def _entry(
+    sessions: tuple[Path, ...], output: Path, report: FloorReport, left_out: dict[str, str]
+) -> dict[str, Any]:
+    """Return the object of ``--json`` (docs/formats.md)."""
+    noise = report.fit.noise
+    has_truth = report.truth_frames > 0
+    return {
+        "version": 1,
+        "sessions": sessions,
+        "output": output,
+        "datum": report.datum,
+        "frames": {
+            "seen": report.frames,
+            "located": report.localized,
+            "with_seam": report.seam_frames,
+            "with_truth": report.truth_frames,
+            "rejected": report.rejected,
+        },
+        "sheets": [_sheet_entry(sheet) for sheet in report.sheets],
+        "seams": [
+            {
+                "sheets": seam.sheets,
+                "frames": seam.frames,
+                "rms_m": seam.rms_mm * 1e-3,
+                "rms_rad": seam.rms_rad,
+            }
+            for seam in report.seams
+        ],
+        "unplaced": report.unplaced,
+        "seam_sigma_factor": noise.seam if report.seams else None,
+        "sigma_truth_m": noise.position_mm * 1e-3 if has_truth else None,
+        "scale": report.scale,
+        "sigma_scale": report.sigma_scale,
+        "rms_rigid_m": report.rms_rigid_mm * 1e-3,
+        "rms_m": report.rms_mm * 1e-3,
+        "cameras": {
+            name: {
+                "focal_px": camera.focal_px,
+                "centre_px": camera.centre_px,
+                "radial": camera.radial,
+            }
+            for name, camera in report.cameras.items()
+        },
+        "left_out": left_out,
+        "notes": report.notes,
+    }
+
+
+def _sheet_entry(sheet: BuiltSheet) -> dict[str, Any]:
+    x, y, heading = sheet.pose.tolist()
+    dx, dy, turn = sheet.shift.tolist()
+    sigma_x, sigma_y, sigma_heading = sheet.sigma.tolist()
+    return {
+        "id": sheet.id,
+        "x_m": x * 1e-3,
+        "y_m": y * 1e-3,
+        "heading_rad": heading,
+        "dx_m": dx * 1e-3,
+        "dy_m": dy * 1e-3,
+        "dheading_rad": turn,
+        "sigma_x_m": sigma_x * 1e-3,
+        "sigma_y_m": sigma_y * 1e-3,
+        "sigma_heading_rad": sigma_heading,
+        "seam_frames": sheet.seam_frames,
+        "truth_frames": sheet.truth_frames,
+        "has_map": sheet.distortion is not None,
+        "sigma_print_m": [value * 1e-3 for value in sheet.distortion_sigma_mm],
+    }

@@ -1,0 +1,655 @@
+"""Calibration of a floor as built: the poses of its sheets, and the errors of their print.
+
+Frames that cross a seam show the relative pose of two sheets
+(:mod:`~locatk.core.dots.localization.seams`, :mod:`.seam_measurements`); all of them together
+determine the poses of all sheets in the frame of one, the datum (:mod:`.floor_fit`).
+
+What is not observable: from frames alone, neither the scale of the print nor its errors inside of a
+sheet, because the scale of a frame is known from the pitch alone; and of the errors of the print
+only the difference along a seam, which is part of the covariance. With truth (a motion capture
+system, a stage) scale and errors are estimated as well, as far as the truth is better than they
+are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.dots.calibration.camera import CalibrateOptions, calibrate
+from locatk.core.dots.calibration.camera_views import MIN_CALIBRATION_FRAMES
+from locatk.core.dots.calibration.floor_fit import (
+    FloorFit,
+    FloorProblem,
+    TruthObservations,
+    cross_validate,
+    fit_floor,
+    lay_out_unknowns,
+    planar_rotation,
+)
+from locatk.core.dots.calibration.floor_frame import BuiltSheet, build_sheets
+from locatk.core.dots.calibration.seam_measurements import (
+    SeamMeasurement,
+    add_systematic_errors,
+    crop_overlaps,
+    measure_seam,
+)
+from locatk.core.dots.camera import Camera
+from locatk.core.dots.codec import Codec, codec
+from locatk.core.dots.frames import Frames
+from locatk.core.dots.localization.frames import (
+    TOO_FEW_DOTS,
+    LocalizedFrames,
+    localize_frames,
+    unlocalized_frames,
+)
+from locatk.core.dots.localization.recordings import batches, find_sheets
+from locatk.core.dots.localization.seams import may_show_seam, separate_sheets
+from locatk.core.dots.sheet import Manifest
+from locatk.core.errors import DegenerateError, InputError
+from locatk.core.evaluation.association import associate
+from locatk.core.geometry import (
+    heading_from_quaternion,
+    quaternion_from_heading,
+    umeyama,
+    wrap_angle,
+)
+from locatk.core.trajectory import Trajectory, has_orientation
+
+Array = NDArray[np.float64]
+
+MIN_SEAM_FRAMES = 3
+"""Least number of frames that connect two sheets: of two that contradict each other, neither can be
+trusted."""
+
+MIN_TRUTH_FRAMES = 10
+"""Least number of poses with truth that connect a sheet to the frame of the truth."""
+
+MIN_TRUTH_EXTENT_MM = 20.0
+"""Least extent of these poses; a shorter one determines no direction."""
+
+MAX_TRUTH_FRAMES = 1500
+"""Maximum number of poses with truth that are fitted; of more, every n-th."""
+
+MAX_LISTED_SHEETS = 6
+"""Maximum number of sheets that an error names."""
+
+
+@dataclass(frozen=True)
+class FloorRecording:
+    """Recording of one camera over the floor.
+
+    Attributes
+    ----------
+    name : str
+    frames : Frames
+    camera : Camera, optional
+        Default: estimated from the frames.
+    truth : Trajectory, optional
+        Of the body that carries the camera, in any frame with z up.
+    offset_s : float
+        Seconds to add to the stamps of the frames to get those of the truth.
+    """
+
+    name: str
+    frames: Frames
+    camera: Camera | None = None
+    truth: Trajectory | None = None
+    offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class SeamReport:
+    """Frames that connect two sheets.
+
+    Attributes
+    ----------
+    sheets : (str, str)
+        Identifiers.
+    frames : int
+        Number of frames that were used.
+    rms_mm, rms_rad : float
+        Root mean square deviation of the frames from the result.
+    """
+
+    sheets: tuple[str, str]
+    frames: int
+    rms_mm: float
+    rms_rad: float
+
+
+@dataclass(frozen=True)
+class FloorReport:
+    """Floor as built.
+
+    Attributes
+    ----------
+    manifest : Manifest
+    datum : str
+        Identifier of the sheet that keeps its pose.
+    sheets : tuple of BuiltSheet
+    seams : tuple of SeamReport
+    unplaced : tuple of str
+        Sheets that no frame shows and that have no position.
+    frames, localized, seam_frames, truth_frames : int
+        Number of frames, of those with a pose on a sheet, with a measured seam, and with truth.
+    rejected : int
+        Number of seams and poses that contradict the others.
+    fit : FloorFit
+        With the noise of the observations.
+    scale, sigma_scale : (x, y)
+        Of the print relative to that of the given manifest, and their standard deviations; nan
+        without truth.
+    rms_rigid_mm, rms_mm : float
+        Root mean square error of held-out poses against the truth: with a pose of each sheet and
+        the scale, and with the maps of distortions as well; nan without truth.
+    cameras : dict of str to Camera
+        Of recordings for which it was estimated.
+    notes : tuple of str
+    """
+
+    manifest: Manifest
+    datum: str
+    sheets: tuple[BuiltSheet, ...]
+    seams: tuple[SeamReport, ...]
+    unplaced: tuple[str, ...]
+    frames: int
+    localized: int
+    seam_frames: int
+    truth_frames: int
+    rejected: int
+    fit: FloorFit
+    scale: tuple[float, float]
+    sigma_scale: tuple[float, float]
+    rms_rigid_mm: float
+    rms_mm: float
+    cameras: dict[str, Camera]
+    notes: tuple[str, ...]
+
+
+def calibrate_floor(
+    recordings: Sequence[FloorRecording],
+    manifest: Manifest,
+    advance: Callable[[], None] = lambda: None,
+) -> FloorReport:
+    """Estimate the poses of the sheets of a floor, and with truth the errors of their print.
+
+    Parameters
+    ----------
+    recordings : sequence of FloorRecording
+    manifest : Manifest
+        Sheets with or without positions; those with positions are searched within
+        :data:`~locatk.core.dots.localization.seams.MAX_PLACE_ERROR_MM` of them.
+    advance : callable
+        Called twice for each frame, when it is localized and when it is examined for seams.
+
+    Raises
+    ------
+    DegenerateError
+        The frames do not connect all sheets that they show, or not all tiles, or the camera of a
+        recording cannot be estimated from them.
+    InputError
+        The manifest has a single sheet and there is no truth, or its codec is unknown.
+    """
+    has_truth = any(recording.truth is not None for recording in recordings)
+    if len(manifest.sheets) < 2 and not has_truth:
+        raise InputError(
+            "the manifest has a single sheet, and there is no truth",
+            hint="Without truth, only the relative poses of several sheets can be estimated",
+        )
+    code = codec(manifest.codec)
+    examined = [
+        _examine(index, recording, manifest, code, advance)
+        for index, recording in enumerate(recordings)
+    ]
+    seams = [seam for each in examined for seam in _measure_seams(each, manifest, code, advance)]
+    if any(sheet.position_mm is None for sheet in manifest.sheets):
+        # The first frames give sheets rough positions, by which more are recognised.
+        rough = _with_rough_positions(manifest, seams)
+        seams = [
+            seam for each in examined for seam in _measure_seams(each, rough, code, lambda: None)
+        ]
+    manifest = crop_overlaps(manifest, seams)
+    seams = add_systematic_errors(seams, manifest.pitch_mm)
+    truths = [truth for each in examined for truth in _truth_observations(each, manifest)]
+    sheets = _visible_sheets(manifest, examined, seams)
+    poses = _initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
+    _require_connected(manifest, sheets, poses)
+    problem, state = _problem(manifest, sheets, seams, truths, poses)
+    fit = fit_floor(problem, state)
+    validation = cross_validate(fit) if fit.problem.truths else (math.nan, math.nan)
+    if fit.problem.layout.nodes and validation[1] > validation[0]:
+        fit = fit_floor(replace(problem, layout=replace(problem.layout, nodes={})), state)
+        validation = validation[0], validation[0]
+    return _report(manifest, examined, problem, fit, validation)
+
+
+# ---- frames
+
+
+@dataclass(frozen=True)
+class _Examined:
+    """Recording with the poses of its frames on the grid.
+
+    ``numbers`` (n,) is the sheet of each frame, -1 if it has none; ``seam_frames`` are the indices
+    of frames that may show several sheets.
+    """
+
+    index: int
+    recording: FloorRecording
+    camera: Camera
+    localized: LocalizedFrames
+    numbers: NDArray[np.intp]
+    seam_frames: NDArray[np.int64]
+
+
+def _examine(
+    index: int,
+    recording: FloorRecording,
+    manifest: Manifest,
+    code: Codec,
+    advance: Callable[[], None],
+) -> _Examined:
+    """Localize the frames of a recording on the grid, and estimate its camera if it has none."""
+    frames, camera = recording.frames, recording.camera
+    localized, numbers = _localize(frames, manifest, code, camera, advance)
+    near_seam = may_show_seam(localized, numbers, manifest)
+    if camera is None:
+        inner = np.flatnonzero(localized.accepted & (numbers >= 0) & ~near_seam)
+        if len(inner) < MIN_CALIBRATION_FRAMES:
+            inner = np.arange(len(frames))
+        try:
+            camera = calibrate(_select(frames, inner), manifest, CalibrateOptions()).camera
+        except DegenerateError as error:
+            raise DegenerateError(
+                f"the camera of {recording.name} cannot be estimated: {error.message}",
+                hint="Give it with --camera, from `locatk calibrate camera`",
+            ) from None
+        localized, numbers = _localize(frames, manifest, code, camera, lambda: None)
+        near_seam = may_show_seam(localized, numbers, manifest)
+    return _Examined(index, recording, camera, localized, numbers, np.flatnonzero(near_seam))
+
+
+def _select(frames: Frames, indices: NDArray[np.int64]) -> Frames:
+    """Return some frames, still loaded on access."""
+    return Frames(
+        frames.device,
+        frames.time_ns[indices],
+        tuple(frames.names[k] for k in indices),
+        _SelectedImages(frames.images, indices),
+    )
+
+
+class _SelectedImages(Sequence[NDArray[np.uint8]]):
+    """Some of a sequence of images."""
+
+    def __init__(self, images: Sequence[NDArray[np.uint8]], indices: NDArray[np.int64]) -> None:
+        self._images, self._indices = images, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, number: Any) -> Any:
+        return self._images[int(self._indices[number])]
+
+
+def _localize(
+    frames: Frames,
+    manifest: Manifest,
+    code: Codec,
+    camera: Camera | None,
+    advance: Callable[[], None],
+) -> tuple[LocalizedFrames, NDArray[np.intp]]:
+    """Localize frames on the grid; return them and the sheet of each."""
+    localized = unlocalized_frames(len(frames), TOO_FEW_DOTS)
+    every = np.arange(len(frames))
+    for indices, images in batches(frames, every, localized.rejected, camera):
+        localized.update(indices, localize_frames(images, code, camera, other_codec_odds=0))
+        for _ in indices:
+            advance()
+    return localized, find_sheets(localized, manifest)
+
+
+def _measure_seams(
+    examined: _Examined, manifest: Manifest, code: Codec, advance: Callable[[], None]
+) -> Iterator[SeamMeasurement]:
+    """Yield the relative poses of the sheets in each frame that shows several."""
+    images = examined.recording.frames.images
+    is_candidate = np.isin(np.arange(len(images)), examined.seam_frames)
+    for frame in range(len(images)):
+        advance()
+        if not is_candidate[frame]:
+            continue
+        views = separate_sheets(images[frame], manifest, code, examined.camera)
+        seam = measure_seam(views, manifest, examined.camera, examined.index, frame)
+        if seam is not None:
+            yield seam
+
+
+def _truth_observations(examined: _Examined, manifest: Manifest) -> Iterator[TruthObservations]:
+    """Yield the poses on each sheet that have truth."""
+    recording, localized = examined.recording, examined.localized
+    if recording.truth is None:
+        return
+    is_used = localized.accepted & (examined.numbers >= 0)
+    is_used[examined.seam_frames] = False
+    frames = np.flatnonzero(is_used)
+    stamps = recording.frames.time_ns[frames]
+    poses = Trajectory(
+        recording.frames.device,
+        "grid",
+        stamps,
+        np.zeros((len(frames), 3)),
+        quaternion_from_heading(np.zeros(len(frames))),
+        np.full((len(frames), 6, 6), np.nan),
+    )
+    match = associate(poses, recording.truth, offset_s=recording.offset_s)
+    rows = np.unique(np.linspace(0, len(match) - 1, min(len(match), MAX_TRUTH_FRAMES)).astype(int))
+    frames, truth = frames[match.index[rows]], match.truth[rows] * 1e3
+    headings = heading_from_quaternion(match.truth_quaternion[rows])
+    if not has_orientation(recording.truth).all():
+        headings = np.full(len(rows), np.nan)
+    for number in np.unique(examined.numbers[frames]).tolist():
+        here = examined.numbers[frames] == number
+        indices = frames[here]
+        nominal = _on_paper(manifest, number)
+        position, heading, covariance = nominal.poses_in_metres(
+            0, localized.grid[indices], localized.heading[indices], localized.covariance[indices]
+        )
+        variance = np.stack(
+            [(covariance[:, 0, 0] + covariance[:, 1, 1]) / 2 * 1e6, covariance[:, 2, 2]], axis=1
+        )
+        yield TruthObservations(
+            number,
+            examined.index,
+            indices,
+            position * 1e3,
+            heading,
+            variance,
+            truth[here, :2],
+            headings[here],
+        )
+
+
+def _on_paper(manifest: Manifest, number: int) -> Manifest:
+    """Return a manifest of one sheet, as designed and in the frame of its paper."""
+    sheet = replace(
+        manifest.sheets[number],
+        position_mm=None,
+        heading_deg=0.0,
+        covariance_mm_deg=None,
+        distortion=None,
+        distortion_sigma_mm=(0.0, 0.0),
+    )
+    return replace(manifest, sheets=(sheet,))
+
+
+# ---- initial guess
+
+
+Node = tuple[str, int]
+"""Sheet or frame of a truth, with its number."""
+
+SHEET, TRUTH = "sheet", "truth"
+
+
+def _visible_sheets(
+    manifest: Manifest, examined: list[_Examined], seams: list[SeamMeasurement]
+) -> list[int]:
+    """Return the sheets that are part of the floor, the datum first.
+
+    These are all tiles, and other sheets that a frame shows.
+    """
+    visible = {number for each in examined for number in each.numbers.tolist() if number >= 0}
+    visible |= {number for seam in seams for number in seam.numbers}
+    tiles = {k for k, sheet in enumerate(manifest.sheets) if sheet.position_mm is not None}
+    if not visible:
+        raise DegenerateError(
+            "no frame shows a sheet of the manifest", hint="Is it the manifest of another floor?"
+        )
+
+    def from_origin(number: int) -> tuple[float, int]:
+        position = manifest.sheets[number].position_mm
+        return (math.inf if position is None else math.hypot(*position), number)
+
+    return sorted(visible | tiles, key=from_origin)[:1] + sorted(
+        sorted(visible | tiles, key=from_origin)[1:]
+    )
+
+
+def _initial_poses(
+    manifest: Manifest,
+    sheets: list[int],
+    seams: list[SeamMeasurement],
+    truths: list[TruthObservations],
+    min_frames: int,
+) -> dict[Node, Array]:
+    """Return the poses (x, y [mm], heading [rad]) of all nodes connected with the datum.
+
+    Each edge has the median of its measurements.
+    """
+    edges = _seam_edges(seams, min_frames) | _truth_edges(truths)
+    sheet = manifest.sheets[sheets[0]]
+    x, y = sheet.position_mm or (0.0, 0.0)
+    poses: dict[Node, Array] = {
+        (SHEET, sheets[0]): np.array([x, y, math.radians(sheet.heading_deg)])
+    }
+    queue = list(poses)
+    while queue:
+        node = queue.pop(0)
+        for (first, second), relative in edges.items():
+            if first == node and second not in poses:
+                poses[second] = _compose(poses[first], relative)
+                queue.append(second)
+            if second == node and first not in poses:
+                poses[first] = _compose(poses[second], _inverse(relative))
+                queue.append(first)
+    return poses
+
+
+def _seam_edges(seams: list[SeamMeasurement], min_frames: int) -> dict[tuple[Node, Node], Array]:
+    """Return the median relative pose of each two sheets that enough frames show together."""
+    relative: dict[tuple[Node, Node], list[Array]] = {}
+    for first, second, point, pose in _pairs(seams):
+        if first > second:
+            # Of the second paper's corner, from the pose of a point on it.
+            corner = pose[:2] - planar_rotation(pose[2]) @ point
+            inverse = _inverse(np.append(corner, pose[2]))
+            relative.setdefault(((SHEET, second), (SHEET, first)), []).append(inverse)
+        else:
+            corner = pose[:2] - planar_rotation(pose[2]) @ point
+            both = (SHEET, first), (SHEET, second)
+            relative.setdefault(both, []).append(np.append(corner, pose[2]))
+    return {
+        edge: _median_pose(np.array(poses))
+        for edge, poses in relative.items()
+        if len(poses) >= min_frames
+    }
+
+
+def _pairs(seams: list[SeamMeasurement]) -> Iterator[tuple[int, int, Array, Array]]:
+    """Yield first and other sheet, point and pose of each measurement."""
+    for seam in seams:
+        for k, number in enumerate(seam.numbers[1:]):
+            yield seam.numbers[0], number, seam.points_mm[k], seam.poses[k]
+
+
+def _median_pose(poses: Array) -> Array:
+    """Return the median of poses (n, 3) whose headings are close to each other."""
+    heading = poses[0, 2] + wrap_angle(poses[:, 2] - poses[0, 2])
+    return np.append(np.median(poses[:, :2], axis=0), np.median(heading))
+
+
+def _truth_edges(truths: list[TruthObservations]) -> dict[tuple[Node, Node], Array]:
+    """Return the pose of the frame of each truth on the sheets that have enough poses in it."""
+    edges = {}
+    for truth in truths:
+        extent = np.ptp(truth.points_mm, axis=0).max(initial=0)
+        if len(truth.frames) >= MIN_TRUTH_FRAMES and extent >= MIN_TRUTH_EXTENT_MM:
+            fit = umeyama(truth.truth_mm, truth.points_mm, with_scale=False)
+            angle = math.atan2(fit.rotation[1, 0], fit.rotation[0, 0])
+            pose = np.append(fit.translation, angle)
+            edges[(SHEET, truth.number), (TRUTH, truth.alignment)] = pose
+    return edges
+
+
+def _compose(pose: Array, relative: Array) -> Array:
+    position = pose[:2] + planar_rotation(pose[2]) @ relative[:2]
+    return np.append(position, pose[2] + relative[2])
+
+
+def _inverse(pose: Array) -> Array:
+    return np.append(-planar_rotation(-pose[2]) @ pose[:2], -pose[2])
+
+
+def _with_rough_positions(manifest: Manifest, seams: list[SeamMeasurement]) -> Manifest:
+    """Return the manifest with the positions of the sheets that seams connect."""
+    if not seams:
+        return manifest
+    sheets = sorted({number for seam in seams for number in seam.numbers})
+    poses = _initial_poses(manifest, sheets, seams, [], 1)
+    placed = list(manifest.sheets)
+    for (_, number), (x, y, heading) in poses.items():
+        placed[number] = replace(
+            placed[number], position_mm=(x, y), heading_deg=math.degrees(heading)
+        )
+    return replace(manifest, sheets=tuple(placed))
+
+
+def _require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, Array]) -> None:
+    """Refuse a floor of several parts."""
+    missing = [number for number in sheets if (SHEET, number) not in poses]
+    if not missing:
+        return
+    names = [manifest.sheets[number].id for number in missing]
+    listed = ", ".join(names[:MAX_LISTED_SHEETS])
+    more = f" and {len(names) - MAX_LISTED_SHEETS} more" if len(names) > MAX_LISTED_SHEETS else ""
+    verb = "are" if len(names) > 1 else "is"
+    raise DegenerateError(
+        f"{listed}{more} {verb} not connected with {manifest.sheets[sheets[0]].id}: fewer than "
+        f"{MIN_SEAM_FRAMES} frames show a seam between them",
+        hint="Move the camera slowly across each seam, at several places, or give --truth; remove "
+        "sheets that are not part of the floor from the manifest",
+    )
+
+
+def _problem(
+    manifest: Manifest,
+    sheets: list[int],
+    seams: list[SeamMeasurement],
+    truths: list[TruthObservations],
+    poses: dict[Node, Array],
+) -> tuple[FloorProblem, Array]:
+    """Return the problem of a floor and the initial guess of its unknowns."""
+    if not all(truth.has_heading for truth in truths):
+        truths = [replace(t, truth_headings=np.full(len(t.frames), np.nan)) for t in truths]
+    numbers = sorted({truth.alignment for truth in truths if (TRUTH, truth.alignment) in poses})
+    used = tuple(
+        replace(truth, alignment=numbers.index(truth.alignment))
+        for truth in truths
+        if truth.alignment in numbers
+    )
+    layout = lay_out_unknowns(manifest, tuple(sheets), len(numbers))
+    problem = FloorProblem(manifest, layout, tuple(seams), used)
+    state = np.zeros(layout.size)
+    for number in sheets[1:]:
+        state[layout.pose(number)] = poses[SHEET, number]
+    for index, number in enumerate(numbers):
+        state[layout.alignment(index)[:3]] = _inverse(poses[TRUTH, number])
+        first = next(truth for truth in used if truth.alignment == index)
+        if first.has_heading:
+            on_floor = first.headings + poses[SHEET, first.number][2]
+            turn = wrap_angle(first.truth_headings - on_floor + poses[TRUTH, number][2])
+            state[layout.alignment(index)[5]] = np.angle(np.exp(1j * turn).mean())
+    return problem, state
+
+
+# ---- report
+
+
+def _report(
+    manifest: Manifest,
+    examined: list[_Examined],
+    given: FloorProblem,
+    fit: FloorFit,
+    validation: tuple[float, float],
+) -> FloorReport:
+    """Return the result of a calibration."""
+    problem = fit.problem
+    built = build_sheets(fit)
+    scale = sigma_scale = (math.nan, math.nan)
+    if problem.layout.alignments:
+        index = problem.layout.scale
+        scale = _pair(1 + fit.state[index])
+        sigma_scale = _pair(np.sqrt(np.diag(fit.covariance)[index]))
+    placed = {sheet.number for sheet in built}
+    return FloorReport(
+        manifest=built_manifest(manifest, built, scale),
+        datum=manifest.sheets[problem.layout.sheets[0]].id,
+        sheets=built,
+        seams=_seam_reports(fit),
+        unplaced=tuple(
+            sheet.id for number, sheet in enumerate(manifest.sheets) if number not in placed
+        ),
+        frames=sum(len(each.recording.frames) for each in examined),
+        localized=sum(int((each.numbers >= 0).sum()) for each in examined),
+        seam_frames=len(problem.seams),
+        truth_frames=problem.truth_frames,
+        rejected=len(given.seams) - len(problem.seams) + given.truth_frames - problem.truth_frames,
+        fit=fit,
+        scale=scale,
+        sigma_scale=sigma_scale,
+        rms_rigid_mm=validation[0],
+        rms_mm=validation[1],
+        cameras={
+            each.recording.name: each.camera for each in examined if each.recording.camera is None
+        },
+        notes=(),
+    )
+
+
+def built_manifest(
+    manifest: Manifest, built: Sequence[BuiltSheet], scale: tuple[float, float]
+) -> Manifest:
+    """Return the manifest of a floor as built; ``scale`` is nan if it was not estimated."""
+    sheets = list(manifest.sheets)
+    for sheet in built:
+        to_degrees = np.diag([1.0, 1.0, math.degrees(1)])
+        covariance = to_degrees @ sheet.covariance @ to_degrees
+        x, y, heading = sheet.pose.tolist()
+        sheets[sheet.number] = replace(
+            sheets[sheet.number],
+            position_mm=(x, y),
+            heading_deg=math.degrees(heading),
+            covariance_mm_deg=tuple(tuple(row) for row in covariance.tolist()),
+            distortion=sheet.distortion,
+            distortion_sigma_mm=sheet.distortion_sigma_mm,
+        )
+    result = replace(manifest, sheets=tuple(sheets))
+    if math.isfinite(scale[0]):
+        result = replace(result, scale=(manifest.scale[0] * scale[0], manifest.scale[1] * scale[1]))
+    return result
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    first, second = values.tolist()
+    return first, second
+
+
+def _seam_reports(fit: FloorFit) -> tuple[SeamReport, ...]:
+    """Return how well the measurements of each seam agree with the result."""
+    sheets = fit.problem.manifest.sheets
+    deviations: dict[tuple[int, int], list[Array]] = {}
+    for first, other, deviation in fit.problem.seam_deviations(fit.state):
+        deviations.setdefault((min(first, other), max(first, other)), []).append(deviation)
+    reports = []
+    for (first, other), values in sorted(deviations.items()):
+        x, y, angle = np.sqrt(np.mean(np.square(values), axis=0)).tolist()
+        names = sheets[first].id, sheets[other].id
+        reports.append(SeamReport(names, len(values), math.hypot(x, y), angle))
+    return tuple(reports)

@@ -1,0 +1,194 @@
+"""Frame of a floor as built, and its sheets in it.
+
+A fit leaves open what of a displacement is the pose of a sheet and what is an error of its print.
+Here, the rigid part of the displacements of a sheet (least squares over its nodes) becomes part of
+its pose. The frame of the floor is that in which the datum sheet, defined in this way, has the pose
+that it has in the manifest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.dots.calibration.floor_fit import (
+    FloorFit,
+    field_weights,
+    node_positions,
+    planar_rotation,
+)
+from locatk.core.dots.sheet import Distortion
+
+Array = NDArray[np.float64]
+
+MIN_MAPPED_FRAMES = 10
+"""Least number of poses with truth on a sheet whose errors of the print are mapped."""
+
+
+@dataclass(frozen=True)
+class BuiltSheet:
+    """Sheet as built.
+
+    Attributes
+    ----------
+    number : int
+        In the manifest.
+    id : str
+    pose : (3,) ndarray
+        Position of the paper's lower left corner [mm] and heading [rad] on the floor.
+    covariance : (3, 3) ndarray
+        Of the pose, relative to the datum.
+    shift : (3,) ndarray
+        Difference from the pose in the manifest; nan if that has none.
+    seam_frames, truth_frames : int
+        Number of frames that were used.
+    distortion : Distortion or None
+    distortion_sigma_mm : (x, y)
+        Standard deviation of the errors of the print that are not in the map.
+    """
+
+    number: int
+    id: str
+    pose: Array
+    covariance: Array
+    shift: Array
+    seam_frames: int
+    truth_frames: int
+    distortion: Distortion | None
+    distortion_sigma_mm: tuple[float, float]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (3,) of the pose."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0))
+
+
+def build_sheets(fit: FloorFit) -> tuple[BuiltSheet, ...]:
+    """Return the sheets of a floor in its frame."""
+    layout, manifest = fit.problem.layout, fit.problem.manifest
+    poses, maps = [], []
+    for number in layout.sheets:
+        pose, by_unknowns = _rigid_pose(fit, number)
+        poses.append(pose)
+        maps.append(by_unknowns)
+    datum = fit.problem.pose(layout.sheets[0], fit.state)
+    built = []
+    for number, pose, by_unknowns in zip(layout.sheets, poses, maps, strict=True):
+        in_frame, derivative = _in_datum(pose, by_unknowns, poses[0], maps[0], datum)
+        sheet = manifest.sheets[number]
+        truth_frames = sum(
+            len(truth.frames) for truth in fit.problem.truths if truth.number == number
+        )
+        distortion, sigma = _distortion(fit, number, truth_frames >= MIN_MAPPED_FRAMES)
+        nominal = np.full(3, np.nan)
+        if sheet.position_mm is not None:
+            nominal = np.array([*sheet.position_mm, math.radians(sheet.heading_deg)])
+        built.append(
+            BuiltSheet(
+                number,
+                sheet.id,
+                in_frame,
+                derivative @ fit.covariance @ derivative.T,
+                in_frame - nominal,
+                sum(number in seam.numbers for seam in fit.problem.seams),
+                truth_frames,
+                distortion,
+                sigma,
+            )
+        )
+    return tuple(built)
+
+
+def _rigid_part(fit: FloorFit, number: int) -> tuple[Array, Array]:
+    """Return the operators from a field (2 nodes) to its rigid part (3), and back.
+
+    The rigid part is a shift and a rotation about the corner of the paper; the field is x, then y.
+    """
+    points = node_positions(fit.problem.manifest, number, fit.problem.layout.nodes[number])
+    basis = np.zeros((2, len(points), 3))
+    basis[0, :, 0] = basis[1, :, 1] = 1
+    basis[0, :, 2], basis[1, :, 2] = -points[:, 1], points[:, 0]
+    flat = basis.reshape(-1, 3)
+    return np.asarray(np.linalg.pinv(flat)), flat
+
+
+def _rigid_pose(fit: FloorFit, number: int) -> tuple[Array, Array]:
+    """Return the pose of a sheet with the rigid part of its field, and derivatives (3, size)."""
+    problem = fit.problem
+    pose = problem.pose(number, fit.state).copy()
+    derivative = np.zeros((3, problem.layout.size))
+    index = problem.layout.pose(number)
+    if index is not None:
+        derivative[:, index] = np.eye(3)
+    if number in problem.layout.nodes:
+        to_floor = np.eye(3)
+        to_floor[:2, :2] = planar_rotation(pose[2])
+        operator, _ = _rigid_part(fit, number)
+        unknowns = problem.layout.field(number).ravel()
+        derivative[:, unknowns] = to_floor @ operator
+        pose += to_floor @ operator @ fit.state[unknowns]
+    return pose, derivative
+
+
+def _in_datum(
+    pose: Array, by_unknowns: Array, datum_pose: Array, datum_by_unknowns: Array, datum: Array
+) -> tuple[Array, Array]:
+    """Return a pose in the frame in which the datum sheet has the pose ``datum``."""
+    angle = datum[2] - datum_pose[2]
+    rotation = planar_rotation(angle)
+    lever = rotation @ (pose[:2] - datum_pose[:2])
+    by_angle = np.array([-lever[1], lever[0]])
+    derivative = np.empty_like(by_unknowns)
+    derivative[:2] = rotation @ (by_unknowns[:2] - datum_by_unknowns[:2])
+    derivative[:2] -= by_angle[:, None] * datum_by_unknowns[2]
+    derivative[2] = by_unknowns[2] - datum_by_unknowns[2]
+    return np.append(datum[:2] + lever, pose[2] + angle), derivative
+
+
+def _distortion(
+    fit: FloorFit, number: int, is_mapped: bool
+) -> tuple[Distortion | None, tuple[float, float]]:
+    """Return the map of a sheet's errors, and the standard deviations of those that are left."""
+    layout = fit.problem.layout
+    if number not in layout.nodes:
+        return None, (0.0, 0.0)
+    unknowns = layout.field(number).ravel()
+    operator, basis = _rigid_part(fit, number)
+    other = np.eye(len(unknowns)) - basis @ operator
+    mean = other @ fit.state[unknowns]
+    covariance = other @ fit.covariance[np.ix_(unknowns, unknowns)] @ other.T
+    if not is_mapped:
+        covariance = covariance + np.outer(mean, mean)
+    x, y = np.sqrt(_mean_variance(fit, number, covariance)).tolist()
+    if not is_mapped:
+        return None, (x, y)
+    columns, rows = layout.nodes[number]
+    along_x, along_y = mean.reshape(2, rows, columns)
+    return Distortion(_as_rows(along_x), _as_rows(along_y)), (x, y)
+
+
+def _mean_variance(fit: FloorFit, number: int, covariance: Array) -> Array:
+    """Return the variance (2,) of displacements along both axes, as the mean over the sheet.
+
+    ``covariance`` (2 nodes, 2 nodes) is that of the nodes, of which those at the ends are the least
+    certain. The mean is over the middles of the cells between them.
+    """
+    manifest, nodes = fit.problem.manifest, fit.problem.layout.nodes[number]
+    columns, rows = nodes
+    grid = node_positions(manifest, number, nodes).reshape(rows, columns, 2)
+    middles = (grid[:-1, :-1] + grid[1:, 1:]).reshape(-1, 2) / 2
+    weights = field_weights(manifest, number, nodes, middles).value
+    by_axis = covariance.reshape(2, columns * rows, 2, columns * rows)
+    return np.array(
+        [
+            np.einsum("ni,ij,nj->n", weights, by_axis[axis, :, axis], weights).mean()
+            for axis in (0, 1)
+        ]
+    )
+
+
+def _as_rows(values: Array) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in values.tolist())

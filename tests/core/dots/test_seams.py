@@ -1,0 +1,231 @@
+"""Frames across the seam of two tiles, by a camera that shares nothing with the solver."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.dots.calibration.seam_measurements import (
+    SeamMeasurement,
+    crop_overlaps,
+    measure_seam,
+    without_ambiguous_dots,
+)
+from locatk.core.dots.camera import Camera
+from locatk.core.dots.codec import codec
+from locatk.core.dots.frames import Frames
+from locatk.core.dots.localization.seams import SheetView, separate_sheets
+from locatk.core.dots.sheet import Manifest, Sheet
+from locatk.core.dots.solver import SolveOptions, solve
+
+PITCH_MM = 0.508
+ANOTO = codec("anoto")
+CAMERA = Camera((188, 120), 348.7, (93.5, 59.5))
+SIZE, PAGE, FIRST = (370, 540), (210.0, 297.0), (10.0, 12.0)
+STEP_MM = 360 * PITCH_MM
+CUT_MM = FIRST[0] + 364.5 * PITCH_MM
+TILES = Manifest(
+    (
+        Sheet("left", (1000, 2000), SIZE, (0, 0), PAGE, FIRST, (0.0, 0.0)),
+        Sheet("right", (1360, 2000), SIZE, (0, 0), PAGE, FIRST, (STEP_MM, 0.0)),
+    )
+)
+"""Two tiles that share ten columns; they are cut in the middle of these."""
+
+Frame = tuple[NDArray[np.uint8], complex, float]
+
+
+@pytest.fixture(scope="module")
+def lay(laid_sheet: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
+    """``lay(dx, dy, turn)``: both tiles, the right one displaced in mm and degrees."""
+
+    def lay(dx: float, dy: float, turn: float) -> tuple[Any, Any]:
+        visible = (0.0, 0.0, CUT_MM, PAGE[1])
+        left = laid_sheet((1000, 2000), SIZE, PAGE, FIRST, visible=visible)
+        visible = (CUT_MM - STEP_MM, 0.0, PAGE[0], PAGE[1])
+        right = laid_sheet((1360, 2000), SIZE, PAGE, FIRST, STEP_MM + dx, dy, turn, visible=visible)
+        return left, right
+
+    return lay
+
+
+@pytest.fixture(scope="module")
+def cross(shoot_floor: Callable[..., Any]) -> Callable[..., Iterator[Frame]]:
+    """``cross(sheets, count, seed)``: frames at random places of the seam, tilted up to 4 deg."""
+
+    def cross(
+        sheets: tuple[Any, Any], count: int, seed: int, width_mm: float = 1.5, **how: Any
+    ) -> Iterator[Frame]:
+        rng = np.random.default_rng(seed)
+        for k in range(count):
+            spot = complex(CUT_MM + rng.uniform(-width_mm, width_mm), rng.uniform(40, 260))
+            heading = rng.uniform(-math.pi, math.pi)
+            tilt, towards = rng.uniform(0, 0.07), rng.uniform(-math.pi, math.pi)
+            image = shoot_floor(
+                sheets, spot.real, spot.imag, heading=heading, seed=k, tilt=tilt, towards=towards,
+                **how,
+            )  # fmt: skip
+            yield image, spot, heading
+
+    return cross
+
+
+def grid_of(sheet: Any, spot: complex) -> NDArray[np.float64]:
+    """Grid coordinates of a place on the floor, by the renderer's arithmetic."""
+    paper = sheet.on_paper(spot)
+    x, y = paper.real - sheet.first[0], sheet.page[1] - sheet.first[1] - paper.imag
+    return np.array([x, y]) / PITCH_MM + sheet.origin
+
+
+def error_of(seam: SeamMeasurement, sheets: tuple[Any, Any]) -> NDArray[np.float64]:
+    """Error (3,) of the pose of the second sheet of a measurement, in mm and rad."""
+    first, other = (sheets[number] for number in seam.numbers)
+    x, y, heading = seam.poses[0]
+    true = first.on_paper(other.on_floor(complex(*seam.points_mm[0])))
+    turn = heading - math.radians(other.turn - first.turn)
+    return np.array([x - true.real, y - true.imag, turn])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "displacement",
+    [(1.3, -0.8, 0.5), (0.9, 1.0, -0.3), (0.1, 0.05, 0.1)],
+    ids=["1.5 mm", "1.3 mm", "0.4 pitches"],
+)
+def test_the_pose_of_a_tile_follows_from_each_frame(
+    lay: Callable[..., Any], cross: Callable[..., Any], displacement: tuple[float, float, float]
+) -> None:
+    """A step of some tenths of a pitch is the worst: one lattice bends over both tiles."""
+    sheets = lay(*displacement)
+    errors, normalized, count = [], [], 16
+    for image, _, _ in cross(sheets, count, 7):
+        views = separate_sheets(image, TILES, ANOTO, CAMERA)
+        seam = measure_seam(views, TILES, CAMERA)
+        if seam is not None:
+            error = error_of(seam, sheets)
+            errors.append(np.hypot(*error[:2]))
+            normalized.append(error @ np.linalg.solve(seam.covariance, error) / 3)
+    assert len(errors) >= count / 2
+    assert max(errors) < 3e-3
+    assert 0.4 < np.mean(normalized) < 2.5
+
+
+def test_every_dot_belongs_to_its_tile(lay: Callable[..., Any], cross: Callable[..., Any]) -> None:
+    sheets = lay(1.3, -0.8, 0.5)
+    ((image, spot, _),) = cross(sheets, 1, 1, width_mm=0.2)
+    views = separate_sheets(image, TILES, ANOTO, CAMERA)
+    assert {view.number for view in views} == {0, 1}
+    assert sum(len(view.pixels) for view in views) > 140
+    for view in views:
+        # Left of the cut all dots are the left tile's, except for a few chance agreements.
+        column = view.grid[:, 0] - sheets[view.number].origin[0]
+        side = column * PITCH_MM + FIRST[0] + view.number * STEP_MM < CUT_MM
+        assert np.mean(side == (view.number == 0)) > 0.95
+        middle = grid_of(sheets[view.number], spot)
+        assert np.abs(view.grid - middle).max() < 11
+
+
+def test_a_tile_alone_is_alone(lay: Callable[..., Any], shoot_floor: Callable[..., Any]) -> None:
+    image = shoot_floor(lay(1.3, -0.8, 0.5), 60.0, 150.0, heading=0.4)
+    (view,) = separate_sheets(image, TILES, ANOTO, CAMERA)
+    assert view.number == 0
+    assert len(view.pixels) > 160
+    assert measure_seam([view], TILES, CAMERA) is None
+
+
+def test_a_blank_frame_has_no_sheet() -> None:
+    blank = np.full((120, 188), 200, np.uint8)
+    assert separate_sheets(blank, TILES, ANOTO, CAMERA) == []
+
+
+def test_a_sheet_without_position_is_decoded_alone(
+    lay: Callable[..., Any], cross: Callable[..., Any]
+) -> None:
+    """Where each half of the frame has enough dots; the other code is that of no neighbour."""
+    unplaced = Manifest(
+        tuple(Sheet(s.id, s.origin, s.size, s.section, s.page_mm, s.first_mm) for s in TILES.sheets)
+    )
+    large = {"size": (320, 240), "centre": (159.5, 119.5)}
+    camera = Camera((320, 240), 348.7, (159.5, 119.5))
+    sheets = lay(1.3, -0.8, 0.5)
+    for image, _, _ in cross(sheets, 3, 5, width_mm=0.5, **large):
+        views = separate_sheets(image, unplaced, ANOTO, camera)
+        assert {view.number for view in views} == {0, 1}
+        seam = measure_seam(views, unplaced, camera)
+        assert seam is not None
+        assert np.hypot(*error_of(seam, sheets)[:2]) < 2e-3
+
+
+def test_dots_of_both_sheets_are_of_neither() -> None:
+    pixels = np.arange(20.0).reshape(10, 2)
+    views = [SheetView(0, pixels[:7], pixels[:7]), SheetView(1, pixels[5:], pixels[5:])]
+    first, second = without_ambiguous_dots(views)
+    assert first.pixels.tolist() == pixels[:5].tolist()
+    assert second.pixels.tolist() == pixels[7:].tolist()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [CAMERA, None], ids=["camera", "no camera"])
+def test_a_pose_at_a_seam_is_that_of_one_tile(
+    lay: Callable[..., Any], cross: Callable[..., Any], camera: Camera | None
+) -> None:
+    """The dots of the other tile used to pull such poses by up to 0.1 mm, 30 sigma."""
+    sheets = lay(0.1, 0.05, 0.1)
+    frames = list(cross(sheets, 24, 11, width_mm=4.0))
+    times = np.arange(len(frames)) * 20_000_000 + 10**18
+    images = [image for image, _, _ in frames]
+    recording = Frames("robot", times, tuple(map(str, times)), images)
+    right = sheets[1]
+    built = Manifest(
+        (
+            TILES.sheets[0],
+            Sheet(*list(vars(TILES.sheets[1]).values())[:6], (right.x, right.y), right.turn),
+        )
+    )
+    solution = solve([recording], built, SolveOptions(camera=camera))
+    (track,) = solution.trajectories
+    rows = np.searchsorted(times, track.time_ns)
+    true = np.array([[frames[k][1].real, frames[k][1].imag] for k in rows])
+    error = track.position[:, :2] * 1e3 - true
+    assert len(track) > 18
+    # A tilted frame without a camera model has its pose in the middle of the frame all the same.
+    assert np.hypot(*error.T).max() < 5e-3
+    spread = track.covariance[:, :2, :2] * 1e6
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]) / 2
+    assert nees.mean() < 3
+
+
+def measured(number: int, columns: range) -> SeamMeasurement:
+    nodes = np.array([[x, y] for x in columns for y in range(2000, 2010)])
+    none = np.zeros((0, 2), np.int64)
+    return SeamMeasurement(
+        0, 0, (number, 1 - number), np.zeros((1, 2)), np.zeros((1, 3)), np.eye(3), (nodes, none)
+    )
+
+
+def test_tiles_end_where_the_other_covers_them() -> None:
+    seams = [measured(0, range(1340, 1363)), measured(1, range(1363, 1390))]
+    left, right = crop_overlaps(TILES, seams).sheets
+    assert (left.origin, left.size) == ((1000, 2000), (363, 540))
+    assert (right.origin, right.size) == ((1363, 2000), (367, 540))
+    # Dots stay where they are on their paper.
+    before = TILES.to_metres(1, [1500, 2100])
+    np.testing.assert_allclose(crop_overlaps(TILES, seams).to_metres(1, [1500, 2100]), before)
+
+
+def test_without_frames_the_cut_is_in_the_middle() -> None:
+    left, right = crop_overlaps(TILES, []).sheets
+    assert left.origin[0] + left.size[0] == right.origin[0] == 1365
+
+
+def test_tiles_below_each_other_are_cut_along_their_rows() -> None:
+    below = Sheet("below", (1000, 2530), SIZE, (0, 0), PAGE, FIRST, (0.0, -530 * PITCH_MM))
+    corner = Sheet("corner", (1360, 2530), SIZE, (0, 0), PAGE, FIRST, (STEP_MM, -530 * PITCH_MM))
+    cut = crop_overlaps(Manifest((*TILES.sheets, below, corner)), []).sheets
+    assert [sheet.size for sheet in cut] == [(365, 535)] * 4
+    assert cut[3].origin == (1365, 2535)
