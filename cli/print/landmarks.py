@@ -9,16 +9,13 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
-from locatk.cli.print.endings import format_of
 
 DEFAULT_OVERLAP_MM = 10.0
-
-SVG_HINT = "Use .pdf; `locatk map export` draws the map as SVG."
 
 
 @click.command(cls=Command, short_help="Draw the installation pack of a landmark map.")
 @options.input_argument("map_file")
-@options.output("PDF to write.")
+@options.output("PDF to write.", endings=(".pdf",))
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -45,10 +42,10 @@ SVG_HINT = "Use .pdf; `locatk map export` draws the map as SVG."
         metavar="PERCENT",
         help="Spare bars, in addition to four for each landmark.",
     ),
-    click.option(
+    options.output_option(
         "--bom",
-        type=options.PATH,
         metavar="FILE",
+        endings=(".csv",),
         help="Also write the bill of materials (.csv).",
     ),
 )
@@ -118,9 +115,6 @@ def landmarks(
     from locatk.formats.exporters.bill_of_materials import write_bill
     from locatk.formats.output import atomic_write
 
-    format_of(output, ("pdf",), hints={".svg": SVG_HINT})
-    if bom is not None and bom.suffix.lower() != ".csv":
-        raise click.UsageError(f"{bom.name!r} does not end in .csv.")
     if templates_only and whole_floor:
         raise click.UsageError("--templates and --floor are different drawings; leave one out.")
     if overlap_mm is not None and not whole_floor:

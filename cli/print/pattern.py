@@ -10,15 +10,19 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
-from locatk.cli.print.endings import format_of
 
 CODECS = ("anoto", "libdots", "microdots")
-FORMATS = ("pdf", "png", "tiff", "pbm", "txt")
+ENDINGS = {
+    "pdf": (".pdf",),
+    "png": (".png",),
+    "tiff": (".tiff", ".tif"),
+    "pbm": (".pbm",),
+    "txt": (".txt",),
+}
+"""Endings of the names of files, by format.
 
-SVG_HINT = (
-    "Dots are pixels of the printer, which programs for vectors do not keep; "
-    "use .pdf, or .png, .tiff or .pbm for pixels."
-)
+SVG is none of them: programs for vectors do not keep the pixels of a printer.
+"""
 
 MAX_FILES = 200
 """Largest number of files of a run, all of which are open until the last one is complete."""
@@ -58,7 +62,7 @@ class PairType(click.ParamType):
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice(FORMATS),
+    type=click.Choice(list(ENDINGS)),
     help="`png`, `tiff`, `pbm`: image of 1 bit per pixel at the printer's resolution, without "
     "margin texts. `txt`: a letter u, d, l or r for each dot. These write one file per sheet, "
     "named by its id.  [default: by the ending of the output]",
@@ -246,7 +250,7 @@ def pattern(
     from locatk.formats.artifacts.ledger import LEDGER_FILE, open_ledger
     from locatk.formats.printing import job
 
-    format_name = format_of(output, FORMATS, format_name, {".svg": SVG_HINT})
+    format_name = options.choose_format(output, format_name, ENDINGS)
     _check_combinations(
         format_name, size, landscape, count, tiles, overlay, strip_black, crop_marks
     )

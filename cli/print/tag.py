@@ -11,9 +11,8 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command
-from locatk.cli.print.endings import format_of
 
-FORMATS = ("pdf", "svg")
+ENDINGS = {"pdf": (".pdf",), "svg": (".svg",)}
 
 
 @click.command(cls=Command, short_help="Draw templates for placing a tag's magnets.")
@@ -22,7 +21,7 @@ FORMATS = ("pdf", "svg")
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice(FORMATS),
+    type=click.Choice(list(ENDINGS)),
     help="`svg` writes one numbered file per page.  [default: by the ending of the output]",
 )
 @click.option(
@@ -86,7 +85,7 @@ def tag(
     from locatk.core.polaris.drawing.cards import draw_tag_cards
     from locatk.formats.artifacts.tags import read_tags
 
-    format_name = format_of(output, FORMATS, format_name)
+    format_name = options.choose_format(output, format_name, ENDINGS)
     tags = read_tags(tag_file)
     _, paper_mm = paper_size(size)
     drawn = draw_tag_cards(

@@ -8,11 +8,10 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command
-from locatk.cli.print.endings import format_of
 
 
 @click.command(cls=Command, short_help="Draw a test sheet for choosing dots.")
-@options.output("PDF to write.")
+@options.output("PDF to write.", endings=(".pdf",))
 @click.option(
     "--size", type=click.Choice(("A4", "Letter"), case_sensitive=False), default="A4",
     show_default=True, help="Paper.",
@@ -52,7 +51,6 @@ def testsheet(
     from locatk.formats.output import atomic_write
     from locatk.formats.printing.pattern import render_test_sheet
 
-    format_of(output, ("pdf",))
     options.guard_output(output, overwrite=overwrite)
     sheet = printer_sheet(size, int(dpi), codec)
     with atomic_write(output, overwrite=overwrite) as stream:

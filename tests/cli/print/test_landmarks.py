@@ -119,7 +119,7 @@ def test_same_map_same_bytes(locatk, map_file: Path, tmp_path: Path) -> None:
         (["--paper", "105x105mm"], 1, "which paper 105x105"),
         (["--floor", "--margin", 2], 1, "joining marks"),
         (["--spares", -1], 2, "--spares"),
-        (["--bom", "parts.txt"], 2, "does not end in .csv"),
+        (["--bom", "parts.txt"], 2, "end it in .csv"),
     ],
 )
 def test_wrong_arguments_are_reported(
@@ -134,22 +134,16 @@ def test_wrong_arguments_are_reported(
 
 
 @pytest.mark.parametrize(
-    ("command", "ending", "words"),
-    [
-        ("landmarks", ".svg", "map export"),
-        ("landmarks", ".png", "Use .pdf."),
-        ("testsheet", ".tiff", "Use .pdf."),
-        ("testsheet", "", "no ending"),
-    ],
+    ("command", "ending"), [("landmarks", ".svg"), ("landmarks", ".png"), ("testsheet", ".tiff")]
 )
 def test_only_pdf_is_written(
-    locatk, map_file: Path, tmp_path: Path, command: str, ending: str, words: str
+    locatk, map_file: Path, tmp_path: Path, command: str, ending: str
 ) -> None:
     source = [map_file] if command == "landmarks" else []
     before = sorted(tmp_path.iterdir())
     result = locatk("print", command, *source, "-o", tmp_path / f"a{ending}")
     assert result.exit_code == 2
-    assert words in result.stderr
+    assert "end it in .pdf" in result.stderr
     assert sorted(tmp_path.iterdir()) == before
 
 

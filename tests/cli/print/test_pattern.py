@@ -17,6 +17,7 @@ from locatk.core.dots.codec import sequences
 from locatk.core.dots.drawing.layout import DPIS
 from locatk.formats.artifacts.ledger import LEDGER_FILE, open_ledger
 from locatk.formats.artifacts.sheets import read_manifest
+from locatk.formats.printing.rasters import WRITERS
 
 
 def page_sizes(path: Path) -> list[tuple[float, float]]:
@@ -323,13 +324,13 @@ def test_a_damaged_ledger_stops_everything(locatk, tmp_path: Path) -> None:
         (["--strip-black"], 2, "--overlay"),
         (["--crop-marks", "-o", "a.png"], 2, "--format pdf"),
         (["--format", "svg"], 2, "svg"),
-        (["--format", "png"], 2, "'a.pdf' ends in .pdf, but --format is png"),
-        (["-o", "a.tif", "--format", "png"], 2, "ends in .tif"),
-        (["-o", "a.svg"], 2, ".png, .tiff or .pbm"),
-        (["-o", "a.svg", "--format", "pdf"], 2, "ends in .svg"),
-        (["-o", "a.jpg"], 2, ".pdf, .png, .tif, .tiff, .pbm or .txt"),
-        (["-o", "sheet"], 2, "no ending"),
-        (["-o", "sheet.toml"], 2, "ends in .toml"),
+        (["--format", "png"], 2, "end it in .png"),
+        (["-o", "a.tif", "--format", "png"], 2, "end it in .png"),
+        (["-o", "a.svg"], 2, "(.pdf, .png, .tiff, .tif, .pbm, .txt)"),
+        (["-o", "a.svg", "--format", "pdf"], 2, "end it in .pdf"),
+        (["-o", "a.jpg"], 2, "(.pdf, .png, .tiff, .tif, .pbm, .txt)"),
+        (["-o", "sheet"], 2, "The ending of 'sheet'"),
+        (["-o", "sheet.toml"], 2, "The ending of 'sheet.toml'"),
         (["--overlay", "none.pdf"], 1, "none.pdf"),
         (["--ledger", "none/ledger.toml"], 1, "folder"),
         (["--count", "500", "-o", "a.txt"], 2, "200"),
@@ -372,6 +373,7 @@ def test_a_too_narrow_margin_is_reported(locatk, tmp_path: Path) -> None:
 def test_choices_are_those_of_core() -> None:
     """Written twice, because commands import nothing heavy."""
     assert set(options.load("locatk.cli.print.pattern:CODECS")) == set(sequences.FOURTH_DIGITS)
+    assert set(options.load("locatk.cli.print.pattern:ENDINGS")) == {"pdf", *WRITERS}
     command = options.load("locatk.cli.print.pattern:pattern")
     option = next(p for p in command.params if p.name == "dpi")
     assert [int(choice) for choice in option.type.choices] == list(DPIS)

@@ -129,12 +129,12 @@ def test_the_ending_or_the_option_selects_the_format(
 def test_endings_of_other_formats_are_refused(locatk, tag_file: Path, tmp_path: Path) -> None:
     before = names(tmp_path)
     for name, more, words in (
-        ("a.svg", ["--format", "pdf"], "--format"),
-        ("a.pdf", ["--format", "svg"], "--format"),
-        ("a.png", [], ".pdf or .svg"),
-        ("a.toml", ["--format", "svg"], ".pdf or .svg"),
-        ("a.dxf", [], ".pdf or .svg"),
-        ("a", [], "no ending"),
+        ("a.svg", ["--format", "pdf"], "end it in .pdf"),
+        ("a.pdf", ["--format", "svg"], "end it in .svg"),
+        ("a.png", [], "(.pdf, .svg)"),
+        ("a.toml", ["--format", "svg"], "end it in .svg"),
+        ("a.dxf", [], "(.pdf, .svg)"),
+        ("a", [], "(.pdf, .svg)"),
     ):
         result = locatk("print", "tag", tag_file, "--id", 1, "-o", tmp_path / name, *more)
         assert result.exit_code == 2, name
