@@ -152,7 +152,7 @@ def draw(
         losses.append(f"{document} has comments that cannot be drawn: {merged.dropped} left out")
     warning = None
     if merged.black_pages:
-        count = f"{merged.black_pages} of {merged.pages} page{'s' * (merged.pages > 1)}"
+        count = f"{merged.black_pages} of {merged.pages} pages"
         warning = (
             f"{document} has black or grey on {count}, which hides the dots from cameras. "
             "Hint: Print it in the other inks with --strip-black"

@@ -18,7 +18,8 @@ from reportlab.pdfbase import pdfdoc
 from reportlab.pdfgen.canvas import Canvas
 
 from locatk.core import drawing
-from locatk.core.dots.drawing.layout import SheetLayout
+from locatk.core.dots.drawing.layout import BASE_DPI, SheetLayout
+from locatk.core.dots.sheet import MM_PER_INCH
 from locatk.core.errors import InputError
 from locatk.formats.output import tool_version
 
@@ -32,11 +33,13 @@ and halftone it; ``0 g`` removes the other inks below it. See :func:`black_ink`.
 MAX_PAGE_MM = 5080.0
 """Longest side that PDF viewers must support: 200 inches (ISO 32000-1 annex C)."""
 
+POINTS_PER_INCH = 72
+
 PAGE_STEP_POINTS = 1e-4
 """Resolution of the size of a page; single precision has 1e-3 points for the largest pages."""
 
-MIN_LINE_WIDTH_MM = 0.12
-"""Smallest width of a printed line: the diagonal of a pixel of 300 dpi (0.1197 mm).
+MIN_LINE_WIDTH_MM = 0.13
+"""Smallest width of a printed line: more than the diagonal of a pixel of 300 dpi (0.1197 mm).
 
 A thinner line has gaps without anti-aliasing, since it passes between the centres of pixels.
 """
@@ -132,14 +135,15 @@ def start_page(
 
 
 def _points(side_mm: float) -> str:
-    """Return the points of a side, rounded down, as digits that reportlab writes unchanged.
+    """Return the points of a side in whole 1/300 in, as digits that reportlab writes unchanged.
 
-    Some rasterizers round the number of pixels of a page up. With single precision, or a scale of
-    300/72, 595.2 or 84.96 points (or even 792) become one pixel more than 2480 (354, 3300) of
-    1/300 in, and the page is stretched over them. A page in seven digits, as reportlab writes
-    numbers, would end up to 0.01 points too early, which is 0.17 px at 1200 dpi.
+    They are a trifle less, since some rasterizers round the number of pixels of a page up. With
+    single precision, or a scale of 300/72, 595.2 or 84.96 points (or even 792) become one pixel
+    more than 2480 (354, 3300) of 1/300 in, and the page is stretched over them. A page in seven
+    digits, as reportlab writes numbers, would end up to 0.01 points too early, which is 0.17 px at
+    1200 dpi.
     """
-    side = round(side_mm * mm, 6)
+    side = round(round(side_mm * BASE_DPI / MM_PER_INCH) * POINTS_PER_INCH / BASE_DPI, 6)
     steps = math.ceil(side / PAGE_STEP_POINTS) - 1
     while float(np.float32(steps * PAGE_STEP_POINTS)) >= side:
         steps -= 1

@@ -7,6 +7,7 @@ a printer prints with black ink; it does not find out if something else covers t
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -118,7 +119,10 @@ class _Walk:
 
     def is_black(self, stream: Stream) -> bool:
         """Return True at the first black operator."""
-        instructions: Any = pikepdf.parse_content_stream(stream)
+        with warnings.catch_warnings():
+            # Content that ends early is drawn up to there.
+            warnings.simplefilter("ignore", UserWarning)
+            instructions: Any = pikepdf.parse_content_stream(stream)
         return any(self._paints_black(str(item.operator), item.operands) for item in instructions)
 
     def _paints_black(self, operator: str, operands: Any) -> bool:
@@ -162,9 +166,7 @@ class _Walk:
     def _shows_black(self) -> bool:
         fill = self._black[0] and self._text_mode in FILLED_TEXT
         stroke = self._black[1] and self._text_mode in STROKED_TEXT
-        return self._text_mode not in (3, 7) and self._finder.font(
-            self._font, self._resources, (fill, stroke)
-        )
+        return self._finder.font(self._font, self._resources, (fill, stroke))
 
     def _resource(self, kind: str, name: Any) -> Any:
         return self._resources.get(kind, Dictionary()).get(str(name))

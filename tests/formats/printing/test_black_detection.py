@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import zlib
 from pathlib import Path
 
-import numpy as np
 import pikepdf
 import pytest
 from pikepdf import Array, Dictionary, Name, Pdf
@@ -25,8 +25,6 @@ def stamp(pages: int) -> bytes:
 
 
 def bytes_of(pdf: Pdf) -> bytes:
-    import io
-
     target = io.BytesIO()
     pdf.save(target)
     return target.getvalue()
@@ -87,7 +85,6 @@ def resources(pdf: Pdf) -> Dictionary:
     )  # fmt: skip
 
 
-BOX = b" 10 10 40 40 re "
 CASES = {
     "": False,
     "0 0 50 50 re f": True,
@@ -152,8 +149,6 @@ def document(path: Path, contents: list[str]) -> Path:
 def test_black_is_found(tmp_path: Path, content: str) -> None:
     source = document(tmp_path / "in.pdf", [content])
     assert overlay(source, stamp(1), strip_black=False).black_pages == CASES[content]
-    # What is removed is not reported.
-    assert overlay(source, stamp(1), strip_black=True).black_pages == 0
 
 
 @pytest.mark.slow
@@ -174,8 +169,13 @@ def test_pages_are_counted(tmp_path: Path) -> None:
         tmp_path / "in.pdf", ["0 0 9 9 re f", "", "/Dark Do", "/Dark Do", "/Light Do"]
     )
     assert overlay(source, stamp(5), strip_black=False).black_pages == 3
+    # What is removed is not reported.
+    assert overlay(source, stamp(5), strip_black=True).black_pages == 0
 
 
+@pytest.mark.filterwarnings("error")
 def test_damaged_content_is_no_error(tmp_path: Path) -> None:
-    source = document(tmp_path / "in.pdf", ["cs scn /None Do 1 0 0 rg /C 0 0 50 50 re f ((("])
-    assert np.isin(overlay(source, stamp(1), strip_black=False).black_pages, [0, 1])
+    """Viewers draw what comes before the damage, and so does the search."""
+    contents = ["0 0 9 9 re f (((", "1 0 0 rg 0 0 9 9 re f (((", "cs scn /None Do /F Tf BT"]
+    source = document(tmp_path / "in.pdf", contents)
+    assert overlay(source, stamp(3), strip_black=False).black_pages == 1

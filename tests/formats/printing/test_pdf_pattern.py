@@ -161,14 +161,18 @@ def corners(layout: SheetLayout, side: int) -> Iterator[tuple[int, int, int, int
 
 def test_papers_are_whole_numbers_of_pixels() -> None:
     """Also for a rasteriser that rounds up; 792 * (600 / 72) is more than 6600 in floats."""
-    for size in ("A5", "A4", "A3", "A2", "A1", "A0", "Letter", "Tabloid", "914x3000"):
+    for size in ("A5", "A4", "A3", "A2", "A1", "A0", "Letter", "Tabloid", "914x3000", "30x5080"):
         layout = lay_out(paper_size(size)[1], 10, snap(1.0, None, 300))
         made = manifest(layout.raster, layout.sheets("a", (0, 0)), "anoto")
         small = replace(made, sheets=(replace(made.sheets[0], size=(8, 8)),))
-        width, height = pypdfium2.PdfDocument(pattern.render(small))[0].get_size()
-        for dpi in (300, 600, 1200):
-            found = tuple(math.ceil(side * (dpi / 72)) for side in (width, height))
-            assert found == tuple(side * dpi // 300 for side in layout.page), (size, dpi)
+        data = pattern.render(small)
+        with pikepdf.open(io.BytesIO(data)) as pdf:
+            exact = [float(side) for side in pdf.pages[0].MediaBox[2:]]
+        # In double precision, and in the single precision of pdfium.
+        for sides in (exact, pypdfium2.PdfDocument(data)[0].get_size()):
+            for dpi in (300, 600, 1200):
+                found = tuple(math.ceil(side * (dpi / 72)) for side in sides)
+                assert found == tuple(side * dpi // 300 for side in layout.page), (size, dpi)
 
 
 @pytest.mark.slow
@@ -447,7 +451,10 @@ def test_tiff_is_the_png(strip_bytes: int, monkeypatch: pytest.MonkeyPatch) -> N
         np.testing.assert_array_equal(np.asarray(opened), found > 0)
 
 
-def test_pbm_is_the_png() -> None:
+def test_pbm_is_the_png(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In several bands, of the exact length."""
+    monkeypatch.setattr(rasters, "BAND_ROWS", 50)
+    monkeypatch.setattr(rasters, "MAX_BAND_PIXELS", 400_000)
     made = sheets("60x80", 600, 3.0)
     data, found = image(made, "pbm")
     np.testing.assert_array_equal(found, image(made)[1])
