@@ -218,9 +218,9 @@ def calibrate_floor(
     seams = add_systematic_errors(seams, manifest.pitch_mm)
     truths = [truth for each in examined for truth in _truth_observations(each, manifest)]
     sheets = _visible_sheets(manifest, examined, seams)
-    poses = _initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
-    _require_connected(manifest, sheets, poses)
-    problem, state = _problem(manifest, sheets, seams, truths, poses)
+    poses = initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
+    require_connected(manifest, sheets, poses)
+    problem, state = floor_problem(manifest, sheets, seams, truths, poses)
     fit = fit_floor(problem, state)
     validation = cross_validate(fit) if fit.problem.truths else (math.nan, math.nan)
     if fit.problem.layout.nodes and validation[1] > validation[0]:
@@ -426,7 +426,7 @@ def _visible_sheets(
     )
 
 
-def _initial_poses(
+def initial_poses(
     manifest: Manifest,
     sheets: list[int],
     seams: list[SeamMeasurement],
@@ -516,7 +516,7 @@ def _with_rough_positions(manifest: Manifest, seams: list[SeamMeasurement]) -> M
     if not seams:
         return manifest
     sheets = sorted({number for seam in seams for number in seam.numbers})
-    poses = _initial_poses(manifest, sheets, seams, [], 1)
+    poses = initial_poses(manifest, sheets, seams, [], 1)
     placed = list(manifest.sheets)
     for (_, number), (x, y, heading) in poses.items():
         placed[number] = replace(
@@ -525,7 +525,7 @@ def _with_rough_positions(manifest: Manifest, seams: list[SeamMeasurement]) -> M
     return replace(manifest, sheets=tuple(placed))
 
 
-def _require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, Array]) -> None:
+def require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, Array]) -> None:
     """Refuse a floor of several parts."""
     missing = [number for number in sheets if (SHEET, number) not in poses]
     if not missing:
@@ -542,7 +542,7 @@ def _require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, 
     )
 
 
-def _problem(
+def floor_problem(
     manifest: Manifest,
     sheets: list[int],
     seams: list[SeamMeasurement],
@@ -613,8 +613,21 @@ def _report(
         cameras={
             each.recording.name: each.camera for each in examined if each.recording.camera is None
         },
-        notes=(),
+        notes=tuple(_notes(given, fit)),
     )
+
+
+def _notes(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
+    """Report what the calibration could not estimate."""
+    if not given.layout.nodes:
+        yield (
+            "the floor has too many sheets for a model of the errors of their print: the standard "
+            "deviations are those of a print without errors"
+        )
+    if fit.problem.truths and not fit.problem.truths[0].has_heading:
+        yield (
+            "the truth has no orientation: it is assumed to be the position of the camera's centre"
+        )
 
 
 def built_manifest(
