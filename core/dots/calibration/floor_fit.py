@@ -6,7 +6,7 @@ Unknowns are, in this order,
 
     poses        (x, y, heading) of each sheet but the first one, which is the datum
     scale        of the print along both axes of the paper; only with truth
-    alignments   of each recording with truth: (x, y, heading) of the floor in the frame of the
+    alignments   of each truth: (x, y, heading) of the floor in the frame of the
                  truth, (x, y) of the camera on the tracked body, and its heading
     fields       displacements of dots at the nodes of a grid over each sheet
 
@@ -112,9 +112,9 @@ class TruthObservations:
     number : int
         Of the sheet.
     alignment : int
-        Number of the recording among those with truth.
-    frames : (n,) int ndarray
-        Index of each frame in the recording.
+        Number of the truth: recordings with one truth have its frame and its body in common.
+    time_ns : (n,) int64 ndarray
+        Stamps of the frames.
     points_mm : (n, 2) ndarray
         Positions on the paper.
     headings : (n,) ndarray
@@ -128,7 +128,7 @@ class TruthObservations:
 
     number: int
     alignment: int
-    frames: Indices
+    time_ns: Indices
     points_mm: Array
     headings: Array
     variance: Array
@@ -145,7 +145,7 @@ class TruthObservations:
         return TruthObservations(
             self.number,
             self.alignment,
-            self.frames[kept],
+            self.time_ns[kept],
             self.points_mm[kept],
             self.headings[kept],
             self.variance[kept],
@@ -186,7 +186,7 @@ class Layout:
     sheets : tuple of int
         Numbers of the sheets of the floor; the first is the datum.
     alignments : int
-        Number of recordings with truth.
+        Number of truths.
     nodes : dict of int to (columns, rows)
         Of the field of each sheet.
     """
@@ -214,7 +214,7 @@ class Layout:
         return 3 * (len(self.sheets) - 1) + np.arange(2)
 
     def alignment(self, index: int) -> Indices:
-        """Return the unknowns (6,) of a recording with truth."""
+        """Return the unknowns (6,) of a truth."""
         return 3 * (len(self.sheets) - 1) + 2 + 6 * index + np.arange(6)
 
     def field(self, number: int) -> Indices:
@@ -355,7 +355,7 @@ class FloorProblem:
     @property
     def truth_frames(self) -> int:
         """Number of poses with truth."""
-        return sum(len(truth.frames) for truth in self.truths)
+        return sum(len(truth.time_ns) for truth in self.truths)
 
     def pose(self, number: int, state: Array) -> Array:
         """Return x, y [mm] and heading [rad] of a sheet."""
@@ -408,7 +408,7 @@ class FloorProblem:
             for kind, equations in self._truth_rows(truth, state):
                 owner = equations.owner + start
                 parts[kind].append(replace(equations, owner=owner))
-            start += len(truth.frames)
+            start += len(truth.time_ns)
         for kind, each in parts.items():
             if each:
                 result[kind] = Equations(
@@ -766,7 +766,7 @@ def _keep(problem: FloorProblem, masks: dict[str, NDArray[np.bool_]]) -> FloorPr
         kept = masks[POSITION].copy()
         if HEADING in masks:
             kept[: len(masks[HEADING])] &= masks[HEADING]
-        ends = np.cumsum([len(truth.frames) for truth in truths])[:-1]
+        ends = np.cumsum([len(truth.time_ns) for truth in truths])[:-1]
         parts = zip(truths, np.split(kept, ends), strict=True)
         truths = tuple(truth.select(mask) for truth, mask in parts if mask.any())
     return replace(problem, seams=seams, truths=truths)
@@ -864,8 +864,8 @@ def cross_validate(fit: FloorFit) -> tuple[float, float]:
 
 def _part_of(problem: FloorProblem, truth: TruthObservations, fold: int) -> NDArray[np.bool_]:
     """Return the poses of a part of their recording, by time."""
-    frames = np.concatenate(
-        [other.frames for other in problem.truths if other.alignment == truth.alignment]
+    stamps = np.concatenate(
+        [other.time_ns for other in problem.truths if other.alignment == truth.alignment]
     )
-    rank = np.searchsorted(np.sort(frames), truth.frames)
-    return np.asarray(rank * FOLDS // len(frames) == fold)
+    rank = np.searchsorted(np.sort(stamps), truth.time_ns)
+    return np.asarray(rank * FOLDS // len(stamps) == fold)
