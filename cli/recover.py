@@ -84,6 +84,7 @@ def _facts(recovered: Any, written: int) -> dict[str, Any]:
         "damaged_chunks": recovered.damaged_chunks,
         "orphans": recovered.orphans,
         "nameless": recovered.nameless,
+        "unconfirmed": recovered.unconfirmed,
         "losses": [
             {
                 "start": each.start,
@@ -131,6 +132,10 @@ def _lost(recovered: Any) -> str:
             (recovered.lost_metadata, _count(recovered.lost_metadata or 0, "metadata record")),
             (holes, f"{size(hole_bytes)} at {_count(holes, 'place')}"),
             (len(recovered.nameless), f"the schema of {', '.join(recovered.nameless)}"),
+            (
+                len(recovered.unconfirmed),
+                f"the confirmed names of {', '.join(recovered.unconfirmed)}",
+            ),
         )
         if count
     ]

@@ -87,13 +87,13 @@ def decode(data: bytes) -> Picture:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             image = Image.open(io.BytesIO(data), formats=PILLOW_FORMATS)
+            count = getattr(image, "n_frames", 1)
     except (UnidentifiedImageError, SyntaxError):
         raise InputError(f"not an image in the format {FORMAT_NAMES}") from None
     except Image.DecompressionBombError:
         raise InputError("the image claims to be too large") from None
     except Exception:  # Pillow raises any builtin exception on damaged headers
         raise InputError("the image is damaged") from None
-    count = getattr(image, "n_frames", 1)
     if count > 1 and image.format != "MPO":  # a JPEG followed by previews
         raise InputError(f"{count} pictures in one file")
     deep = image.mode in ("RGB", "RGBA") and "16" in str(image.tile)

@@ -218,6 +218,7 @@ def test_commands_import_little_at_import_time(root: Path) -> None:
     """Commands start fast: numpy and the like are imported inside their functions."""
     light_modules = {
         "locatk.core.errors",
+        "locatk.core.printable",
         "locatk.core.units",
         "locatk.formats.artifacts.kinds",
         "locatk.formats.simulation.settings",

@@ -45,7 +45,8 @@ MAX_SHEETS = 60
         "--truth",
         many=True,
         help="Poses of the camera from another system: a session with truth, or a TUM or CSV file. "
-        "Give one file for all sessions, or one for each in the same order.",
+        "Give one file for all sessions, or one for each in the same order, each in a frame of its "
+        "own.",
     ),
     click.option(
         "--offset",
@@ -143,6 +144,7 @@ def _recordings(
     from locatk.formats.sessions.reader import Session
 
     found: list[FloorRecording] = []
+    tracks = [_tracks(path) for path in truth]
     left_out: dict[str, str] = {}
     for index, path in enumerate(sessions):
         with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
@@ -154,11 +156,13 @@ def _recordings(
                     hint="Calibrate sessions of one floor, or give its manifest with --artifact",
                 )
             own = camera or observations.read_camera(session)
-            tracks = _tracks(truth[min(index, len(truth) - 1)]) if truth else None
             cameras = observations.read_frames(session)
             for frames in cameras:
                 name = str(path) if len(cameras) == 1 else f"{path}: {frames.device}"
-                true = None if tracks is None else _track_of(frames.device, tracks, truth)
+                true = None
+                if truth:
+                    file = min(index, len(truth) - 1)
+                    true = _track_of(frames.device, tracks[file], truth[file])
                 found.append(FloorRecording(name, frames, own, true, offset))
     return found, left_out
 
@@ -169,13 +173,13 @@ def _tracks(path: Path) -> list[Trajectory]:
     return trajectories.read(path, role="truth")
 
 
-def _track_of(device: str, tracks: list[Trajectory], files: tuple[Path, ...]) -> Trajectory:
+def _track_of(device: str, tracks: list[Trajectory], path: Path) -> Trajectory:
     """Return the truth of a device: the one of its name, or the only one."""
     named = [track for track in tracks if track.device == device]
     if len(named or tracks) != 1:
         raise InputError(
             f"no truth of {device!r} among {', '.join(track.device for track in tracks)}",
-            file=files[0],
+            file=path,
             hint="Give a file with one trajectory, or with a trajectory of this name",
         )
     return (named or tracks)[0]

@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MAX_DISTANCE_M = 1e100
-"""Largest coordinate difference between estimate and truth; squares of larger ones overflow."""
+"""Largest coordinate of estimate and truth; squares of larger ones overflow."""
 
 DEFAULT_DELTA = Delta(1.0, "f")
 """Relative errors are those from each pose to the next."""
@@ -246,8 +246,8 @@ def _match(
 
 
 def _require_finite(estimate: Array, truth: Array) -> None:
-    """Refuse positions that are not finite, or whose distances overflow."""
-    if not np.all(np.abs(estimate - truth) < MAX_DISTANCE_M):
+    """Refuse positions that are not finite, or whose squares overflow."""
+    if not (np.all(np.abs(estimate) < MAX_DISTANCE_M) and np.all(np.abs(truth) < MAX_DISTANCE_M)):
         raise InputError(
             f"estimate or truth has positions that are not numbers, or beyond {MAX_DISTANCE_M:g} m",
             hint="correct them, or leave them out",

@@ -173,11 +173,12 @@ _DISTORTION = Table(
         Key(
             "x_mm",
             _DISPLACEMENTS,
-            "rows of displacements to the right at the nodes of a regular grid, from the lower "
-            "left to the upper right end of the printed area",
+            "measured errors of the print along the paper's width, added after the scale: rows of "
+            "values at the nodes of a regular grid, from the lower left to the upper right end of "
+            "the printed area; between the nodes by cubic convolution",
             is_si=False,
         ),
-        Key("y_mm", _DISPLACEMENTS, "the same of displacements up the paper", is_si=False),
+        Key("y_mm", _DISPLACEMENTS, "the same up the paper", is_si=False),
     ),
     _distortion_of,
     vars,
@@ -222,13 +223,7 @@ _SHEET = Table(
             "as designed, exact",
             is_si=False,
         ),
-        Key(
-            "distortion",
-            _DISTORTION,
-            "measured errors of the print, added to positions on the paper after the scale",
-            None,
-            "none",
-        ),
+        Key("distortion", _DISTORTION, default=None),
         Key(
             "distortion_sigma_mm",
             Row(NOT_NEGATIVE, 2),

@@ -6,8 +6,10 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.message import DecodeError, Message
 
 from locatk.core.errors import FormatError
 from locatk.formats.capture.ingestion import AUTO, SerialIntake, StampedMessage
@@ -18,6 +20,8 @@ from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, CHANNELS_RECORD, SESSION_RECORD
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
+
+M = TypeVar("M", bound=Message)
 
 TOPIC = "/serial/"
 
@@ -168,13 +172,13 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
     expected = dict.fromkeys(intakes, 0)
     for topic, time_ns, payload in session.messages([*intakes, "/log"]):
         if topic == "/log":
-            line = Log.FromString(payload)
+            line = _parsed(Log, payload, session, topic)
             # Log messages of a device are decoded again; only those of the recorder are copied.
             if line.name.startswith("locatk"):
                 yield from _decode_waiting(intakes, waiting)
                 yield StampedMessage("/log", line, time_ns, time_ns)
             continue
-        chunk = SerialChunk.FromString(payload)
+        chunk = _parsed(SerialChunk, payload, session, topic)
         hole = chunk.byte_offset != expected[topic]
         is_reconnect = chunk.byte_offset != 0 and (chunk.opened or hole)
         if is_reconnect or time_ns - start_ns >= BATCH_NS:
@@ -189,6 +193,14 @@ def _messages(session: Session, intakes: Mapping[str, SerialIntake]) -> Iterator
     yield from _decode_waiting(intakes, waiting)
     for intake in intakes.values():
         yield from intake.finish()
+
+
+def _parsed(message_class: type[M], payload: bytes, session: Session, topic: str) -> M:
+    """Parse a message of a topic."""
+    try:
+        return message_class.FromString(payload)
+    except DecodeError:
+        raise FormatError("a message is damaged", file=session.path, where=topic) from None
 
 
 def _decode_waiting(

@@ -133,7 +133,8 @@ def unit_quaternions(table: Table, names: Sequence[str], *, allow_missing: bool 
             "an incomplete quaternion",
             "Leave all of qx qy qz qw empty if the orientation is unknown",
         )
-    length = np.linalg.norm(quaternion, axis=1)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(quaternion, axis=1)
     is_wrong = np.abs(length - 1) > MAX_NORM_ERROR
     if is_wrong.any():
         row = int(np.argmax(is_wrong))

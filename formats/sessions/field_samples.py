@@ -393,7 +393,7 @@ def _check(device: str, time_ns: NDArray[np.int64], field_t: NDArray[np.float64]
         is_equal = time_ns[number] == time_ns[number - 1]
         relation = "has the time of" if is_equal else "is older than"
         raise InputError(f"sample {number} of {device} {relation} the one before it")
-    infinite = np.isinf(field_t)
+    infinite = np.abs(field_t) > np.finfo(np.float32).max  # in which they are stored
     if infinite.any():
         number, sensor = (int(n) for n in np.argwhere(infinite)[0][:2])
         raise InputError(f"sample {number} of {device} is infinite at sensor {sensor}")

@@ -47,7 +47,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets, cell_positions, vertices
 from locatk.core.trajectory import Trajectory
 from locatk.formats.sessions.messages import TimedMessage, timestamp
-from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.reader import MAX_TIME_NS, Session, time_error
 
 MAX_PATH_POINTS = 5000
 """Number of points of a path that is drawn as one line; longer paths are thinned evenly."""
@@ -203,6 +203,9 @@ def read_trajectory(session: Session, topic: str, device: str) -> Trajectory:
         rows.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
         frame = frame or message.frame_id
     table = np.array(rows, np.float64).reshape(-1, 7)
+    last_ns = max(map(abs, times), default=0)
+    if last_ns > MAX_TIME_NS:
+        raise time_error(session.path, topic, last_ns)
     time_ns = np.array(times, np.int64)
     order = np.argsort(time_ns, kind="stable")
     return Trajectory(

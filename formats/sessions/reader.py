@@ -28,6 +28,9 @@ from locatk.formats.sessions.mcap_file import (
 )
 from locatk.formats.sessions.recovery.salvage import describe_damage, salvage
 
+MAX_TIME_NS = (1 << 63) - 1
+"""Latest time of a message that is read [ns since 1970]; MCAP permits twice of it."""
+
 _MessageT = TypeVar("_MessageT", bound=Message)
 
 
@@ -119,6 +122,9 @@ class Session:
                     raise
                 index = found.index
                 index.damage = _describe(damage)
+                if found.unconfirmed:
+                    names = sorted(index.channels[number].topic for number in found.unconfirmed)
+                    index.damage += f"; only it contains the names of {', '.join(names)}"
             if index.damage is not None and not damaged_ok:  # Its writer made no summary.
                 raise DamageError(index.damage)
             return cls(path, index)
@@ -160,6 +166,8 @@ class Session:
             for segment in self.index.segments_with(topic_of):
                 for channel, time_ns, data in mcap_file.read_messages(stream, segment, topic_of):
                     count += 1
+                    if time_ns > MAX_TIME_NS:
+                        raise time_error(self.path, topic_of[channel], time_ns)
                     yield topic_of[channel], time_ns, data
             _check_count(self.index, count, topic_of)
 
@@ -253,6 +261,9 @@ class RandomAccess:
                 for position in mcap_file.find_messages(stream, segment, channels)
             ]
             _check_count(self._session.index, len(found), channels)
+        last_ns = max((position.time_ns for position in found), default=0)
+        if last_ns > MAX_TIME_NS:
+            raise time_error(self._session.path, topic, last_ns)
         return found
 
     def payload(self, position: MessagePosition) -> bytes:
@@ -288,6 +299,16 @@ def read_index(stream: IO[bytes]) -> Index:
         index = found.index
         index.damage = describe_damage(found)
     return index
+
+
+def time_error(path: str | os.PathLike[str], topic: str, time_ns: int) -> FormatError:
+    """Return the error for a time that int64 nanoseconds do not hold."""
+    return FormatError(
+        f"a message has the time {time_ns} ns, after the year 2262",
+        file=path,
+        where=topic,
+        hint="Set the clock of the recorder, and record again",
+    )
 
 
 def _check_count(index: Index, count: int, channels: Iterable[int]) -> None:

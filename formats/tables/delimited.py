@@ -71,14 +71,17 @@ class Table:
         without surrounding blanks.
     lines : sequence of int
         Line of each row in the file, from 1, for error messages.
-    numbers : dict of str to (n,) ndarray
-        Columns that were parsed with the whole file: finite float64, or int64 times [ns].
+    numbers : dict of str to (n,) float64 ndarray
+        Columns that were parsed with the whole file; finite.
+    times_ns : dict of str to (n,) int64 ndarray
+        Exact times of those of them that contain epoch seconds.
     """
 
     file: Path
     columns: Mapping[str, Sequence[str]]
     lines: Sequence[int]
-    numbers: Mapping[str, Array | NDArray[np.int64]] = field(default_factory=dict)
+    numbers: Mapping[str, Array] = field(default_factory=dict)
+    times_ns: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -121,7 +124,7 @@ class Table:
         """
         missing = np.zeros(len(self), bool)
         if name in self.numbers:
-            values = np.asarray(self.numbers[name], np.float64)
+            values = self.numbers[name]
         else:
             cells = self.columns[name]
             if allow_missing:
@@ -182,8 +185,8 @@ class Table:
         InputError
             A cell is not a finite number, or is outside of the range of int64.
         """
-        if name in self.numbers:
-            return np.asarray(self.numbers[name], np.int64)
+        if name in self.times_ns:
+            return self.times_ns[name]
         cells = self.columns[name]
         try:
             return parse_decimal_times(cells)
@@ -218,6 +221,19 @@ def _first_failing(convert: Callable[[str], object], cells: Sequence[str]) -> in
 # ---- files
 
 
+def _read_text(path: Path) -> str:
+    """Read a text without zero bytes, which a crash can leave at the end of a file."""
+    text = read_text(path, MAX_FILE_BYTES)
+    if "\0" in text:
+        raise FormatError(
+            "zero bytes in a text file",
+            file=path,
+            where=text.count("\n", 0, text.index("\0")) + 1,
+            hint="The file is damaged or of another kind",
+        )
+    return text
+
+
 def read_table(path: Path) -> Table:
     """Read a CSV file with a header; blank lines are ignored.
 
@@ -229,15 +245,7 @@ def read_table(path: Path) -> Table:
         The file is not UTF-8 or empty, its quotes are broken, two columns have the same name, or
         rows differ in length.
     """
-    text = read_text(path, MAX_FILE_BYTES)
-    # The csv module knows no NUL, and a crash can leave zeros at the end of a file.
-    if "\0" in text:
-        raise FormatError(
-            "zero bytes in a text file",
-            file=path,
-            where=text.count("\n", 0, text.index("\0")) + 1,
-            hint="The file is damaged or not CSV",
-        )
+    text = _read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -296,7 +304,7 @@ def read_number_rows(
     MissingDataError, FormatError
         The file is missing, is not text, has no rows, or has rows of another length.
     """
-    text = read_text(path, MAX_FILE_BYTES)
+    text = _read_text(path)
     table = _plain_rows(path, text, names, time_column)
     return table or _rows_by_word(path, text, names, hint)
 
@@ -312,14 +320,15 @@ def _plain_rows(path: Path, text: str, names: Sequence[str], time_column: str) -
     parsed = parse_numbers(block, len(names), " ")
     if parsed is None or not np.isfinite(parsed.values).all():
         return None
-    numbers: dict[str, Array | NDArray[np.int64]] = dict(zip(names, parsed.values.T, strict=True))
+    numbers = dict(zip(names, parsed.values.T, strict=True))
+    times_ns: dict[str, NDArray[np.int64]] = {}
     if time_column:
         times = parse_digits(parsed.characters(block, 0))
         if times is None:
             return None
-        numbers[time_column] = times
+        times_ns[time_column] = times
     lines = range(comments + 1, comments + 1 + len(parsed.values))
-    return Table(Path(path), {}, lines, numbers)
+    return Table(Path(path), {}, lines, numbers, times_ns)
 
 
 def _rows_by_word(path: Path, text: str, names: Sequence[str], hint: str) -> Table:

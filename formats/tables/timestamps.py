@@ -84,6 +84,8 @@ def parse_decimal_times(cells: Sequence[str]) -> Times:
         texts = np.array(cells, "S")
     except UnicodeEncodeError:  # decimal digits of another script, which Python reads as well
         texts = None
+    if "\0" in "".join(cells):  # numpy drops zeros at the end of a text
+        texts = None
     if texts is not None and texts.size and 0 < texts.itemsize <= MAX_DIGITS + 2:
         times = parse_digits(texts.view(np.uint8).reshape(len(texts), -1))
     if times is None:

@@ -91,7 +91,8 @@ class FloorRecording:
     camera : Camera, optional
         Default: estimated from the frames.
     truth : Trajectory, optional
-        Of the body that carries the camera, in any frame with z up.
+        Of the body that carries the camera, in any frame with z up. Recordings with the same object
+        have the frame and the camera's pose on the body in common.
     offset_s : float
         Seconds to add to the stamps of the frames to get those of the truth.
     """
@@ -202,25 +203,32 @@ def calibrate_floor(
             "the manifest has a single sheet, and there is no truth",
             hint="Without truth, only the relative poses of several sheets can be estimated",
         )
+    if any(sheet.id == "floor" and sheet.position_mm is None for sheet in manifest.sheets):
+        raise InputError(
+            "a sheet is named 'floor', which is the name of the frame of all sheets",
+            hint="Rename it in the manifest",
+        )
     code = codec(manifest.codec)
     examined = [
         _examine(index, recording, manifest, code, advance)
         for index, recording in enumerate(recordings)
     ]
-    seams = [seam for each in examined for seam in _measure_seams(each, manifest, code, advance)]
     if any(sheet.position_mm is None for sheet in manifest.sheets):
         # The first frames give sheets rough positions, by which more are recognised.
-        rough = _with_rough_positions(manifest, seams)
-        seams = [
-            seam for each in examined for seam in _measure_seams(each, rough, code, lambda: None)
-        ]
+        first = [seam for each in examined for seam in _measure_seams(each, manifest, code)]
+        rough = _with_rough_positions(manifest, first)
+    else:
+        rough = manifest
+    seams: list[SeamMeasurement] = []
+    for each in examined:
+        seams += _measure_seams(each, rough, code, advance, is_last=True)
     manifest = crop_overlaps(manifest, seams)
     seams = add_systematic_errors(seams, manifest.pitch_mm)
-    truths = [truth for each in examined for truth in _truth_observations(each, manifest)]
+    truths = list(_truth_observations(examined, manifest))
     sheets = _visible_sheets(manifest, examined, seams)
-    poses = _initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
-    _require_connected(manifest, sheets, poses)
-    problem, state = _problem(manifest, sheets, seams, truths, poses)
+    poses = initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
+    require_connected(manifest, sheets, poses)
+    problem, state = floor_problem(manifest, sheets, seams, truths, poses)
     fit = fit_floor(problem, state)
     validation = cross_validate(fit) if fit.problem.truths else (math.nan, math.nan)
     if fit.problem.layout.nodes and validation[1] > validation[0]:
@@ -236,8 +244,8 @@ def calibrate_floor(
 class _Examined:
     """Recording with the poses of its frames on the grid.
 
-    ``numbers`` (n,) is the sheet of each frame, -1 if it has none; ``seam_frames`` are the indices
-    of frames that may show several sheets.
+    ``numbers`` (n,) is the sheet of each frame, -1 if it has none; ``near_seam`` (n,) are the
+    frames that may show several sheets, without those that were found to show one.
     """
 
     index: int
@@ -245,7 +253,7 @@ class _Examined:
     camera: Camera
     localized: LocalizedFrames
     numbers: NDArray[np.intp]
-    seam_frames: NDArray[np.int64]
+    near_seam: NDArray[np.bool_]
 
 
 def _examine(
@@ -272,7 +280,7 @@ def _examine(
             ) from None
         localized, numbers = _localize(frames, manifest, code, camera, lambda: None)
         near_seam = may_show_seam(localized, numbers, manifest)
-    return _Examined(index, recording, camera, localized, numbers, np.flatnonzero(near_seam))
+    return _Examined(index, recording, camera, localized, numbers, near_seam)
 
 
 def _select(frames: Frames, indices: NDArray[np.int64]) -> Frames:
@@ -316,28 +324,48 @@ def _localize(
 
 
 def _measure_seams(
-    examined: _Examined, manifest: Manifest, code: Codec, advance: Callable[[], None]
+    examined: _Examined,
+    manifest: Manifest,
+    code: Codec,
+    advance: Callable[[], None] = lambda: None,
+    *,
+    is_last: bool = False,
 ) -> Iterator[SeamMeasurement]:
-    """Yield the relative poses of the sheets in each frame that shows several."""
+    """Yield the relative poses of the sheets in each frame that shows several.
+
+    With ``is_last``, frames that show a single sheet are no longer counted as near a seam.
+    """
     images = examined.recording.frames.images
-    is_candidate = np.isin(np.arange(len(images)), examined.seam_frames)
     for frame in range(len(images)):
         advance()
-        if not is_candidate[frame]:
+        if not examined.near_seam[frame]:
             continue
         views = separate_sheets(images[frame], manifest, code, examined.camera)
+        if is_last and len(views) == 1 and views[0].number == examined.numbers[frame]:
+            examined.near_seam[frame] = False
         seam = measure_seam(views, manifest, examined.camera, examined.index, frame)
         if seam is not None:
             yield seam
 
 
-def _truth_observations(examined: _Examined, manifest: Manifest) -> Iterator[TruthObservations]:
+def _truth_observations(
+    examined: list[_Examined], manifest: Manifest
+) -> Iterator[TruthObservations]:
+    """Yield the poses on each sheet that have truth, of each recording."""
+    alignments: dict[int, int] = {}
+    for each in examined:
+        truth = each.recording.truth
+        if truth is not None:
+            alignment = alignments.setdefault(id(truth), len(alignments))
+            yield from _compare_with_truth(each, truth, alignment, manifest)
+
+
+def _compare_with_truth(
+    examined: _Examined, true: Trajectory, alignment: int, manifest: Manifest
+) -> Iterator[TruthObservations]:
     """Yield the poses on each sheet that have truth."""
     recording, localized = examined.recording, examined.localized
-    if recording.truth is None:
-        return
-    is_used = localized.accepted & (examined.numbers >= 0)
-    is_used[examined.seam_frames] = False
+    is_used = localized.accepted & (examined.numbers >= 0) & ~examined.near_seam
     frames = np.flatnonzero(is_used)
     stamps = recording.frames.time_ns[frames]
     poses = Trajectory(
@@ -348,11 +376,11 @@ def _truth_observations(examined: _Examined, manifest: Manifest) -> Iterator[Tru
         quaternion_from_heading(np.zeros(len(frames))),
         np.full((len(frames), 6, 6), np.nan),
     )
-    match = associate(poses, recording.truth, offset_s=recording.offset_s)
+    match = associate(poses, true, offset_s=recording.offset_s)
     rows = np.unique(np.linspace(0, len(match) - 1, min(len(match), MAX_TRUTH_FRAMES)).astype(int))
     frames, truth = frames[match.index[rows]], match.truth[rows] * 1e3
     headings = heading_from_quaternion(match.truth_quaternion[rows])
-    if not has_orientation(recording.truth).all():
+    if not has_orientation(true).all():
         headings = np.full(len(rows), np.nan)
     for number in np.unique(examined.numbers[frames]).tolist():
         here = examined.numbers[frames] == number
@@ -366,8 +394,8 @@ def _truth_observations(examined: _Examined, manifest: Manifest) -> Iterator[Tru
         )
         yield TruthObservations(
             number,
-            examined.index,
-            indices,
+            alignment,
+            recording.frames.time_ns[indices],
             position * 1e3,
             heading,
             variance,
@@ -422,7 +450,7 @@ def _visible_sheets(
     )
 
 
-def _initial_poses(
+def initial_poses(
     manifest: Manifest,
     sheets: list[int],
     seams: list[SeamMeasurement],
@@ -490,7 +518,7 @@ def _truth_edges(truths: list[TruthObservations]) -> dict[tuple[Node, Node], Arr
     edges = {}
     for truth in truths:
         extent = np.ptp(truth.points_mm, axis=0).max(initial=0)
-        if len(truth.frames) >= MIN_TRUTH_FRAMES and extent >= MIN_TRUTH_EXTENT_MM:
+        if len(truth.time_ns) >= MIN_TRUTH_FRAMES and extent >= MIN_TRUTH_EXTENT_MM:
             fit = umeyama(truth.truth_mm, truth.points_mm, with_scale=False)
             angle = math.atan2(fit.rotation[1, 0], fit.rotation[0, 0])
             pose = np.append(fit.translation, angle)
@@ -512,7 +540,7 @@ def _with_rough_positions(manifest: Manifest, seams: list[SeamMeasurement]) -> M
     if not seams:
         return manifest
     sheets = sorted({number for seam in seams for number in seam.numbers})
-    poses = _initial_poses(manifest, sheets, seams, [], 1)
+    poses = initial_poses(manifest, sheets, seams, [], 1)
     placed = list(manifest.sheets)
     for (_, number), (x, y, heading) in poses.items():
         placed[number] = replace(
@@ -521,7 +549,7 @@ def _with_rough_positions(manifest: Manifest, seams: list[SeamMeasurement]) -> M
     return replace(manifest, sheets=tuple(placed))
 
 
-def _require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, Array]) -> None:
+def require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, Array]) -> None:
     """Refuse a floor of several parts."""
     missing = [number for number in sheets if (SHEET, number) not in poses]
     if not missing:
@@ -538,7 +566,7 @@ def _require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, 
     )
 
 
-def _problem(
+def floor_problem(
     manifest: Manifest,
     sheets: list[int],
     seams: list[SeamMeasurement],
@@ -547,7 +575,7 @@ def _problem(
 ) -> tuple[FloorProblem, Array]:
     """Return the problem of a floor and the initial guess of its unknowns."""
     if not all(truth.has_heading for truth in truths):
-        truths = [replace(t, truth_headings=np.full(len(t.frames), np.nan)) for t in truths]
+        truths = [replace(t, truth_headings=np.full(len(t.time_ns), np.nan)) for t in truths]
     numbers = sorted({truth.alignment for truth in truths if (TRUTH, truth.alignment) in poses})
     used = tuple(
         replace(truth, alignment=numbers.index(truth.alignment))
@@ -609,8 +637,21 @@ def _report(
         cameras={
             each.recording.name: each.camera for each in examined if each.recording.camera is None
         },
-        notes=(),
+        notes=tuple(_notes(given, fit)),
     )
+
+
+def _notes(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
+    """Report what the calibration could not estimate."""
+    if not given.layout.nodes:
+        yield (
+            "the floor has too many sheets for a model of the errors of their print: the standard "
+            "deviations are those of a print without errors"
+        )
+    if fit.problem.truths and not fit.problem.truths[0].has_heading:
+        yield (
+            "the truth has no orientation: it is assumed to be the position of the camera's centre"
+        )
 
 
 def built_manifest(

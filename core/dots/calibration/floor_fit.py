@@ -6,7 +6,7 @@ Unknowns are, in this order,
 
     poses        (x, y, heading) of each sheet but the first one, which is the datum
     scale        of the print along both axes of the paper; only with truth
-    alignments   of each recording with truth: (x, y, heading) of the floor in the frame of the
+    alignments   of each truth: (x, y, heading) of the floor in the frame of the
                  truth, (x, y) of the camera on the tracked body, and its heading
     fields       displacements of dots at the nodes of a grid over each sheet
 
@@ -29,7 +29,7 @@ scale of a frame is known from the pitch alone, and would be a height as well as
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,11 +50,12 @@ CORRELATION_LENGTHS_MM = (50.0, 100.0, 200.0)
 """Correlation lengths of the print's errors that are compared. Figures 13 and 14 of Hostettler et
 al. 2016 show regions of some centimetres with a common error on an A3 print."""
 
-NODE_SPACING_MM = 40.0
-"""Largest distance of two nodes of a field."""
+NODE_SPACINGS_MM = (40.0, 50.0, 60.0)
+"""Largest distance of two nodes of a field: the first that needs no more than
+:data:`MAX_UNKNOWNS`. Wider grids cannot represent fields of the shortest correlation length."""
 
 MAX_UNKNOWNS = 2000
-"""Number of unknowns from which fields have fewer nodes; beyond, a fit takes minutes."""
+"""Maximum number of unknowns; with more, a fit takes minutes."""
 
 RELATIVE_JITTER = 1e-6
 """Variance of a node, relative to that of the field, that is independent of other nodes."""
@@ -79,6 +80,10 @@ LEVER_PRIOR_SIGMA_MM = 300.0
 FLAT_SIGMA = 1e5
 """Prior standard deviation, in mm and rad, of parameters without prior."""
 
+MAX_EXCESS_SIGMAS = 3.0
+"""Excess of the mean square of normalised residuals, in its standard deviations, up to which they
+have no other cause than the noise of the dots."""
+
 MIN_FIELD_MM = 0.02
 """Standard deviation of a field from which the search for the most likely one starts."""
 
@@ -94,7 +99,7 @@ MAX_GATING_ROUNDS = 5
 FOLDS = 10
 """Number of parts of the recordings in the cross-validation."""
 
-MAX_EVALUATIONS = 150
+MAX_EVALUATIONS = 80
 """Maximum number of evaluations of the evidence for each correlation length."""
 
 
@@ -107,9 +112,9 @@ class TruthObservations:
     number : int
         Of the sheet.
     alignment : int
-        Number of the recording among those with truth.
-    frames : (n,) int ndarray
-        Index of each frame in the recording.
+        Number of the truth: recordings with one truth have its frame and its body in common.
+    time_ns : (n,) int64 ndarray
+        Stamps of the frames.
     points_mm : (n, 2) ndarray
         Positions on the paper.
     headings : (n,) ndarray
@@ -123,7 +128,7 @@ class TruthObservations:
 
     number: int
     alignment: int
-    frames: Indices
+    time_ns: Indices
     points_mm: Array
     headings: Array
     variance: Array
@@ -140,7 +145,7 @@ class TruthObservations:
         return TruthObservations(
             self.number,
             self.alignment,
-            self.frames[kept],
+            self.time_ns[kept],
             self.points_mm[kept],
             self.headings[kept],
             self.variance[kept],
@@ -181,7 +186,7 @@ class Layout:
     sheets : tuple of int
         Numbers of the sheets of the floor; the first is the datum.
     alignments : int
-        Number of recordings with truth.
+        Number of truths.
     nodes : dict of int to (columns, rows)
         Of the field of each sheet.
     """
@@ -209,7 +214,7 @@ class Layout:
         return 3 * (len(self.sheets) - 1) + np.arange(2)
 
     def alignment(self, index: int) -> Indices:
-        """Return the unknowns (6,) of a recording with truth."""
+        """Return the unknowns (6,) of a truth."""
         return 3 * (len(self.sheets) - 1) + 2 + 6 * index + np.arange(6)
 
     def field(self, number: int) -> Indices:
@@ -223,14 +228,13 @@ class Layout:
 
 
 def lay_out_unknowns(manifest: Manifest, sheets: tuple[int, ...], alignments: int) -> Layout:
-    """Return the unknowns of a floor."""
-    spacing_mm = NODE_SPACING_MM
-    while True:
+    """Return the unknowns of a floor; without fields if it is too large for them."""
+    for spacing_mm in NODE_SPACINGS_MM:
         nodes = {number: _nodes(manifest, number, spacing_mm) for number in sheets}
         layout = Layout(sheets, alignments, nodes)
-        if layout.size <= MAX_UNKNOWNS or set(nodes.values()) == {(2, 2)}:
+        if layout.size <= MAX_UNKNOWNS:
             return layout
-        spacing_mm *= 1.25
+    return Layout(sheets, alignments, {})
 
 
 def _nodes(manifest: Manifest, number: int, spacing_mm: float) -> tuple[int, int]:
@@ -351,7 +355,7 @@ class FloorProblem:
     @property
     def truth_frames(self) -> int:
         """Number of poses with truth."""
-        return sum(len(truth.frames) for truth in self.truths)
+        return sum(len(truth.time_ns) for truth in self.truths)
 
     def pose(self, number: int, state: Array) -> Array:
         """Return x, y [mm] and heading [rad] of a sheet."""
@@ -404,7 +408,7 @@ class FloorProblem:
             for kind, equations in self._truth_rows(truth, state):
                 owner = equations.owner + start
                 parts[kind].append(replace(equations, owner=owner))
-            start += len(truth.frames)
+            start += len(truth.time_ns)
         for kind, each in parts.items():
             if each:
                 result[kind] = Equations(
@@ -624,13 +628,20 @@ def fit_state(problem: FloorProblem, state: Array, noise: Noise) -> FloorFit:
     return FloorFit(problem, state, covariance, noise, evidence)
 
 
-def fit_noise(problem: FloorProblem, state: Array, noise: Noise) -> Noise:
-    """Return the noise of the largest evidence, about a state; with fields if there are any."""
+def fit_noise(
+    problem: FloorProblem,
+    state: Array,
+    noise: Noise,
+    lengths_mm: Sequence[float] | None = None,
+) -> Noise:
+    """Return the noise of the largest evidence about a state, near a given one.
+
+    Correlation lengths that are compared are ``lengths_mm``, by default that of the given noise.
+    """
     grams = _Grams.of(problem.linearize(state), state)
     prior = Prior(problem.manifest, problem.layout)
-    has_field = bool(problem.layout.nodes)
     best: tuple[float, Noise] | None = None
-    for length_mm in CORRELATION_LENGTHS_MM if has_field else (noise.length_mm,):
+    for length_mm in lengths_mm or (noise.length_mm,):
         start = replace(noise if best is None else best[1], length_mm=length_mm)
         names = _free_parameters(problem)
 
@@ -755,7 +766,7 @@ def _keep(problem: FloorProblem, masks: dict[str, NDArray[np.bool_]]) -> FloorPr
         kept = masks[POSITION].copy()
         if HEADING in masks:
             kept[: len(masks[HEADING])] &= masks[HEADING]
-        ends = np.cumsum([len(truth.frames) for truth in truths])[:-1]
+        ends = np.cumsum([len(truth.time_ns) for truth in truths])[:-1]
         parts = zip(truths, np.split(kept, ends), strict=True)
         truths = tuple(truth.select(mask) for truth, mask in parts if mask.any())
     return replace(problem, seams=seams, truths=truths)
@@ -770,7 +781,7 @@ def fit_floor(problem: FloorProblem, state: Array) -> FloorFit:
     rigid = replace(problem, layout=replace(problem.layout, nodes={}))
     rigid, state, noise = fit_robustly(rigid, state[: rigid.layout.size])
     without = _fit_gated(rigid, state, noise)
-    if not fields:
+    if not fields or _is_explained(without):
         return without
     deviation = max(without.noise.position_mm, MIN_FIELD_MM) if problem.truths else MIN_FIELD_MM
     noise = replace(without.noise, field_mm=(deviation, deviation))
@@ -783,10 +794,21 @@ def fit_floor(problem: FloorProblem, state: Array) -> FloorFit:
     return with_field if gain > MIN_FIELD_EVIDENCE else without
 
 
+def _is_explained(fit: FloorFit) -> bool:
+    """Return whether seams agree within the noise of their dots, without fields and truth."""
+    if fit.problem.truths:
+        return False
+    residual = fit.problem.linearize(fit.state)[SEAM].residual
+    excess = float(residual @ residual) / len(residual) - 1
+    return excess < MAX_EXCESS_SIGMAS * math.sqrt(2 / len(residual))
+
+
 def _fit_gated(problem: FloorProblem, state: Array, noise: Noise) -> FloorFit:
     """Fit noise and unknowns in turn, and reject improbable observations."""
+    lengths_mm = CORRELATION_LENGTHS_MM if problem.layout.nodes else None
     for _ in range(MAX_GATING_ROUNDS):
-        noise = fit_noise(problem, state, noise)
+        noise = fit_noise(problem, state, noise, lengths_mm)
+        lengths_mm = None
         fit = fit_state(problem, state, noise)
         state = fit.state
         masks = {}
@@ -842,8 +864,8 @@ def cross_validate(fit: FloorFit) -> tuple[float, float]:
 
 def _part_of(problem: FloorProblem, truth: TruthObservations, fold: int) -> NDArray[np.bool_]:
     """Return the poses of a part of their recording, by time."""
-    frames = np.concatenate(
-        [other.frames for other in problem.truths if other.alignment == truth.alignment]
+    stamps = np.concatenate(
+        [other.time_ns for other in problem.truths if other.alignment == truth.alignment]
     )
-    rank = np.searchsorted(np.sort(frames), truth.frames)
-    return np.asarray(rank * FOLDS // len(frames) == fold)
+    rank = np.searchsorted(np.sort(stamps), truth.time_ns)
+    return np.asarray(rank * FOLDS // len(stamps) == fold)

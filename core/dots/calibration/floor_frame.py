@@ -80,7 +80,7 @@ def build_sheets(fit: FloorFit) -> tuple[BuiltSheet, ...]:
         in_frame, derivative = _in_datum(pose, by_unknowns, poses[0], maps[0], datum)
         sheet = manifest.sheets[number]
         truth_frames = sum(
-            len(truth.frames) for truth in fit.problem.truths if truth.number == number
+            len(truth.time_ns) for truth in fit.problem.truths if truth.number == number
         )
         distortion, sigma = _distortion(fit, number, truth_frames >= MIN_MAPPED_FRAMES)
         nominal = np.full(3, np.nan)

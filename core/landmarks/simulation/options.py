@@ -40,6 +40,11 @@ MAX_HEADING_OFFSET_RAD = math.pi / 4
 STRATEGIES = ("paper", "published", "path", "pass")
 
 
+MAX_WAYPOINT_M = 1000.0
+"""Largest coordinate of a waypoint [m]. At 0.1 m/s and 200 Hz, a drive over this distance has two
+million samples."""
+
+
 @dataclass(frozen=True)
 class Errors:
     """Errors of sensors, landmarks and odometry: standard deviations, unless stated otherwise.
@@ -265,6 +270,13 @@ class SimulationOptions:
                 ("landmarks", self.landmarks is None or self.landmarks >= 1, "1 or more"),
                 ("spins", self.spins is None or self.spins >= 0, from_0),
                 ("waypoints", all(map(_finite, self.waypoints)), "numbers"),
+                (
+                    "waypoints",
+                    all(
+                        abs(value) <= MAX_WAYPOINT_M for point in self.waypoints for value in point
+                    ),
+                    f"at most {MAX_WAYPOINT_M:g} m from the origin of the map",
+                ),
                 ("waypoints", not (self.waypoints and self.cells), "waypoints or cells"),
                 (
                     "waypoints",

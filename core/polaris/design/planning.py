@@ -196,7 +196,8 @@ def disc_field(magnet: Magnet, points: Array) -> Array:
         polarization=(magnet.remanence_t, 0, 0),
         dimension=(magnet.diameter_m, magnet.height_m),
     )
-    return np.asarray(source.getB(points), float).reshape(-1, 3)
+    with np.errstate(over="ignore", invalid="ignore"):  # far away, the field is 0
+        return np.asarray(source.getB(points), float).reshape(-1, 3)
 
 
 def field_width(

@@ -134,7 +134,7 @@ def detect_magnets(
     """
     if speed_mps is None:
         raise InputError(
-            "no speed, which the paper's method needs,", hint="Give it with --speed, in m/s"
+            "no speed, which the paper's method needs", hint="Give it with --speed, in m/s"
         )
     if not 0 < speed_mps < math.inf:
         raise InputError(f"a speed of {speed_mps:g} m/s is not above 0")

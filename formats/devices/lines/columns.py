@@ -77,6 +77,11 @@ Columns = Mapping[tuple[str, ...], SiColumn]
 """Columns of one kind by key, in the order of the line."""
 
 
+def without_overflow(values: Array) -> Array:
+    """Replace values beyond float32, in which fields are recorded, by nan."""
+    return np.where(np.abs(values) <= np.finfo(np.float32).max, values, np.nan)
+
+
 @dataclass(frozen=True)
 class Part:
     """Records of one stream: the columns of a line that they are taken from."""
@@ -89,7 +94,7 @@ class Part:
         index = [column.number for column in self.columns]
         values = lines[:, index] * np.array([column.factor for column in self.columns])
         if self.stream.kind != "readings":
-            values[np.isinf(values)] = np.nan
+            return without_overflow(values)
         return values
 
     def fields(self, values: Array) -> dict[str, NDArray[Any]]:
@@ -205,7 +210,8 @@ class ColumnLayout:
             return []
         fields = part.fields(values[has_record])
         if part.stream.kind == "magnetometers" and self.temperature is not None:
-            fields["temperature_celsius"] = lines[rows, self.temperature.number]
+            temperature = lines[rows, self.temperature.number]
+            fields["temperature_celsius"] = without_overflow(temperature)
         stream = Stream(part.stream.kind, "", part.stream.sensors, part.stream.names, clock)
         return [
             Batch(

@@ -87,6 +87,8 @@ class Recovered:
         Messages in intact chunks whose channel is defined nowhere; not saved.
     nameless : tuple of str
         Topics whose schema is lost; saved without it.
+    unconfirmed : tuple of str
+        Topics whose names are only in a damaged index, so that they may be wrong.
     losses : tuple of Loss
         Unusable bytes of the source.
     tail : int
@@ -110,6 +112,7 @@ class Recovered:
     lost_metadata: int | None
     orphans: int
     nameless: tuple[str, ...]
+    unconfirmed: tuple[str, ...]
     losses: tuple[Loss, ...]
     tail: int
     ended: bool
@@ -428,6 +431,8 @@ def _summarize(source: str, output: str, found: Salvage, rewriter: Rewriter) -> 
     topics += [
         RecoveredTopic(name, "", 0, count) for name, count in lost.items() if isinstance(name, str)
     ]
+    new_ids = {rewriter.new_ids[old] for old in found.unconfirmed if old in rewriter.new_ids}
+    unconfirmed = tuple(rewriter.topics[new_id][0] for new_id in sorted(new_ids))
     return Recovered(
         source=source,
         output=output,
@@ -440,11 +445,12 @@ def _summarize(source: str, output: str, found: Salvage, rewriter: Rewriter) -> 
         lost_metadata=lost_metadata,
         orphans=rewriter.orphans,
         nameless=tuple(rewriter.nameless),
+        unconfirmed=unconfirmed,
         losses=tuple(found.losses),
         tail=found.tail,
         ended=found.ended,
         damaged=not found.is_whole,
-        complete=found.ended and is_intact and not rewriter.orphans,
+        complete=found.ended and is_intact and not rewriter.orphans and not unconfirmed,
     )
 
 
@@ -469,6 +475,7 @@ def _metadata_record(recovered: Recovered) -> dict[str, str]:
         "lost_attachments": recovered.lost_attachments,
         "lost_metadata": recovered.lost_metadata,
         "orphans": recovered.orphans,
+        "unconfirmed": ", ".join(recovered.unconfirmed) or None,
         "tail_bytes": recovered.tail,
         **{f"saved:{topic.topic}": topic.saved for topic in recovered.topics},
         **{f"missing_bytes:{topic.topic}": topic.missing_bytes for topic in recovered.topics},

@@ -121,6 +121,9 @@ class Salvage:
         Number of messages, attachments and metadata records, if the summary is intact.
     conflicts : set of (Opcode, int)
         Kinds and ids of schemas and channels of which chunks contain different definitions.
+    unconfirmed : set of int
+        Ids of channels with messages in chunks whose definitions are only in a damaged index. A
+        flipped bit may have changed their names.
     """
 
     size: int
@@ -132,6 +135,7 @@ class Salvage:
     ended: bool = False
     statistics: records.Statistics | None = None
     conflicts: set[tuple[Opcode, int]] = field(default_factory=set)
+    unconfirmed: set[int] = field(default_factory=set)
 
     @property
     def tail(self) -> int:
@@ -205,6 +209,7 @@ class _Search:
         self._in_data_section = True
         self._summary_start = 0
         self._recordings = 0
+        self._has_intact_summary = False
         self._chunk_keys: set[tuple[int, int]] = set()
         self._verified_definitions: dict[tuple[Opcode, int], Definition] = {}
         # Runs of messages outside chunks
@@ -237,8 +242,24 @@ class _Search:
         if self._recordings > 1:
             result.statistics = None  # it describes one of several concatenated recordings
         self._settle_runs()
+        if self.has_chunks and not self._has_intact_summary:
+            result.unconfirmed = {
+                entry.id for entry in result.index.channels.values() if self._is_unconfirmed(entry)
+            }
         result.index.segments.sort(key=lambda segment: segment.offset)
         return result
+
+    def _is_unconfirmed(self, channel: records.Channel) -> bool:
+        """Return whether neither a checksum nor the list of a live recording confirms a channel."""
+        index, verified = self._result.index, self._verified_definitions
+        if not index.counts[channel.id] or (
+            (Opcode.CHANNEL, channel.id) in verified
+            and (channel.schema_id == 0 or (Opcode.SCHEMA, channel.schema_id) in verified)
+        ):
+            return False
+        schema = index.schemas.get(channel.schema_id)
+        listed = index.metadata.get(CHANNELS_RECORD, {}).get(str(channel.id))
+        return listed is None or listed != f"{channel.topic} {schema.name if schema else ''}"
 
     # ---- intact records
 
@@ -364,6 +385,7 @@ class _Search:
         if summary is None:
             result.index_losses.append(Loss(self._summary_start or position, end, "index"))
             return
+        self._has_intact_summary = True
         start, summary_records, is_verified = summary
         for opcode, record in summary_records:
             if opcode == Opcode.STATISTICS:

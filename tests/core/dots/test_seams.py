@@ -102,7 +102,7 @@ def test_the_pose_of_a_tile_follows_from_each_frame(
 ) -> None:
     """A step of some tenths of a pitch is the worst: one lattice bends over both tiles."""
     sheets = lay(*displacement)
-    errors, normalized, count = [], [], 16
+    errors, normalized, count = [], [], 10
     for image, _, _ in cross(sheets, count, 7):
         views = separate_sheets(image, TILES, ANOTO, CAMERA)
         seam = measure_seam(views, TILES, CAMERA)
@@ -143,6 +143,7 @@ def test_a_blank_frame_has_no_sheet() -> None:
     assert separate_sheets(blank, TILES, ANOTO, CAMERA) == []
 
 
+@pytest.mark.slow
 def test_a_sheet_without_position_is_decoded_alone(
     lay: Callable[..., Any], cross: Callable[..., Any]
 ) -> None:
@@ -153,7 +154,7 @@ def test_a_sheet_without_position_is_decoded_alone(
     large = {"size": (320, 240), "centre": (159.5, 119.5)}
     camera = Camera((320, 240), 348.7, (159.5, 119.5))
     sheets = lay(1.3, -0.8, 0.5)
-    for image, _, _ in cross(sheets, 3, 5, width_mm=0.5, **large):
+    for image, _, _ in cross(sheets, 2, 5, width_mm=0.5, **large):
         views = separate_sheets(image, unplaced, ANOTO, camera)
         assert {view.number for view in views} == {0, 1}
         seam = measure_seam(views, unplaced, camera)
@@ -176,7 +177,7 @@ def test_a_pose_at_a_seam_is_that_of_one_tile(
 ) -> None:
     """The dots of the other tile used to pull such poses by up to 0.1 mm, 30 sigma."""
     sheets = lay(0.1, 0.05, 0.1)
-    frames = list(cross(sheets, 24, 11, width_mm=4.0))
+    frames = list(cross(sheets, 14, 11, width_mm=4.0))
     times = np.arange(len(frames)) * 20_000_000 + 10**18
     images = [image for image, _, _ in frames]
     recording = Frames("robot", times, tuple(map(str, times)), images)
@@ -192,7 +193,7 @@ def test_a_pose_at_a_seam_is_that_of_one_tile(
     rows = np.searchsorted(times, track.time_ns)
     true = np.array([[frames[k][1].real, frames[k][1].imag] for k in rows])
     error = track.position[:, :2] * 1e3 - true
-    assert len(track) > 18
+    assert len(track) >= 10
     # A tilted frame without a camera model has its pose in the middle of the frame all the same.
     assert np.hypot(*error.T).max() < 5e-3
     spread = track.covariance[:, :2, :2] * 1e6

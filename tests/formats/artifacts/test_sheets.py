@@ -157,6 +157,31 @@ def test_tiles_may_share_their_rims() -> None:
     assert manifest.sheets[1].heading_deg == 1.0
 
 
+COVARIANCE = """
+covariance_mm_deg = [[1.0, 0.1, 0.0], [0.1, 4.0, 0.0], [0.0, 0.0, 0.01]]
+"""
+DISTORTION = """
+[sheets.distortion]
+x_mm = [[0.1, 0.2], [0.3, 0.4]]
+y_mm = [[0.5, 0.6], [0.7, 0.8]]
+"""
+
+
+def test_sheets_as_built() -> None:
+    text = HEAD + SHEET + TILE + COVARIANCE + "distortion_sigma_mm = [0.02, 0.05]" + DISTORTION
+    (sheet,) = loads_manifest(text).sheets
+    assert sheet.covariance_mm_deg == ((1.0, 0.1, 0.0), (0.1, 4.0, 0.0), (0.0, 0.0, 0.01))
+    assert sheet.distortion_sigma_mm == (0.02, 0.05)
+    assert sheet.distortion is not None
+    assert sheet.distortion.y_mm == ((0.5, 0.6), (0.7, 0.8))
+    sheet.distortion.displacement_mm  # noqa: B018 - computed once; it is no part of the file
+    written = dumps_manifest(loads_manifest(text))
+    assert loads_manifest(written) == loads_manifest(text)
+    assert dumps_manifest(Manifest((sheet,))) == dumps_manifest(
+        loads_manifest(dumps_manifest(Manifest((sheet,))))
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "where", "words"),
     [
@@ -194,6 +219,37 @@ def test_tiles_may_share_their_rims() -> None:
         (HEAD + SHEET + "heading_deg = 5", "sheets[0].heading_deg", "without position_mm"),
         (HEAD + SHEET + "position_mm = [1]", "sheets[0].position_mm", "list of 2"),
         (HEAD + SHEET + "colour = 3", "sheets[0]", "unknown key 'colour'"),
+        (HEAD + SHEET + COVARIANCE, "sheets[0].covariance_mm_deg", "without position_mm"),
+        (
+            HEAD + SHEET + TILE + COVARIANCE.replace("[0.1, ", "[0.2, "),
+            "sheets[0].covariance_mm_deg",
+            "expected a covariance",
+        ),
+        (
+            HEAD + SHEET + TILE + COVARIANCE.replace("4.0", "0.001"),
+            "sheets[0].covariance_mm_deg",
+            "expected a covariance",
+        ),
+        (
+            HEAD + SHEET + DISTORTION.replace("[0.1, 0.2], ", ""),
+            "sheets[0].distortion.y_mm",
+            "as many rows and columns",
+        ),
+        (
+            HEAD
+            + SHEET
+            + DISTORTION.replace("0.1, ", "")
+            .replace("0.3, ", "")
+            .replace("0.5, ", "")
+            .replace("0.7, ", ""),
+            "sheets[0].distortion.x_mm",
+            "at least two rows and columns",
+        ),
+        (
+            HEAD + SHEET + "distortion_sigma_mm = [0.1, -0.1]",
+            "sheets[0].distortion_sigma_mm",
+            "at least 0",
+        ),
         (
             HEAD + SHEET + OTHER.replace("[400, 3000]", "[399, 3599]"),
             "sheets[1].origin",

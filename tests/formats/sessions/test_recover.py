@@ -421,7 +421,7 @@ def test_the_chunk_that_defines_the_channels_is_lost(
         return
     result = recover(path, output)
     assert stock(output) == good.flat[len(good.messages[0]) :]
-    assert (result.orphans, result.nameless) == (0, ())
+    assert (result.orphans, result.nameless, result.unconfirmed) == (0, (), ())
     session = Session.open(output)
     assert len(list(session.decoded("/serial/bar", SerialChunk))) == 10 * (CHUNKS - 1)
     rest = Session.open(path, damaged_ok=True)
@@ -666,3 +666,20 @@ def test_any_damage(
         assert len(list(Session.open(output).messages())) == result.messages
         return
     assert not output.exists()
+
+
+def test_unconfirmed_names_are_reported(good: Whole, tmp_path: Path) -> None:
+    data = bytearray(good.data)
+    for chunk_start, _ in good.chunks[:1]:
+        data[chunk_start + 100] ^= 1
+    at = data.rindex(b"/serial/bar")  # in the index
+    data[at + 1] ^= 1
+    path, output = tmp_path / "bad.mcap", tmp_path / "out.mcap"
+    path.write_bytes(data)
+    result = recover(path, output)
+    assert "/rerial/bar" in result.unconfirmed
+    assert not result.complete
+    damage = Session.open(path, damaged_ok=True).damage
+    assert damage is not None
+    assert "only it contains the names of" in damage
+    assert "/rerial/bar" in Session.open(output).metadata()["recovered"]["unconfirmed"]

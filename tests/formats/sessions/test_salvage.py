@@ -278,6 +278,36 @@ def test_a_summary_with_a_wrong_checksum_is_ignored() -> None:
     ]
 
 
+def test_names_that_no_checksum_confirms_are_reported() -> None:
+    data = bytearray(file())
+    (first, _), *_ = spans(bytes(data), Opcode.CHUNK)
+    [(start, end)] = spans(bytes(data), Opcode.CHANNEL)  # in the summary
+    name = data.index(b"/thing", start, end)
+    data[first + 60] ^= 1
+    found, left = times(bytes(data))
+    assert left == ALL[2:]
+    assert not found.unconfirmed  # the checksum of the summary is right
+    data[name + 1] ^= 1
+    found, left = times(bytes(data))
+    assert left == ALL[2:]
+    assert found.index.channels[1].topic == "/uhing"
+    assert found.unconfirmed == {1}
+    data[first + 60] ^= 1
+    found, left = times(bytes(data))
+    assert left == ALL
+    assert found.index.channels[1].topic == "/thing"  # from the chunk, whose checksum is right
+    assert not found.unconfirmed
+
+
+def test_a_file_without_a_checksum_of_the_summary_is_accepted() -> None:
+    data = bytearray(file(enable_crcs=False))
+    (first, _), *_ = spans(bytes(data), Opcode.CHUNK)
+    data[first + 9 + 48] ^= 0xFF  # the magic number of the compressed data
+    found, left = times(bytes(data))
+    assert left == ALL[2:]
+    assert not found.unconfirmed
+
+
 # ---- messages outside chunks
 
 

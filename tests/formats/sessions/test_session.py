@@ -13,6 +13,8 @@ import mcap.reader
 import mcap.writer
 import pytest
 import zstandard
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Chunk
@@ -27,6 +29,7 @@ from locatk.core.errors import (
 )
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import mcap_file
+from locatk.formats.sessions.foxglove import read_trajectory
 from locatk.formats.sessions.reader import AttachmentInfo, Channel, RandomAccess, Session
 from locatk.formats.sessions.writer import PROFILE, SessionWriter
 
@@ -508,3 +511,29 @@ def test_chunks_larger_than_stated_take_little_memory(compression: str) -> None:
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("time_ns", [1 << 63, (1 << 64) - 1])
+def test_times_after_2262_are_refused(tmp_path: Path, time_ns: int) -> None:
+    path = tmp_path / "late.mcap"
+    with open(path, "wb") as stream:
+        writer = mcap.writer.Writer(stream)
+        writer.start("locatk")
+        channel = writer.register_channel("/late", "json", 0)
+        writer.add_message(channel, 5, b"1", time_ns)  # the time of publication is not used
+        writer.add_message(channel, time_ns, b"2", 5)
+        writer.finish()
+    session = Session.open(path)
+    problem = f"late.mcap:/late: a message has the time {time_ns} ns, after the year 2262"
+    with pytest.raises(FormatError, match=problem):
+        list(session.messages())
+    with pytest.raises(FormatError, match=problem):
+        RandomAccess(session).positions("/late")
+
+
+def test_times_of_poses_after_2262_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "late.mcap"
+    with SessionWriter(path, system="") as writer:
+        writer.write("/pose", PoseInFrame(timestamp=Timestamp(seconds=1 << 62)), 0)
+    with pytest.raises(FormatError, match="after the year 2262"):
+        read_trajectory(Session.open(path), "/pose", "red")

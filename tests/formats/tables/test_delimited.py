@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -138,3 +139,34 @@ def test_numpy_accepts_what_the_check_lets_pass() -> None:
     for cell in ("1-2", "1.2.3", "e", "+-1", "1e"):
         with pytest.raises(ValueError, match="could not convert"):
             np.loadtxt(io.BytesIO(f"{cell},1\n".encode()), delimiter=",", comments=None)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2**63 - 1), st.floats(-1e3, 1e3, allow_nan=False)),
+        min_size=1,
+        max_size=5,
+    )
+)
+def test_times_are_equal_on_both_paths(rows: list[tuple[int, float]]) -> None:
+    text = "".join(f"{ns // 10**9}.{ns % 10**9:09d} {x!r}\n" for ns, x in rows)
+    tables = []
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.txt"
+        for tail in ("", "# a comment behind the rows\n"):  # which is not read at once
+            path.write_text(text + tail)
+            tables.append(read_number_rows(path, ("t", "x"), hint="", time_column="t"))
+    at_once, by_word = tables
+    assert not by_word.numbers
+    for name in ("t", "x"):
+        assert at_once.floats(name).tolist() == by_word.floats(name).tolist()
+    times = [table.epoch_times_ns("t").tolist() for table in tables]
+    assert times[0] == times[1] == [ns for ns, _ in rows]
+
+
+def test_zero_bytes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_bytes(b"1.5 2\n2.5 3\0\0\0\n")
+    with pytest.raises(FormatError, match="zero bytes in a text file") as caught:
+        read_number_rows(path, ("t", "x"), hint="", time_column="t")
+    assert caught.value.where == 2

@@ -81,3 +81,8 @@ def test_iso_times(text: str, time_ns: int) -> None:
 def test_text_that_is_not_an_iso_time(text: str) -> None:
     with pytest.raises(ValueError, match=r".+"):
         ts.parse_iso_time(text)
+
+
+def test_zero_bytes_are_no_times() -> None:
+    with pytest.raises(ValueError, match="not a time"):
+        ts.parse_decimal_times(["1.5\0"])

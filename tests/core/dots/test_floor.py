@@ -1,0 +1,381 @@
+"""Floors as built: from measurements whose errors are known, and from frames end to end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from locatk.core.dots.calibration import floor as calibration
+from locatk.core.dots.calibration.floor import FloorRecording, built_manifest, calibrate_floor
+from locatk.core.dots.calibration.floor_fit import (
+    FloorFit,
+    TruthObservations,
+    cross_validate,
+    fit_floor,
+    lay_out_unknowns,
+)
+from locatk.core.dots.calibration.floor_frame import build_sheets
+from locatk.core.dots.calibration.seam_measurements import SeamMeasurement
+from locatk.core.dots.camera import Camera
+from locatk.core.dots.frames import Frames
+from locatk.core.dots.sheet import Manifest, Sheet
+from locatk.core.errors import DegenerateError, InputError
+
+Array = NDArray[np.float64]
+Warp = Callable[[Array], Array]
+
+PITCH_MM, PAGE, FIRST, SIZE = 0.508, (150.0, 210.0), (5.0, 5.0), (276, 394)
+WIDTH_MM, HEIGHT_MM = PAGE
+SIGMA_MM, SIGMA_RAD = 5e-3, 2e-3
+
+
+def designed(columns: int, rows: int) -> Manifest:
+    """Tiles without overlap, row by row from the lower left one."""
+    return Manifest(
+        tuple(
+            Sheet(
+                f"c{column}r{row}",
+                (1000 + 300 * column, 5000 - 400 * row),
+                SIZE,
+                (0, 0),
+                PAGE,
+                FIRST,
+                (WIDTH_MM * column, HEIGHT_MM * row),
+            )
+            for row in range(rows)
+            for column in range(columns)
+        )
+    )
+
+
+def rotated(points: Array, angle: float) -> Array:
+    turned = (points[..., 0] + 1j * points[..., 1]) * complex(math.cos(angle), math.sin(angle))
+    return np.stack([turned.real, turned.imag], axis=-1)
+
+
+def no_warp(points: Array) -> Array:
+    return np.zeros_like(points)
+
+
+class Floor:
+    """Tiles glued with errors, whose seams and poses are measured with known noise."""
+
+    def __init__(
+        self, seed: int, columns: int = 3, rows: int = 2, warps: dict[int, Warp] | None = None
+    ) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.manifest = designed(columns, rows)
+        self.columns, self.rows = columns, rows
+        self.warps = warps or {}
+        nominal = np.array([[*s.position_mm, 0.0] for s in self.manifest.sheets])  # type: ignore[misc]
+        error = self.rng.normal(0, [1.0, 1.0, math.radians(0.3)], nominal.shape)
+        error[0] = 0
+        self.poses = nominal + error
+
+    def on_floor(self, number: int, points: Array) -> Array:
+        x, y, angle = self.poses[number]
+        several = np.atleast_2d(points)
+        moved = several + self.warps.get(number, no_warp)(several)
+        return (rotated(moved, angle) + [x, y]).reshape(points.shape)
+
+    def seams(self, frames: int, sigma_mm: float = SIGMA_MM) -> list[SeamMeasurement]:
+        """Measure each seam in as many frames as given."""
+        result = []
+        for number in range(len(self.poses)):
+            row, column = divmod(number, self.columns)
+            if column + 1 < self.columns:
+                result += self.measure(number, number + 1, 0, frames, sigma_mm)
+            if row + 1 < self.rows:
+                result += self.measure(number, number + self.columns, 1, frames, sigma_mm)
+        return result
+
+    def measure(
+        self, first: int, other: int, axis: int, frames: int, sigma_mm: float = SIGMA_MM
+    ) -> list[SeamMeasurement]:
+        seams = []
+        for frame in range(frames):
+            along = self.rng.uniform(10, PAGE[1 - axis] - 10)
+            point = np.array([2.0, along] if axis == 0 else [along, 2.0])
+            spot = self.on_floor(other, point)
+            x, y, angle = self.poses[first]
+            position = rotated(spot - [x, y], -angle)
+            heading = self.poses[other, 2] - angle
+            sigma = np.array([sigma_mm, sigma_mm, SIGMA_RAD])
+            pose = np.append(position, heading) + self.rng.normal(0, sigma)
+            seams.append(
+                SeamMeasurement(
+                    *(0, frame, (first, other), point[None], pose[None], np.diag(sigma**2)), ()
+                )
+            )
+        return seams
+
+    def truth(self, number: int, count: int, sigma_mm: float = 0.02) -> TruthObservations:
+        """Poses in a frame that is rotated by 1 rad, of a body 30 mm from the camera."""
+        points = self.rng.uniform([8, 8], [WIDTH_MM - 8, HEIGHT_MM - 8], (count, 2))
+        headings = self.rng.uniform(-math.pi, math.pi, count)
+        body = self.poses[number, 2] + headings + 1.0 + 0.3
+        world = rotated(self.on_floor(number, points), 1.0) + [500, -200]
+        lever = np.stack([30 * np.cos(body) - 5 * np.sin(body),
+                          30 * np.sin(body) + 5 * np.cos(body)], axis=1)  # fmt: skip
+        world -= lever
+        return TruthObservations(
+            number,
+            0,
+            np.arange(count) + 10_000 * number,
+            points,
+            headings,
+            np.full((count, 2), 1e-8),
+            world + self.rng.normal(0, sigma_mm, world.shape),
+            np.angle(np.exp(1j * (body + self.rng.normal(0, 1e-3, count)))),
+        )
+
+    def fit(
+        self, seams: list[SeamMeasurement], truths: list[TruthObservations] | None = None
+    ) -> FloorFit:
+        sheets = list(range(len(self.poses)))
+        poses = calibration.initial_poses(self.manifest, sheets, seams, truths or [], 1)
+        problem, state = calibration.floor_problem(
+            self.manifest, sheets, seams, truths or [], poses
+        )
+        return fit_floor(problem, state)
+
+    def errors(self, fit: FloorFit) -> list[tuple[Array, Array]]:
+        """Errors (3,) of all tiles but the datum, with their covariances."""
+        return [
+            (sheet.pose - self.poses[sheet.number], sheet.covariance)
+            for sheet in build_sheets(fit)[1:]
+        ]
+
+
+def nees(errors: list[tuple[Array, Array]]) -> float:
+    return float(np.mean([e @ np.linalg.solve(c, e) / 3 for e, c in errors]))
+
+
+@pytest.mark.slow
+def test_the_covariance_of_the_tiles_is_that_of_their_errors() -> None:
+    errors = []
+    for seed in range(8):
+        floor = Floor(seed, 2, 2)
+        fit = floor.fit(floor.seams(8))
+        assert not fit.problem.layout.nodes
+        errors += floor.errors(fit)
+    assert max(np.hypot(*e[:2]) for e, _ in errors) < 0.03
+    assert 0.6 < nees(errors) < 1.6
+
+
+@pytest.mark.slow
+def test_wrong_frames_are_rejected() -> None:
+    floor = Floor(3)
+    seams = floor.seams(8)
+    for k in (1, 9, 10, 30):
+        pose = seams[k].poses + [[0.6, -0.4, 0.02]]
+        seams[k] = replace(seams[k], poses=pose)
+    fit = floor.fit(seams)
+    used = {id(seam) for seam in fit.problem.seams}
+    assert [k for k, seam in enumerate(seams) if id(seam) not in used] == [1, 9, 10, 30]
+    assert nees(floor.errors(fit)) < 3
+
+
+@pytest.mark.slow
+def test_errors_of_the_print_along_a_seam_widen_the_covariance() -> None:
+    """Errors of 0.1 mm along the seams, where a frame measures to 5 um."""
+
+    def warp(points: Array, phase: float) -> Array:
+        return 0.1 * np.stack(
+            [np.sin(points[:, 1] / 40 + phase), np.cos(points[:, 0] / 35 + phase)], axis=1
+        )
+
+    errors = []
+    for seed in range(4):
+        warps = {n: lambda points, n=n, k=seed: warp(points, 2.0 * n + k) for n in range(2)}
+        floor = Floor(seed, 2, 1, warps)
+        fit = floor.fit(floor.seams(20))
+        assert fit.problem.layout.nodes
+        sheets = build_sheets(fit)
+        assert all(sheet.distortion is None for sheet in sheets)
+        assert all(0.02 < sheet.distortion_sigma_mm[0] < 0.4 for sheet in sheets)
+        errors += floor.errors(fit)
+    assert nees(errors) < 3
+
+
+def stretched(points: Array) -> Array:
+    """0.15 % and -0.1 % of scale, and regions with errors of 0.03 and 0.1 mm."""
+    x, y = points.T
+    return np.stack(
+        [
+            1.5e-3 * x + 0.03 * np.sin(y / 40 + 1) * np.cos(x / 45),
+            -1e-3 * y + 0.1 * np.sin(y / 35) * np.cos(x / 50 + 2),
+        ],
+        axis=1,
+    )
+
+
+@pytest.mark.slow
+def test_truth_maps_the_errors_of_the_print() -> None:
+    floor = Floor(5, 2, 1, {0: stretched, 1: stretched})
+    fit = floor.fit(floor.measure(0, 1, 0, 8), [floor.truth(0, 150), floor.truth(1, 150)])
+    sheets = build_sheets(fit)
+    assert all(sheet.distortion is not None for sheet in sheets)
+    index = fit.problem.layout.scale
+    scale = 1 + fit.state[index]
+    assert scale == pytest.approx([1.0015, 0.999], abs=1e-3)
+    without, with_maps = cross_validate(fit)
+    # Of the rest, 0.041 mm are noise of the truth and of its heading, times the lever.
+    assert 0.041 < with_maps < 0.85 * without
+    # Places anywhere on the tiles, where nothing was measured: relative positions on the floor.
+    built = built_manifest(floor.manifest, sheets, (float(scale[0]), float(scale[1])))
+    rng = np.random.default_rng(0)
+    points = rng.uniform([10, 10], [WIDTH_MM - 10, HEIGHT_MM - 10], (200, 2))
+    estimated, true, normalized = [], [], []
+    for number in (0, 1):
+        upper = [points[:, 0] - FIRST[0], PAGE[1] - points[:, 1] - FIRST[1]]
+        grid = np.stack(upper, axis=1) / PITCH_MM + floor.manifest.sheets[number].origin
+        estimated.append(built.to_metres(number, grid) * 1e3)
+        true.append(floor.on_floor(number, points))
+        normalized.append(built.covariance(number, estimated[-1] * 1e-3)[:, :2, :2] * 1e6)
+    both, at = np.concatenate(estimated), np.concatenate(true)
+    shift, turn = (at - both).mean(axis=0), np.zeros(1)
+    centred = (both - both.mean(axis=0)) @ [1, 1j]
+    turn = np.angle((np.conj(centred) * ((at - at.mean(axis=0)) @ [1, 1j])).sum())
+    aligned = rotated(both - both.mean(axis=0), float(turn)) + both.mean(axis=0) + shift
+    error = aligned - at
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.03
+    spread = np.concatenate(normalized)
+    values = np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[..., None])[..., 0]) / 2
+    assert 0.1 < values.mean() < 2
+
+
+@pytest.mark.slow
+def test_a_good_print_gets_no_map() -> None:
+    floor = Floor(6, 2, 1)
+    fit = floor.fit(floor.measure(0, 1, 0, 8), [floor.truth(0, 100), floor.truth(1, 100)])
+    assert not fit.problem.layout.nodes
+    assert all(sheet.distortion is None for sheet in build_sheets(fit))
+    # 0.02 mm, and the error of the heading of the body (0.001 rad) times the lever of 30 mm.
+    assert fit.noise.position_mm == pytest.approx(math.hypot(0.02, 0.03 / math.sqrt(2)), rel=0.2)
+
+
+@pytest.mark.slow
+def test_truth_connects_sheets_without_a_seam() -> None:
+    floor = Floor(8, 2, 1)
+    fit = floor.fit([], [floor.truth(0, 60), floor.truth(1, 60)])
+    ((error, covariance),) = floor.errors(fit)
+    assert np.hypot(*error[:2]) < 0.03
+    assert error @ np.linalg.solve(covariance, error) / 3 < 4
+
+
+def test_truth_without_orientation() -> None:
+    floor = Floor(8, 2, 1)
+    truths = [
+        replace(truth, truth_headings=np.full(len(truth.time_ns), np.nan), truth_mm=at)
+        for truth in (floor.truth(0, 60), floor.truth(1, 60))
+        for at in [rotated(floor.on_floor(truth.number, truth.points_mm), 1.0)]
+    ]
+    ((error, _),) = floor.errors(floor.fit([], truths))
+    assert np.hypot(*error[:2]) < 0.01
+
+
+@pytest.mark.slow
+def test_the_datum_keeps_its_pose() -> None:
+    floor = Floor(5, 2, 1, {0: stretched, 1: stretched})
+    datum, _ = build_sheets(
+        floor.fit(floor.measure(0, 1, 0, 8), [floor.truth(0, 80), floor.truth(1, 80)])
+    )
+    np.testing.assert_allclose(datum.pose, 0, atol=1e-9)
+    np.testing.assert_allclose(datum.covariance, 0, atol=1e-12)
+    # Its map has neither a shift nor a rotation.
+    assert datum.distortion is not None
+    assert np.abs(datum.distortion.displacement_mm.mean(axis=(0, 1))).max() < 1e-6
+
+
+def test_parts_of_a_floor_are_named() -> None:
+    floor = Floor(0)
+    seams = floor.measure(0, 1, 0, 5) + floor.measure(3, 4, 0, 5) + floor.measure(1, 4, 1, 2)
+    sheets = list(range(6))
+    poses = calibration.initial_poses(floor.manifest, sheets, seams, [], 3)
+    with pytest.raises(DegenerateError, match=r"c2r0, c0r1, c1r1, c2r1 are not connected") as error:
+        calibration.require_connected(floor.manifest, sheets, poses)
+    assert "across each seam" in str(error.value.hint)
+
+
+def test_large_floors_have_coarser_fields() -> None:
+    sizes = {}
+    for count in (4, 6, 7, 10):
+        manifest = designed(count, count)
+        layout = lay_out_unknowns(manifest, tuple(range(count**2)), 1)
+        assert layout.size <= 2000
+        sizes[count] = layout.nodes.get(0)
+        unknowns = [layout.field(number).ravel() for number in layout.nodes]
+        assert sum(map(len, unknowns)) == layout.size - layout.rigid
+        assert len(np.unique(np.concatenate([*unknowns, [0]]))) == 1 + sum(map(len, unknowns))
+    assert sizes == {4: (5, 6), 6: (4, 5), 7: None, 10: None}
+
+
+def blank_recording() -> FloorRecording:
+    image = np.full((120, 188), 200, np.uint8)
+    frames = Frames("cam", np.arange(3) * 10**7, ("a", "b", "c"), [image] * 3)
+    return FloorRecording("blank", frames, Camera((188, 120), 348.7, (93.5, 59.5)))
+
+
+def test_refusals() -> None:
+    with pytest.raises(InputError, match="a single sheet"):
+        calibrate_floor([blank_recording()], designed(1, 1))
+    with pytest.raises(DegenerateError, match="no frame shows a sheet"):
+        calibrate_floor([blank_recording()], designed(2, 1))
+    without = replace(blank_recording(), camera=None)
+    with pytest.raises(DegenerateError, match="camera of blank cannot be estimated") as error:
+        calibrate_floor([without], designed(2, 1))
+    assert "--camera" in str(error.value.hint)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("has_positions", [True, False], ids=["tiles", "sheets"])
+def test_from_frames_to_a_manifest(
+    laid_sheet: Callable[..., Any], shoot_floor: Callable[..., Any], has_positions: bool
+) -> None:
+    """Two small sheets glued with a turn, seen by a camera that shares nothing with the solver."""
+    size, page, first = (90, 80), (47.0, 42.0), (0.5, 0.6)
+    ids = ("A6-0001", "A6-0002")
+    origins = ((1000, 2000), (1100, 2000))
+    positions = ((0.0, 0.0), (46.0, 0.5)) if has_positions else (None, None)
+    manifest = Manifest(
+        tuple(
+            Sheet(name, origin, size, (0, 0), page, first, position)
+            for name, origin, position in zip(ids, origins, positions, strict=True)
+        )
+    )
+    floor = (
+        laid_sheet(origins[0], size, page, first),
+        laid_sheet(origins[1], size, page, first, 46.7, -0.4, 1.0),
+    )
+    rng = np.random.default_rng(4)
+    large = {"size": (320, 240), "centre": (159.5, 119.5)}
+    images = [
+        shoot_floor(
+            floor,
+            46.4 + rng.uniform(-1.5, 1.5),
+            rng.uniform(6, 36),
+            heading=rng.uniform(-3, 3),
+            seed=k,
+            **large,
+        )
+        for k in range(6)
+    ]
+    frames = Frames("cam", np.arange(6) * 10**7, tuple(map(str, range(6))), images)
+    camera = Camera((320, 240), 348.7, (159.5, 119.5))
+    report = calibrate_floor([FloorRecording("run", frames, camera)], manifest)
+    assert report.datum == "A6-0001"
+    second = report.manifest.sheets[1]
+    np.testing.assert_allclose(second.position_mm, (46.7, -0.4), atol=2e-3)
+    assert second.heading_deg == pytest.approx(1.0, abs=2e-3)
+    assert second.covariance_mm_deg is not None
+    sigma = np.sqrt(np.diag(second.covariance_mm_deg))
+    error = np.array([*second.position_mm, second.heading_deg]) - [46.7, -0.4, 1.0]  # type: ignore[misc]
+    assert np.abs(error / sigma).max() < 5
+    assert report.manifest.frame(1) == "floor"
