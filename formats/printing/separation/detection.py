@@ -36,6 +36,9 @@ SHOWING = {"Tj", "TJ", "'", '"'}
 FILLED_TEXT, STROKED_TEXT = {0, 2, 4, 6}, {1, 2, 5, 6}
 """Text rendering modes (ISO 32000-1 table 106); 3 is invisible, as of recognized text on scans."""
 
+MAX_IMAGE_PIXELS = 50_000_000
+"""Largest image that is decoded, in 0.4 GB; larger ones count as black."""
+
 SHADING_STEPS = 64
 """Colours of a shading that are examined."""
 
@@ -196,6 +199,8 @@ def _is_black(space: ColourSpace, values: Any) -> bool:
 
 def _is_black_image(image: Stream) -> bool:
     """Return True if a pixel of an image is black; also if the image cannot be decoded."""
+    if int(image.Width) * int(image.Height) > MAX_IMAGE_PIXELS:
+        return True
     try:
         picture = PdfImage(image).as_pil_image()
         is_cmyk = picture.mode == "CMYK"

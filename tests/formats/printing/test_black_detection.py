@@ -179,3 +179,32 @@ def test_damaged_content_is_no_error(tmp_path: Path) -> None:
     contents = ["0 0 9 9 re f (((", "1 0 0 rg 0 0 9 9 re f (((", "cs scn /None Do /F Tf BT"]
     source = document(tmp_path / "in.pdf", contents)
     assert overlay(source, stamp(3), strip_black=False).black_pages == 1
+
+
+def test_nested_and_recursive_forms_end(tmp_path: Path) -> None:
+    pdf = Pdf.new()
+    page = pdf.add_blank_page(page_size=(SIZE, SIZE)).obj
+    inner = pdf.make_stream(b"/Self Do /Self Do 1 0 0 rg 0 0 9 9 re f")
+    inner.Subtype, inner.BBox = Name.Form, Array([0, 0, 72, 72])
+    inner.Resources = Dictionary(XObject=Dictionary(Self=inner))
+    for _ in range(3000):
+        outer = pdf.make_stream(b"/Inner Do /Inner Do")
+        outer.Subtype, outer.BBox = Name.Form, Array([0, 0, 72, 72])
+        outer.Resources = Dictionary(XObject=Dictionary(Inner=inner))
+        inner = outer
+    page.Resources = Dictionary(XObject=Dictionary(Inner=inner))
+    page.Contents = pdf.make_stream(b"/Inner Do")
+    (tmp_path / "in.pdf").write_bytes(bytes_of(pdf))
+    assert overlay(tmp_path / "in.pdf", stamp(1), strip_black=False).black_pages == 0
+    assert overlay(tmp_path / "in.pdf", stamp(1), strip_black=True).left_black != {}
+
+
+def test_huge_images_are_not_decoded(tmp_path: Path) -> None:
+    pdf = Pdf.new()
+    page = pdf.add_blank_page(page_size=(SIZE, SIZE)).obj
+    page.Resources = Dictionary(
+        XObject=Dictionary(I=image(pdf, b"\xff", Name.DeviceGray, side=60_000))
+    )
+    page.Contents = pdf.make_stream(b"q 9 0 0 9 0 0 cm /I Do Q")
+    (tmp_path / "in.pdf").write_bytes(bytes_of(pdf))
+    assert overlay(tmp_path / "in.pdf", stamp(1), strip_black=False).black_pages == 1
