@@ -26,7 +26,7 @@ from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.printing import overlay, pattern, rasters
 
 STUDY_VARIABLE = "LOCATK_PRINT_STUDY"
-"""Environment variable that selects all sheets instead of a few; they take about half an hour."""
+"""Environment variable that selects all sheets instead of a few; they take 15 to 30 minutes."""
 
 QUICK_SHEETS = (("A4", 300), ("A5", 600), ("60x80mm", 1200), ("A0", 300))
 """Papers and dpi without this variable."""
@@ -100,10 +100,10 @@ def overlaid_sheets(dpi: int) -> PrintedSheets:
         sheet.UserUnit = unit
     stream = io.BytesIO()
     pdf.save(stream)
-    with tempfile.NamedTemporaryFile(suffix=".pdf") as file:
-        file.write(stream.getvalue())
-        file.flush()
-        sizes = overlay.page_sizes(file.name)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "document.pdf"
+        path.write_bytes(stream.getvalue())
+        sizes = overlay.page_sizes(path)
     made = _printed(f"overlay {dpi} dpi", [_lay_out(size, dpi) for size in sizes], dpi)
     return replace(made, document=stream.getvalue())
 
@@ -167,20 +167,23 @@ def rasteriser_figures() -> list[Figure]:
                 percents[name][sheets.name] = exact_percent(sheets.manifest, expected, pages)
     rows = []
     for name, values in percents.items():
-        exact = Figure(f"{name}: dots on their pixels", None, "%", "", 100.0, "higher")
-        duration = Figure(f"{name}: {TIMED_SHEET} rasterised", seconds.get(name), "s",
-                          "once, with the start of the program")  # fmt: skip
-        if reasons[name]:
-            rows += [exact.missing(reasons[name]), duration.missing(reasons[name])]
-            continue
-        lowest = min(values, key=lambda sheet: values[sheet])
-        how = (
-            f"dots that are black on exactly their pixels, lowest of {len(values)} sheets: {lowest}"
-        )
-        rows.append(replace(exact, value=values[lowest], how=how))
-        is_timed = duration.value is not None
-        rows.append(duration if is_timed else duration.missing(f"set {STUDY_VARIABLE}=1"))
+        rows += _figures(name, values, seconds.get(name), reasons[name])
     return rows
+
+
+def _figures(
+    name: str, percents: dict[str, float], seconds: float | None, reason: object
+) -> list[Figure]:
+    """Return the figures of a rasteriser: the lowest of the percentages, and the duration."""
+    exact = Figure(f"{name}: dots on their pixels", None, "%", "", 100.0, "higher")
+    how = "once, with the start of the program"
+    duration = Figure(f"{name}: {TIMED_SHEET} rasterised", seconds, "s", how)
+    if reason:
+        return [exact.missing(reason), duration.missing(reason)]
+    lowest = min(percents, key=lambda sheet: percents[sheet])
+    how = f"dots that are black on exactly their pixels, lowest of {len(percents)} sheets: {lowest}"
+    exact = replace(exact, value=percents[lowest], how=how)
+    return [exact, duration if seconds else duration.missing(f"set {STUDY_VARIABLE}=1")]
 
 
 def expected_page(manifest: Manifest, number: int) -> Grey:
