@@ -45,6 +45,9 @@ TIME_KEY = "t"
 POSE_KEYS = ("x", "y", "heading")
 """Keys of the columns of odometry."""
 
+MAX_POSE = 1e9
+"""Largest coordinate [m] and angle [rad] of odometry; beyond, their squares lose all digits."""
+
 MIN_DISTINCT_POSES = 10
 """Fewer distinct poses do not show how often odometry is updated."""
 
@@ -320,6 +323,10 @@ def _odometry(
             file=table.file,
             hint="Record the wheels too: four sensors alone do not determine the path",
         )
+    is_absurd = (np.abs(values[rows]) > MAX_POSE).any(axis=1)
+    if is_absurd.any():
+        problem = f"a pose of odometry beyond {MAX_POSE:g} m or rad"
+        table.fail(int(rows[np.argmax(is_absurd)]), problem, "Check the units of x, y and heading")
     updates = rows[_find_updates(values[rows])]
     x, y, heading = values[updates].T
     odometry = Trajectory(
