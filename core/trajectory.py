@@ -7,6 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+MAX_ODOMETRY = 1e9
+"""Largest coordinate [m] and angle [rad] of odometry. No vehicle reaches it, and a double resolves
+0.1 micrometres there."""
+
 PROVISIONAL_PROBABILITY = 0.999
 """Probability of a pose below which it is provisional: of a thousand poses, one may be wrong."""
 

@@ -163,12 +163,10 @@ def count_phase_conflicts(time_s: Array, zero_s: Array, period_s: float) -> tupl
         tolerance_s = MAX_PAIR_ERROR_S + MAX_PHASE_DRIFT_PPM * 1e-6 * interval_s
         return (error_s < tolerance_s) & (interval_s < PHASE_WINDOW_S)
 
-    differs_before = (zero_s[:, None] - before < PHASE_WINDOW_S) & ~agrees(before, zero_s[:, None])
     differs_after = (after - zero_s[:, None] < PHASE_WINDOW_S) & ~agrees(zero_s[:, None], after)
     is_conflict = np.zeros(len(zero_s), bool)
     for k in range(NEIGHBOURS):
-        agree = agrees(before[:, k, None], after) & differs_after & differs_before[:, k, None]
-        is_conflict |= np.any(agree, axis=1)
+        is_conflict |= np.any(agrees(before[:, k, None], after) & differs_after, axis=1)
     return int(size[is_conflict].sum()), paired
 
 

@@ -183,6 +183,11 @@ def nearest_key_hint(key: str, known: Iterable[str]) -> str:
     return f"Did you mean {near[0]}?" if near else f"Known keys: {', '.join(names)}"
 
 
+MAX_MAGNITUDE = 1e12
+"""Largest number in an artifact, in the unit of its key: a million kilometres in millimetres. The
+squares of much larger ones overflow."""
+
+
 @dataclass(frozen=True)
 class Number:
     """Finite number within a range, which may exclude its ends; nan only if it is allowed."""
@@ -223,6 +228,10 @@ class Number:
             return number
         if not math.isfinite(number):
             raise InvalidValueError(f"expected a finite number{self._range}{symbol}", "", self.hint)
+        if abs(number) > MAX_MAGNITUDE:
+            raise InvalidValueError(
+                f"expected a number of at most {MAX_MAGNITUDE:g} in magnitude{symbol}"
+            )
         is_above = number > self.low if self.is_low_excluded else number >= self.low
         is_below = number < self.high if self.is_high_excluded else number <= self.high
         if not (is_above and is_below):

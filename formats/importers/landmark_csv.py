@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import FormatError, InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.halls import HallSamples, HallSensors
-from locatk.core.trajectory import Trajectory
+from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.importers.field_readings import exclude_readings, find_absent_readings
 from locatk.formats.tables.delimited import Table, read_table
 from locatk.formats.tables.quantities import (
@@ -320,6 +320,10 @@ def _odometry(
             file=table.file,
             hint="Record the wheels too: four sensors alone do not determine the path",
         )
+    is_absurd = (np.abs(values[rows]) > MAX_ODOMETRY).any(axis=1)
+    if is_absurd.any():
+        problem = f"a pose of odometry beyond {MAX_ODOMETRY:g} m or rad"
+        table.fail(int(rows[np.argmax(is_absurd)]), problem, "Check the units of x, y and heading")
     updates = rows[_find_updates(values[rows])]
     x, y, heading = values[updates].T
     odometry = Trajectory(

@@ -39,6 +39,9 @@ POSITION_COLUMNS, QUATERNION_COLUMNS, SIGMA_COLUMNS = COLUMNS[2:5], COLUMNS[5:9]
 
 PROBABILITY_COLUMN = COLUMNS[13]
 
+MAX_SIGMA = 1e100
+"""Largest standard deviation [m or rad]; squares of larger ones overflow."""
+
 MAX_NORM_ERROR = 1e-2
 """Largest deviation of a quaternion from unit length that passes for rounding by its writer."""
 
@@ -83,7 +86,10 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     sigma = np.full((n, 4), np.nan)
     if any(name in table.columns for name in SIGMA_COLUMNS):
         table.require(*SIGMA_COLUMNS)
-        columns = [table.floats(name, low=0.0, allow_missing=True) for name in SIGMA_COLUMNS]
+        columns = [
+            table.floats(name, low=0.0, high=MAX_SIGMA, allow_missing=True)
+            for name in SIGMA_COLUMNS
+        ]
         sigma = np.stack(columns, axis=1)
     probability = np.full(n, np.nan)
     if PROBABILITY_COLUMN in table.columns:

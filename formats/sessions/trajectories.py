@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
-from locatk.core.trajectory import Trajectory
+from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.sessions import foxglove
 from locatk.formats.sessions.messages import (
     MAX_BATCH_SAMPLES,
@@ -138,6 +138,13 @@ def read_odometry(session: Session) -> list[Trajectory]:
         batches = read_batches(session, [topic], ODOMETRY)
         columns = batches.columns
         n = len(columns["time_ns"])
+        for name in ("x_m", "y_m", "heading_rad"):
+            if np.any(np.abs(columns[name]) > MAX_ODOMETRY):
+                raise FormatError(
+                    f"a pose of odometry beyond {MAX_ODOMETRY:g} m or rad",
+                    file=session.path,
+                    where=topic,
+                )
         position = np.column_stack([columns["x_m"], columns["y_m"], np.zeros(n)])
         quaternion = quaternion_from_heading(columns["heading_rad"])
         covariance = np.full((n, 6, 6), np.nan)
