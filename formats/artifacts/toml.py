@@ -21,6 +21,11 @@ from typing import Any
 from locatk.core.errors import ArtifactError
 from locatk.formats.files import MAX_TEXT_BYTES, read_bytes
 
+MAX_KEY_PARTS = 1000
+"""Most parts of a dotted key; the time that ``tomllib`` needs grows with their square."""
+
+_SEPARATORS = re.compile("[,=\n]")
+
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -54,6 +59,12 @@ def loads(text: str | bytes, file: str | os.PathLike[str]) -> dict[str, Any]:
         raise ArtifactError(
             "not UTF-8 text", file=file, where=line, hint="Give a TOML artifact, not a recording"
         ) from None
+    if any(part.count(".") > MAX_KEY_PARTS for part in _SEPARATORS.split(decoded)):
+        raise ArtifactError(
+            f"not valid TOML (a key of more than {MAX_KEY_PARTS} parts)",
+            file=file,
+            hint="Check that it is the right file",
+        )
     try:
         return tomllib.loads(decoded.removeprefix("\ufeff"), parse_float=_parse_decimal)
     except (ValueError, DecimalException, RecursionError) as error:

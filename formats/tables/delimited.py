@@ -53,6 +53,9 @@ PLAIN_CHARACTERS = b"0123456789+-.eE\n"
 MIN_ARROW_BYTES = 2 << 20
 """Smallest block for pyarrow: loadtxt takes as long for it as the import of pyarrow (0.13 s)."""
 
+MAX_COLUMNS = 1000
+"""Most columns of a table."""
+
 MAX_QUOTED_CHARACTERS = 40
 """Longest part of a cell in an error message."""
 
@@ -261,6 +264,13 @@ def read_table(path: Path) -> Table:
     if not rows:
         raise FormatError("empty file", file=path, hint="The recording has no data")
     header = [name.strip().lower() for name in rows[0]]
+    if len(header) > MAX_COLUMNS:
+        raise FormatError(
+            f"{len(header)} columns, more than {MAX_COLUMNS}",
+            file=path,
+            where=lines[0],
+            hint="The file is damaged or of another kind",
+        )
     repeated = {name for name in header if name and header.count(name) > 1}
     if repeated:
         raise FormatError(

@@ -11,9 +11,12 @@ from pathlib import Path
 import pytest
 
 import locatk.formats
-from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
+from locatk.core.errors import ArtifactError, FormatError, InputError, LocatkError, MissingDataError
 from locatk.formats import files
+from locatk.formats.artifacts import toml
 from locatk.formats.files import open_binary, read_bytes, read_head, read_text
+from locatk.formats.importers.dotbot.log import read_dotbot_log
+from locatk.formats.tables.delimited import read_table
 
 
 def test_existing_files_are_read(tmp_path: Path) -> None:
@@ -162,3 +165,24 @@ def test_the_check_of_readers_finds_openings() -> None:
         assert isinstance(call, ast.Call)
         assert _opens_path(call), text
     assert files.MAX_TEXT_BYTES < files.MAX_FILE_BYTES
+
+
+def test_a_key_of_many_parts_is_refused_at_once() -> None:
+    with pytest.raises(ArtifactError, match="a key of more than 1000 parts"):
+        toml.loads("a" + ".a" * 100_000 + " = 1\n", "x.toml")
+    assert toml.loads(f"a = [{'1.5, ' * 2000}]\n", "x.toml")["a"][0] == 1.5
+
+
+def test_tables_of_many_columns_are_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "wide.csv"
+    path.write_text("1," * 1_000_000)
+    with pytest.raises(FormatError, match="1000001 columns, more than 1000"):
+        read_table(path)
+
+
+def test_large_logs_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "large.log"
+    with open(path, "wb") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(FormatError, match="larger than 8 GiB"):
+        read_dotbot_log([path])

@@ -43,7 +43,7 @@ from locatk.core.errors import FormatError, MissingDataError
 from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
-from locatk.formats.files import open_binary
+from locatk.formats.files import check_regular, open_binary
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.tables.timestamps import parse_iso_time
 
@@ -62,6 +62,9 @@ MAX_WINDOWS_PER_RECORD = 16
 
 ROWS_PER_BLOCK = 1 << 16
 """Sweeps after which the list of tuples is packed into an array, to save memory."""
+
+MAX_FILE_BYTES = 8 << 30
+"""Largest log [bytes], of some weeks of a robot; it is read line by line."""
 
 MAX_NAMED_FAULTS = 5
 """Damaged records that get a warning each."""
@@ -225,6 +228,10 @@ def _read(path: Path, log: _Log) -> None:
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     """Yield lines with their numbers and ends; lines longer than any record are empty."""
+    if check_regular(path) > MAX_FILE_BYTES:
+        raise FormatError(
+            f"larger than {MAX_FILE_BYTES >> 30} GiB", file=path, hint="Split the log, or check it"
+        )
     with open_binary(path) as stream:
         number = 0
         while line := stream.readline(MAX_LINE_BYTES):
