@@ -85,7 +85,7 @@ def command(
     \b
     Examples:
       locatk calibrate sheet run.mcap -o floor-built.toml
-      locatk calibrate sheet day/*.mcap --artifact floor.toml --camera camera.toml -o built.toml
+      locatk calibrate sheet day/*.mcap --artifact floor.toml -o floor-built.toml
       locatk calibrate sheet run.mcap --truth mocap.tum -o floor-built.toml --json
       locatk solve later.mcap -o solved.mcap --artifact floor-built.toml
     """
