@@ -26,7 +26,7 @@ from locatk.core.dots.calibration.floor_frame import build_sheets
 from locatk.core.dots.calibration.seam_measurements import SeamMeasurement
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.sheet import Manifest, Sheet
+from locatk.core.dots.sheet import Distortion, Manifest, Sheet
 from locatk.core.errors import DegenerateError, InputError
 
 Array = NDArray[np.float64]
@@ -263,6 +263,17 @@ def test_a_good_print_gets_no_map() -> None:
     assert fit.noise.position_mm == pytest.approx(math.hypot(0.02, 0.03 / math.sqrt(2)), rel=0.2)
 
 
+def test_maps_that_cannot_be_renewed_are_named() -> None:
+    floor = Floor(6, 2, 1)
+    fit = floor.fit(floor.measure(0, 1, 0, 8))
+    mapped = replace(floor.manifest.sheets[0], distortion=Distortion(*(((0.0, 0.0),) * 2,) * 2))
+    problem = replace(fit.problem, layout=lay_out_unknowns(floor.manifest, (0, 1), 0))
+    built = replace(floor.manifest, sheets=(mapped, floor.manifest.sheets[1]))
+    (note,) = calibration.notes_of(replace(problem, manifest=built), fit)
+    assert "they need --truth" in note
+    assert list(calibration.notes_of(problem, fit)) == []
+
+
 @pytest.mark.slow
 def test_truth_connects_sheets_without_a_seam() -> None:
     floor = Floor(8, 2, 1)
@@ -353,6 +364,9 @@ def test_refusals() -> None:
         calibrate_floor([blank_recording()], designed(1, 1))
     with pytest.raises(DegenerateError, match="no frame shows a sheet"):
         calibrate_floor([blank_recording()], designed(2, 1))
+    large = replace(blank_recording(), camera=Camera((320, 240), 348.7, (159.5, 119.5)))
+    with pytest.raises(InputError, match="no frame of blank has the size of the camera"):
+        calibrate_floor([large], designed(2, 1))
     without = replace(blank_recording(), camera=None)
     with pytest.raises(DegenerateError, match="camera of blank cannot be estimated") as error:
         calibrate_floor([without], designed(2, 1))

@@ -183,7 +183,7 @@ def test_many_frames_do_not_average_systematic_errors() -> None:
     result = add_systematic_errors(seams, PITCH_MM)
     information = sum(np.linalg.inv(seam.covariance) for seam in result)
     sigma = np.sqrt(np.diag(np.linalg.inv(information)))
-    assert sigma[:2] == pytest.approx(math.hypot(2e-4 * PITCH_MM, 1e-4 / 20), rel=1e-6)
+    assert sigma[:2] == pytest.approx(math.hypot(1e-4 * PITCH_MM, 1e-4 / 20), rel=1e-6)
     assert sigma[2] == pytest.approx(1e-4 / 20)
 
 
