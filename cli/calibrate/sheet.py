@@ -11,7 +11,7 @@ import click
 from locatk.cli import console, options
 from locatk.cli.calibrate import recordings
 from locatk.cli.command import Command, section
-from locatk.core.errors import InputError
+from locatk.core.errors import InputError, LocatkError
 
 if TYPE_CHECKING:
     from locatk.core.dots.calibration.floor import FloorRecording, FloorReport
@@ -85,7 +85,7 @@ def command(
     \b
     Examples:
       locatk calibrate sheet run.mcap -o floor-built.toml
-      locatk calibrate sheet day/*.mcap --artifact floor.toml --camera camera.toml -o built.toml
+      locatk calibrate sheet day/*.mcap --artifact floor.toml -o floor-built.toml
       locatk calibrate sheet run.mcap --truth mocap.tum -o floor-built.toml --json
       locatk solve later.mcap -o solved.mcap --artifact floor-built.toml
     """
@@ -105,7 +105,12 @@ def command(
         raise InputError("no session can be used", hint="The messages above name the reasons")
     # Each frame is localized, and examined for seams.
     with console.steps(2 * sum(len(each.frames) for each in found), "Calibrating") as advance:
-        report = calibrate_floor(found, manifest, advance)
+        try:
+            report = calibrate_floor(found, manifest, advance)
+        except LocatkError as error:
+            # Solvers work on arrays and do not know the file.
+            error.file = error.file or str(sessions[0])
+            raise
     sheets.write_manifest(output, report.manifest, overwrite=overwrite)
     recordings.print_result(_text(output, report), report.notes, left_out)
     if as_json:

@@ -48,7 +48,7 @@ from locatk.core.dots.localization.frames import (
     localize_frames,
     unlocalized_frames,
 )
-from locatk.core.dots.localization.recordings import batches, find_sheets
+from locatk.core.dots.localization.recordings import OTHER_SIZE, batches, find_sheets
 from locatk.core.dots.localization.seams import may_show_seam, separate_sheets
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import DegenerateError, InputError
@@ -195,7 +195,8 @@ def calibrate_floor(
         The frames do not connect all sheets that they show, or not all tiles, or the camera of a
         recording cannot be estimated from them.
     InputError
-        The manifest has a single sheet and there is no truth, or its codec is unknown.
+        The manifest has a single sheet and there is no truth, its codec is unknown, or a camera
+        has frames of another size.
     """
     has_truth = any(recording.truth is not None for recording in recordings)
     if len(manifest.sheets) < 2 and not has_truth:
@@ -266,6 +267,11 @@ def _examine(
     """Localize the frames of a recording on the grid, and estimate its camera if it has none."""
     frames, camera = recording.frames, recording.camera
     localized, numbers = _localize(frames, manifest, code, camera, advance)
+    if len(frames) and (localized.rejected == OTHER_SIZE).all():
+        raise InputError(
+            f"no frame of {recording.name} has the size of the camera",
+            hint="Calibrate the camera at the resolution of the recording",
+        )
     near_seam = may_show_seam(localized, numbers, manifest)
     if camera is None:
         inner = np.flatnonzero(localized.accepted & (numbers >= 0) & ~near_seam)
@@ -637,17 +643,19 @@ def _report(
         cameras={
             each.recording.name: each.camera for each in examined if each.recording.camera is None
         },
-        notes=tuple(_notes(given, fit)),
+        notes=tuple(notes_of(given, fit)),
     )
 
 
-def _notes(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
+def notes_of(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
     """Report what the calibration could not estimate."""
     if not given.layout.nodes:
         yield (
             "the floor has too many sheets for a model of the errors of their print: the standard "
             "deviations are those of a print without errors"
         )
+    if not given.truths and any(sheet.distortion for sheet in given.manifest.sheets):
+        yield "the maps of the print in the given manifest are left out: they need --truth"
     if fit.problem.truths and not fit.problem.truths[0].has_heading:
         yield (
             "the truth has no orientation: it is assumed to be the position of the camera's centre"

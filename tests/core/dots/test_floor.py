@@ -15,6 +15,8 @@ from locatk.core.dots.calibration import floor as calibration
 from locatk.core.dots.calibration.floor import FloorRecording, built_manifest, calibrate_floor
 from locatk.core.dots.calibration.floor_fit import (
     FloorFit,
+    FloorProblem,
+    Noise,
     TruthObservations,
     cross_validate,
     fit_floor,
@@ -24,7 +26,7 @@ from locatk.core.dots.calibration.floor_frame import build_sheets
 from locatk.core.dots.calibration.seam_measurements import SeamMeasurement
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.sheet import Manifest, Sheet
+from locatk.core.dots.sheet import Distortion, Manifest, Sheet
 from locatk.core.errors import DegenerateError, InputError
 
 Array = NDArray[np.float64]
@@ -261,6 +263,17 @@ def test_a_good_print_gets_no_map() -> None:
     assert fit.noise.position_mm == pytest.approx(math.hypot(0.02, 0.03 / math.sqrt(2)), rel=0.2)
 
 
+def test_maps_that_cannot_be_renewed_are_named() -> None:
+    floor = Floor(6, 2, 1)
+    fit = floor.fit(floor.measure(0, 1, 0, 8))
+    mapped = replace(floor.manifest.sheets[0], distortion=Distortion(*(((0.0, 0.0),) * 2,) * 2))
+    problem = replace(fit.problem, layout=lay_out_unknowns(floor.manifest, (0, 1), 0))
+    built = replace(floor.manifest, sheets=(mapped, floor.manifest.sheets[1]))
+    (note,) = calibration.notes_of(replace(problem, manifest=built), fit)
+    assert "they need --truth" in note
+    assert list(calibration.notes_of(problem, fit)) == []
+
+
 @pytest.mark.slow
 def test_truth_connects_sheets_without_a_seam() -> None:
     floor = Floor(8, 2, 1)
@@ -292,6 +305,29 @@ def test_the_datum_keeps_its_pose() -> None:
     # Its map has neither a shift nor a rotation.
     assert datum.distortion is not None
     assert np.abs(datum.distortion.displacement_mm.mean(axis=(0, 1))).max() < 1e-6
+
+
+def test_poses_in_the_frame_of_the_datum_have_the_covariance_of_their_derivatives() -> None:
+    floor = Floor(2, 2, 1)
+    layout = lay_out_unknowns(floor.manifest, (0, 1), 1)
+    problem = FloorProblem(floor.manifest, layout, (), ())
+    rng = np.random.default_rng(0)
+    state = rng.normal(0, 0.05, layout.size)
+    state[layout.pose(1)] = [151.0, -0.5, 0.3]
+    root = rng.normal(0, 1e-4, (layout.size, 8))
+
+    def pose(at: Array) -> Array:
+        fit = FloorFit(problem, at, root @ root.T, Noise(), 0.0)
+        return build_sheets(fit)[1].pose
+
+    steps = 1e-4 * root / np.abs(root).max()
+    moved = np.array([pose(state + step) - pose(state - step) for step in steps.T]) / 2
+    moved *= np.abs(root).max() / 1e-4
+    covariance = build_sheets(FloorFit(problem, state, root @ root.T, Noise(), 0.0))[1].covariance
+    # Without products of the heading and the shift by the field, which are 1e-2 of the latter.
+    sigma = np.sqrt(np.diag(covariance))
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(covariance / scale, moved.T @ moved / scale, atol=1e-2)
 
 
 def test_parts_of_a_floor_are_named() -> None:
@@ -328,6 +364,9 @@ def test_refusals() -> None:
         calibrate_floor([blank_recording()], designed(1, 1))
     with pytest.raises(DegenerateError, match="no frame shows a sheet"):
         calibrate_floor([blank_recording()], designed(2, 1))
+    large = replace(blank_recording(), camera=Camera((320, 240), 348.7, (159.5, 119.5)))
+    with pytest.raises(InputError, match="no frame of blank has the size of the camera"):
+        calibrate_floor([large], designed(2, 1))
     without = replace(blank_recording(), camera=None)
     with pytest.raises(DegenerateError, match="camera of blank cannot be estimated") as error:
         calibrate_floor([without], designed(2, 1))
@@ -341,25 +380,27 @@ def test_from_frames_to_a_manifest(
 ) -> None:
     """Two small sheets glued with a turn, seen by a camera that shares nothing with the solver."""
     size, page, first = (90, 80), (47.0, 42.0), (0.5, 0.6)
-    ids = ("A6-0001", "A6-0002")
-    origins = ((1000, 2000), (1100, 2000))
-    positions = ((0.0, 0.0), (46.0, 0.5)) if has_positions else (None, None)
+    ids, shared = ("A6-0001", "A6-0002"), 10 if has_positions else -10
+    origins = ((1000, 2000), (1000 + size[0] - shared, 2000))
+    step = (size[0] - shared) * PITCH_MM if has_positions else 46.0
+    positions = ((0.0, 0.0), (step, 0.0)) if has_positions else (None, None)
     manifest = Manifest(
         tuple(
             Sheet(name, origin, size, (0, 0), page, first, position)
             for name, origin, position in zip(ids, origins, positions, strict=True)
         )
     )
+    # The second one covers the end of the first one.
     floor = (
         laid_sheet(origins[0], size, page, first),
-        laid_sheet(origins[1], size, page, first, 46.7, -0.4, 1.0),
+        laid_sheet(origins[1], size, page, first, step + 0.7, -0.4, 1.0),
     )
     rng = np.random.default_rng(4)
     large = {"size": (320, 240), "centre": (159.5, 119.5)}
     images = [
         shoot_floor(
             floor,
-            46.4 + rng.uniform(-1.5, 1.5),
+            step + 0.4 + rng.uniform(-1.5, 1.5),
             rng.uniform(6, 36),
             heading=rng.uniform(-3, 3),
             seed=k,
@@ -372,10 +413,13 @@ def test_from_frames_to_a_manifest(
     report = calibrate_floor([FloorRecording("run", frames, camera)], manifest)
     assert report.datum == "A6-0001"
     second = report.manifest.sheets[1]
-    np.testing.assert_allclose(second.position_mm, (46.7, -0.4), atol=2e-3)
+    np.testing.assert_allclose(second.position_mm, (step + 0.7, -0.4), atol=2e-3)
     assert second.heading_deg == pytest.approx(1.0, abs=2e-3)
     assert second.covariance_mm_deg is not None
     sigma = np.sqrt(np.diag(second.covariance_mm_deg))
-    error = np.array([*second.position_mm, second.heading_deg]) - [46.7, -0.4, 1.0]  # type: ignore[misc]
+    error = np.array([*second.position_mm, second.heading_deg]) - [step + 0.7, -0.4, 1.0]  # type: ignore[misc]
     assert np.abs(error / sigma).max() < 5
     assert report.manifest.frame(1) == "floor"
+    first_end = report.manifest.sheets[0].origin[0] + report.manifest.sheets[0].size[0]
+    assert second.origin == origins[1]
+    assert first_end == (1080 if has_positions else 1090)

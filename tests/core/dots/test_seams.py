@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.calibration.seam_measurements import (
     SeamMeasurement,
+    add_systematic_errors,
     crop_overlaps,
     measure_seam,
     without_ambiguous_dots,
@@ -160,6 +162,29 @@ def test_a_sheet_without_position_is_decoded_alone(
         seam = measure_seam(views, unplaced, camera)
         assert seam is not None
         assert np.hypot(*error_of(seam, sheets)[:2]) < 2e-3
+
+
+@pytest.mark.slow
+def test_almost_aligned_tiles_do_not_pull_each_other(
+    lay: Callable[..., Any], cross: Callable[..., Any]
+) -> None:
+    """A dot in the overlap agrees with both tiles, 0.06 pitches apart, but is printed on one."""
+    sheets = lay(0.02, 0.03, 0.0)
+    camera = Camera((320, 240), 348.7, (159.5, 119.5))
+    for image, _, _ in cross(sheets, 3, 5, 0.5, size=(320, 240), centre=(159.5, 119.5)):
+        seam = measure_seam(separate_sheets(image, TILES, ANOTO, camera), TILES, camera)
+        assert seam is not None
+        assert np.hypot(*error_of(seam, sheets)[:2]) < 2e-3
+
+
+def test_many_frames_do_not_average_systematic_errors() -> None:
+    seams = [measured(0, range(1340, 1341))] * 400
+    seams = [replace(seam, covariance=np.eye(3) * 1e-8) for seam in seams]
+    result = add_systematic_errors(seams, PITCH_MM)
+    information = sum(np.linalg.inv(seam.covariance) for seam in result)
+    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
+    assert sigma[:2] == pytest.approx(math.hypot(1e-4 * PITCH_MM, 1e-4 / 20), rel=1e-6)
+    assert sigma[2] == pytest.approx(1e-4 / 20)
 
 
 def test_dots_of_both_sheets_are_of_neither() -> None:
