@@ -190,16 +190,15 @@ def _no_constant(name: str) -> None:
 
 def build_corpus(folder: Path) -> None:
     """Write a small valid file of each kind."""
-    session = "--frames 8", "--duration 4 --robots 2", "--id 5 --seed 1"
     (folder / "eight-sim.toml").write_text(
         'format = "locatk-simulation-polaris"\nformat_version = 1\n[sensors]\ncount = 8\n'
     )
     made = (
         "tag design -o tag.toml",
         "map design 8x8 -o map.toml",
-        f"simulate lighthouse -o lighthouse.mcap {session[1]}",
-        f"simulate dots -o dots.mcap {session[0]}",
-        f"simulate polaris tag.toml -o polaris.mcap {session[2]}",
+        "simulate lighthouse -o lighthouse.mcap --duration 4 --robots 2",
+        "simulate dots -o dots.mcap --frames 8",
+        "simulate polaris tag.toml -o polaris.mcap --id 5 --seed 1",
         "simulate polaris tag.toml -o eight.mcap --config eight-sim.toml",
         "simulate landmarks map.toml -o landmarks.mcap --landmarks 4",
         *(f"solve {name}.mcap -o {name}-solved.mcap" for name in SYSTEMS),
