@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +126,7 @@ def landmarks(
     options.guard_output(output, overwrite=overwrite, inputs=[map_file])
     if bom is not None:
         options.guard_output(bom, overwrite=overwrite, inputs=[map_file])
-        if bom.resolve() == output.resolve():
+        if os.path.realpath(bom) == os.path.realpath(output):
             raise OutputExistsError("drawing and materials would be one file", file=bom)
     floor = read_map(map_file)
     items = bill_of_materials(floor, spares_percent)

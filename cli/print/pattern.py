@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -257,7 +258,7 @@ def pattern(
     ledger_file = ledger or output.parent / LEDGER_FILE
     inputs = [overlay] if overlay else []
     manifest_file = output.with_suffix(".toml")
-    if len({path.resolve() for path in (output, manifest_file, ledger_file)}) < 3:
+    if len({os.path.realpath(path) for path in (output, manifest_file, ledger_file)}) < 3:
         raise OutputExistsError(
             "sheets, manifest and ledger would be one file", file=manifest_file, hint="Rename one"
         )

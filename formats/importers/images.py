@@ -8,6 +8,7 @@ folder. They contain no times, which therefore follow from a rate: the first fra
 from __future__ import annotations
 
 import glob
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -142,10 +143,10 @@ def find_images(paths: Sequence[Path]) -> list[Path]:
     FormatError
         A folder or pattern has no image.
     """
-    by_path: dict[Path, Path] = {}
+    by_path: dict[str, Path] = {}
     for path in paths:
         for file in _expand(path):
-            by_path.setdefault(file.resolve(), file)
+            by_path.setdefault(os.path.realpath(file), file)
     return sorted(by_path.values(), key=natural_path_key)
 
 

@@ -19,6 +19,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from locatk.core.errors import FormatError, LocatkError, OutputExistsError
+from locatk.core.printable import escape_controls
 from locatk.formats.output import atomic_write, check_output, tool_version
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.mcap_file import (
@@ -463,7 +464,7 @@ def _metadata_record(recovered: Recovered) -> dict[str, str]:
     if len(recovered.losses) > MAX_LISTED_RANGES:
         ranges.append("...")
     values = {
-        "source": Path(recovered.source).name,
+        "source": escape_controls(Path(recovered.source).name),
         "complete": str(recovered.complete).lower(),
         "ended": str(recovered.ended).lower(),
         "messages": recovered.messages,

@@ -683,3 +683,10 @@ def test_unconfirmed_names_are_reported(good: Whole, tmp_path: Path) -> None:
     assert damage is not None
     assert "only it contains the names of" in damage
     assert "/rerial/bar" in Session.open(output).metadata()["recovered"]["unconfirmed"]
+
+
+def test_a_name_that_is_not_utf8(good: Whole, tmp_path: Path) -> None:
+    path, output = tmp_path / os.fsdecode(b"bad\xff.mcap"), tmp_path / "out.mcap"
+    path.write_bytes(good.data)
+    recover(path, output)
+    assert Session.open(output).metadata()["recovered"]["source"] == r"bad\xff.mcap"
