@@ -192,7 +192,7 @@ def _track_of(device: str, tracks: list[Trajectory], path: Path) -> Trajectory:
 
 def _text(output: Path, report: FloorReport) -> str:
     """Format a table of the sheets, and how well the observations agree."""
-    header = ("sheet", "x [mm]", "y", "heading [deg]", "dx", "dy", "turn", "sigma", "", "frames")
+    header = ("sheet", "x [mm]", "y", "[deg]", "dx", "dy", "turn", "sigma", "[deg]", "frames")
     rows = [_row(sheet, report.datum) for sheet in report.sheets[:MAX_SHEETS]]
     lines = [
         f"{len(report.sheets)} sheets from {report.seam_frames} frames with a seam, of "
@@ -230,14 +230,14 @@ def _row(sheet: BuiltSheet, datum: str) -> tuple[Any, ...]:
     if sheet.id != datum:
         sigma_x, sigma_y, sigma_heading = sheet.sigma.tolist()
         position = math.hypot(sigma_x, sigma_y)
-        sigma = (f"{position:.4f} mm", f"{math.degrees(sigma_heading):.5f} deg")
+        sigma = (f"{position:.4f}", f"{math.degrees(sigma_heading):.5f}")
     return (
         sheet.id,
-        f"{x:.3f}",
-        f"{y:.3f}",
-        f"{math.degrees(heading):.4f}",
-        *("-" if math.isnan(value) else f"{value:+.3f}" for value in (dx, dy)),
-        "-" if math.isnan(turn) else f"{math.degrees(turn):+.4f}",
+        f"{x:.2f}",
+        f"{y:.2f}",
+        f"{math.degrees(heading):.3f}",
+        *("-" if math.isnan(value) else f"{value:+.2f}" for value in (dx, dy)),
+        "-" if math.isnan(turn) else f"{math.degrees(turn):+.3f}",
         *sigma,
         sheet.seam_frames + sheet.truth_frames,
     )

@@ -125,7 +125,7 @@ def localize_windows_numpy(
     return GridPoses(
         grid=np.einsum("nij,nj->ni", rotation, centre) + corner + dots.origin,
         heading=np.arctan2(-right[:, 1], right[:, 0]),
-        covariance=pose_covariance(covariance, slope, rotation),
+        covariance=_pose_covariance(covariance, slope, rotation),
     )
 
 
@@ -158,7 +158,7 @@ def assign_dots(
     return DotAssignments(used, residual, index + printed_offset, np.stack([x, y], axis=1))
 
 
-def pose_covariance(covariance: Array, slope: Array, rotation: NDArray[np.int64]) -> Array:
+def _pose_covariance(covariance: Array, slope: Array, rotation: NDArray[np.int64]) -> Array:
     """Return the covariance (n, 3, 3) of x, y and heading from that of lattice parameters."""
     n = len(covariance)
     jacobian = np.zeros((n, 3, 9))

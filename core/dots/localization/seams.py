@@ -23,17 +23,7 @@ from scipy.spatial import cKDTree
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import DOT_DIRECTIONS, Codec
 from locatk.core.dots.detection.blobs import detect_dots
-from locatk.core.dots.detection.lattice import (
-    C_U,
-    C_V,
-    LENS,
-    MIN_SIGMA_PITCHES,
-    PERSPECTIVE,
-    DotLattices,
-    nearest_symbol_offset,
-    refit_lattices,
-    slope_at_centre,
-)
+from locatk.core.dots.detection.lattice import MIN_SIGMA_PITCHES, nearest_symbol_offset
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.identification.decoding import MIN_CONFIDENCE
 from locatk.core.dots.localization.frames import (
@@ -45,8 +35,8 @@ from locatk.core.dots.localization.frames import (
     localize_frames,
     unlocalized_frames,
 )
-from locatk.core.dots.localization.pose import pose_covariance
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest, Sheet
+from locatk.core.least_squares import DenseEquations, Indices, minimize
 from locatk.core.robust import robust_sigma
 
 Array = NDArray[np.float64]
@@ -95,6 +85,13 @@ DETECTED_PITCH_PX = 11.0
 DOT_GATE_SIGMAS = 4.0
 """Distance from its fit, per axis and in robust standard deviations, from which a dot is not used
 for a pose. A dot of another sheet is within the gate of a symbol in 4 % of the cases."""
+
+LENS_PRIOR_SIGMA = 0.15
+"""Prior standard deviation of the distortion of an unknown lens at the corner of the frame, as for
+lattices (:mod:`~locatk.core.dots.detection.lattice`)."""
+
+KNOWN_LENS_SIGMA = 1e-9
+"""The same of a known lens, whose distortion has been removed."""
 
 REFITS = 4
 """Number of fits of a pose, each with the dots within the gate of the previous one."""
@@ -199,41 +196,115 @@ def localize_view(
     points = points / half_diagonal
     start = np.rint(view.grid.mean(axis=0))
     grid = view.grid - start
-    homography, _ = cv2.findHomography(points, grid, cv2.RANSAC, CONSENSUS_GATE_PITCHES)
-    parameters = np.append(homography.ravel()[:8] / homography[2, 2], 0.0)[None]
-    used = np.ones(len(grid), np.bool_)
-    for _ in range(REFITS):
-        q = points / (1 + parameters[0, LENS] * (points**2).sum(axis=1, keepdims=True))
-        depth = 1 + q @ parameters[0, PERSPECTIVE]
-        uv = np.column_stack([q, np.ones(len(q))]) @ parameters[0, :6].reshape(2, 3).T
-        uv /= depth[:, None]
-        residual = uv - grid
-        gate = DOT_GATE_SIGMAS * max(robust_sigma(residual), MIN_SIGMA_PITCHES)
-        used = (np.abs(residual) < gate).all(axis=1)
-        lattice = DotLattices(
-            parameters,
-            points.astype(np.float32)[None],
-            used[None],
-            uv.astype(np.float32)[None],
-            np.rint(uv).astype(np.float32)[None],
-            np.zeros(1),
-            np.ones(1, np.bool_),
-            camera is None,
-        )
-        parameters, covariance = refit_lattices(
-            lattice, residual.astype(np.float32)[None], used[None]
-        )
-    slope = slope_at_centre(parameters)
-    right = slope[0, :, 0]
+    parameters, covariance, dots = _fit_view(points, grid, has_lens=camera is None)
+    # Central differences; the pose is smooth on the scale of its errors.
+    steps = np.sqrt(np.diag(covariance)) + np.finfo(float).tiny
+    jacobian = np.stack(
+        [
+            (_pose_of(parameters + row) - _pose_of(parameters - row)) / (2 * step)
+            for row, step in zip(np.diag(steps), steps, strict=True)
+        ],
+        axis=1,
+    )
+    pose = _pose_of(parameters)
     result = unlocalized_frames(1, "")
-    result.grid[0] = start + parameters[0, [C_U, C_V]]
+    result.grid[0] = start + pose[:2]
     result.section[0] = manifest.sheets[view.number].section
-    result.heading[0] = math.atan2(-right[1], right[0])
-    result.covariance[0] = pose_covariance(covariance, slope, np.eye(2, dtype=np.int64)[None])[0]
-    result.dots[0] = used.sum()
+    result.heading[0] = pose[2]
+    result.covariance[0] = jacobian @ covariance @ jacobian.T
+    result.dots[0] = dots
     # The frame was decoded with this confidence or more.
     result.confidence[0] = MIN_CONFIDENCE
     return result
+
+
+def _pose_of(parameters: Array) -> Array:
+    """Return x, y and heading on the grid at the centre of the camera, by a homography to it."""
+    rows = np.append(parameters[:8], 1.0).reshape(3, 3)
+    x, y, scale = np.linalg.solve(rows, [0.0, 0.0, 1.0])
+    x, y = x / scale, y / scale
+    depth = rows[2] @ [x, y, 1.0]
+    right = np.linalg.solve(rows[:2, :2] / depth, [1.0, 0.0])
+    return np.array([x, y, math.atan2(-right[1], right[0])])
+
+
+def _fit_view(points: Array, grid: Array, *, has_lens: bool) -> tuple[Array, Array, int]:
+    """Fit the homography from the grid to the frame, and the distortion of an unknown lens.
+
+    Returns
+    -------
+    parameters : (9,) ndarray
+        Homography by rows, without the last element, which is 1; k of the division model.
+    covariance : (9, 9) ndarray
+    dots : int
+        Number of dots within the gate.
+    """
+    homography, _ = cv2.findHomography(points, grid, cv2.RANSAC, CONSENSUS_GATE_PITCHES)
+    inverse = np.linalg.inv(homography)
+    state = np.append(inverse.ravel()[:8] / inverse[2, 2], 0.0)
+    used = np.ones(len(grid), np.bool_)
+    pitch = math.sqrt(abs(float(np.linalg.det(state[[0, 1, 3, 4]].reshape(2, 2)))))
+    least = MIN_SIGMA_PITCHES * pitch
+    sigma = least
+    for _ in range(REFITS):
+        problem = _ViewProblem(points[used], grid[used], sigma, has_lens)
+        minimum = minimize(problem, state, damping=1e-6, min_gain=1e-9)
+        state = minimum.state
+        residual = _ViewProblem(points, grid, 1.0, has_lens).residual(state)
+        sigma = max(robust_sigma(residual), least)
+        used = np.asarray((np.abs(residual) < DOT_GATE_SIGMAS * sigma).all(axis=1))
+    final = _ViewProblem(points[used], grid[used], sigma, has_lens).linearize(
+        state, np.zeros(1, np.int64)
+    )
+    information = final.hessian[0]
+    return state, np.linalg.inv(information), int(used.sum())
+
+
+@dataclass(frozen=True)
+class _ViewProblem:
+    """Fit of a view as a problem for :func:`~locatk.core.least_squares.minimize`.
+
+    The distortion is zero up to its prior if the lens is known.
+    """
+
+    points: Array
+    grid: Array
+    sigma: float
+    has_lens: bool
+
+    def residual(self, state: Array) -> Array:
+        """Return predicted minus observed positions (n, 2) without distortion."""
+        rows = np.append(state[:8], 1.0).reshape(3, 3)
+        projected = np.column_stack([self.grid, np.ones(len(self.grid))]) @ rows.T
+        squared = (self.points**2).sum(axis=1, keepdims=True)
+        return np.asarray(
+            projected[:, :2] / projected[:, 2:] - self.points / (1 + state[8] * squared)
+        )
+
+    def linearize(self, state: Array, problems: Indices) -> DenseEquations:
+        rows = np.append(state[:8], 1.0).reshape(3, 3)
+        homogeneous = np.column_stack([self.grid, np.ones(len(self.grid))])
+        projected = homogeneous @ rows.T
+        depth = projected[:, 2:]
+        position = projected[:, :2] / depth
+        jacobian = np.zeros((len(self.grid), 2, 9))
+        jacobian[:, 0, 0:3] = jacobian[:, 1, 3:6] = homogeneous / depth
+        jacobian[:, :, 6:8] = -position[:, :, None] * (self.grid / depth)[:, None]
+        squared = (self.points**2).sum(axis=1, keepdims=True)
+        jacobian[:, :, 8] = self.points * squared / (1 + state[8] * squared) ** 2
+        residual = self.residual(state).ravel()[None] / self.sigma
+        equations = DenseEquations.from_weighted(
+            residual,
+            residual,
+            jacobian.reshape(1, -1, 9) / self.sigma,
+            0.5 * (residual**2).sum(axis=1),
+        )
+        lens_sigma = LENS_PRIOR_SIGMA if self.has_lens else KNOWN_LENS_SIGMA
+        equations.add_prior(slice(8, 9), state[None, 8:], np.array([lens_sigma]))
+        return equations
+
+    def retract(self, state: Array, step: Array) -> Array:
+        return np.asarray(state + step[0])
 
 
 def may_show_seam(
