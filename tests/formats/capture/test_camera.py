@@ -172,7 +172,7 @@ def test_an_address_without_a_camera() -> None:
 
 def test_files_that_are_no_videos(tmp_path: Path) -> None:
     assert "no such video" in str(refused(str(tmp_path / "none.mp4")))
-    assert "cannot be read" in str(refused(str(tmp_path)))
+    assert "a folder instead of a file" in str(refused(str(tmp_path)))
     noise = np.random.default_rng(0).bytes(4000)
     for content in (b"", b"hello\n" * 100, noise):
         path = tmp_path / "some.mp4"
