@@ -1493,37 +1493,33 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
 
 /* ---- Poses ------------------------------------------------------------------------------ */
 
-/* Refit the lattice to the dots that agree with the decoded pattern, and derive the pose and its
- * covariance from it. Return 0 if the equations are singular. */
-static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *uv,
-                         const float *cells, int m, int half_width, int lens, const double *prior,
-                         const int64_t *window, double offset, double gate, double min_sigma,
-                         const Dots *d, int64_t *phases, double *parameters, double *pose,
-                         double *covariance)
+/* Constants of the robust fit; those of locatk.core.dots.localization.pose. */
+typedef struct {
+    int half_width, lens, steps;
+    const double *prior;
+    double offset, symbol_gate, min_sigma, gate_sigmas, gated_variance, square_radius,
+        square_radius_sigma;
+} PoseOptions;
+
+static const int ROTATIONS[4][2][2] = {
+    {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
+static const int CORNERS[4][2] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
+
+/* Residuals of the projected dots from the symbols at their cells in the decoded window. Squared
+ * residuals of the dots that agree with their symbol are written to `squares`, -1 for others. */
+static void match_pattern(const Codec *codec, const PoseOptions *options, const int64_t *columns,
+                          const int64_t *rows, int quarter, const Dots *d, int m, float *squares)
 {
-    static const int rotations[4][2][2] = {
-        {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
-    static const int corners[4][2] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
-    const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
-    const int(*rotation)[2] = rotations[window[4]], *corner = corners[window[4]],
-          length = 2 * half_width;
-    int64_t *columns = phases, *rows = phases + length;
-    for (int k = 0; k < length; k++) {
-        const int64_t column_position = remainder_of(x + k, codec->range);
-        const int64_t row_position = remainder_of(y + k, codec->range);
-        columns[k] = remainder_of(phase_at(codec, column_position) + section[0] + y, PERIOD);
-        rows[k] = remainder_of(phase_at(codec, row_position) + section[1] + x, PERIOD);
-    }
-    int count = 0;
-    double squares = 0;
+    const int(*rotation)[2] = ROTATIONS[quarter], *corner = CORNERS[quarter];
+    const int half_width = options->half_width, length = 2 * half_width;
+    const float offset = (float)options->offset, gate = (float)options->symbol_gate;
     for (int i = 0; i < m; i++) {
-        d->use[i] = 0;
-        if (!valid[i]) continue;
+        squares[i] = -1;
+        if (d->valid[i] == 0) continue;
+        const float u = rintf(d->u[i]), v = rintf(d->v[i]);
         /* Outside of the window, and for NaN, a conversion to int may be undefined. */
-        if (!(fabsf(cells[2 * i]) <= (float)half_width
-              && fabsf(cells[2 * i + 1]) <= (float)half_width))
-            continue;
-        const int a = (int)cells[2 * i] + half_width, b = (int)cells[2 * i + 1] + half_width;
+        if (!(fabsf(u) <= (float)half_width && fabsf(v) <= (float)half_width)) continue;
+        const int a = (int)u + half_width, b = (int)v + half_width;
         const int column = rotation[0][0] * a + rotation[0][1] * b + corner[0] * (length - 1);
         const int row = rotation[1][0] * a + rotation[1][1] * b + corner[1] * (length - 1);
         if (column < 0 || column >= length || row < 0 || row >= length) continue;
@@ -1531,34 +1527,103 @@ static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *
         const int row_bit = codec->signs[rows[row] + column] > 0;
         /* Up 00, left 10, right 01, down 11 (column bit, row bit). */
         const int dx = row_bit - column_bit, dy = row_bit + column_bit - 1;
-        const float du = uv[2 * i] - cells[2 * i]
-                         - (float)offset * (float)(rotation[0][0] * dx + rotation[1][0] * dy);
-        const float dv = uv[2 * i + 1] - cells[2 * i + 1]
-                         - (float)offset * (float)(rotation[0][1] * dx + rotation[1][1] * dy);
-        if (!(fabsf(du) < (float)gate && fabsf(dv) < (float)gate)) continue;
-        d->use[i] = 1;
+        const float du =
+            d->u[i] - u - offset * (float)(rotation[0][0] * dx + rotation[1][0] * dy);
+        const float dv =
+            d->v[i] - v - offset * (float)(rotation[0][1] * dx + rotation[1][1] * dy);
+        if (!(fabsf(du) < gate && fabsf(dv) < gate)) continue;
         d->residual[0][i] = du;
         d->residual[1][i] = dv;
-        count++;
-        squares += (double)(du * du + dv * dv);
+        squares[i] = du * du + dv * dv;
     }
-    double variance = squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1);
-    if (variance < min_sigma * min_sigma) variance = min_sigma * min_sigma;
-    project(parameters, d);
+}
+
+/* Variance of the dots per axis from the median of their squared residuals (-1: no residual). */
+static double median_variance(const float *squares, int m, float *ordered)
+{
+    int count = 0;
+    for (int i = 0; i < m; i++)
+        if (squares[i] >= 0) ordered[count++] = squares[i];
+    if (!count) return 0;
+    const double median = nth_smallest(ordered, count, (count - 1) / 2);
+    const int degrees = 2 * count - 8 > 1 ? 2 * count - 8 : 1;
+    return median / (2 * log(2.0)) * (2.0 * count / degrees);
+}
+
+/* Refit the lattice robustly to the dots that agree with the decoded pattern, and derive the pose
+ * and its covariance from it. Return 0 if the equations are singular. */
+static int estimate_pose(const Codec *codec, const PoseOptions *options, const int64_t *window,
+                         const Dots *d, int m, int64_t *phases, float *squares, double *parameters,
+                         double *pose, double *covariance)
+{
+    static const double no_prior[PARAMETERS] = {0};
+    const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
+    const int half_width = options->half_width, length = 2 * half_width;
+    int64_t *columns = phases, *rows = phases + length;
+    for (int k = 0; k < length; k++) {
+        const int64_t column_position = remainder_of(x + k, codec->range);
+        const int64_t row_position = remainder_of(y + k, codec->range);
+        columns[k] = remainder_of(phase_at(codec, column_position) + section[0] + y, PERIOD);
+        rows[k] = remainder_of(phase_at(codec, row_position) + section[1] + x, PERIOD);
+    }
+    const double min_variance = options->min_sigma * options->min_sigma;
     double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], right[PARAMETERS];
-    normal_equations(parameters, d, sqrt(variance), lens, prior, normal, right);
+    double variance = min_variance, gate_square = 0;
+    for (int step = 0; step < options->steps; step++) {
+        project(parameters, d);
+        match_pattern(codec, options, columns, rows, (int)window[4], d, m, squares);
+        variance = median_variance(squares, m, squares + m);
+        if (!(variance > min_variance)) variance = min_variance;
+        gate_square = options->gate_sigmas * options->gate_sigmas * variance;
+        for (int i = 0; i < m; i++) d->use[i] = squares[i] >= 0 && squares[i] < gate_square;
+        normal_equations(parameters, d, sqrt(variance), options->lens, options->prior, normal,
+                         right);
+        if (step + 1 < options->steps) {
+            if (!solve_linear(normal, right, 1)) return 0;
+            for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
+        }
+    }
+    int inliers = 0;
+    double sum = 0;
+    /* Outliers count as if at the gate: in directions of their own, and all together. */
+    for (int i = 0; i < m; i++) {
+        if (d->use[i] != 0) {
+            inliers++;
+            sum += squares[i];
+            d->use[i] = 0;
+        } else if (squares[i] >= 0) {
+            const float scale = (float)sqrt(gate_square / squares[i]);
+            d->residual[0][i] *= scale;
+            d->residual[1][i] *= scale;
+            d->use[i] = 1;
+        }
+    }
+    double outliers[PARAMETERS][PARAMETERS], together[PARAMETERS];
+    normal_equations(parameters, d, 0, options->lens, no_prior, outliers, together);
     memcpy(copy, normal, sizeof(normal));
     if (!solve_linear(copy, right, 1)) return 0;
     for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
 
-    const double *t = parameters;
-    const double centre[2] = {t[C_U] + half_width, t[C_V] + half_width};
-    const double u = t[A_U] - t[C_U] * t[PERSPECTIVE], v = t[A_V] - t[C_V] * t[PERSPECTIVE];
-    double right_of[2];
+    const double *t = parameters, *g = t + PERSPECTIVE;
+    const double slope[2][2] = {{t[A_U] - t[C_U] * g[0], t[A_U + 1] - t[C_U] * g[1]},
+                                {t[A_V] - t[C_V] * g[0], t[A_V + 1] - t[C_V] * g[1]}};
+    const double area = slope[0][0] * slope[1][1] - slope[0][1] * slope[1][0];
+    if (!(fabs(area) > 0)) return 0;
+    /* Slope of the logarithm of the inverse depth on the paper. */
+    const double depth_slope[2] = {(g[0] * slope[1][1] - g[1] * slope[1][0]) / area,
+                                   (g[1] * slope[0][0] - g[0] * slope[0][1]) / area};
+    const double centre[2] = {t[C_U] + half_width + options->square_radius * depth_slope[0],
+                              t[C_V] + half_width + options->square_radius * depth_slope[1]};
+    const int(*rotation)[2] = ROTATIONS[window[4]], *corner = CORNERS[window[4]];
+    const double u = slope[0][0], v = slope[1][0];
+    double right_of[2], spread[3] = {0};
     for (int axis = 0; axis < 2; axis++) {
-        pose[axis] = rotation[axis][0] * centre[0] + rotation[axis][1] * centre[1]
-                     + corner[axis] * (length - 1) + (double)(axis ? y : x);
-        right_of[axis] = rotation[axis][0] * u + rotation[axis][1] * v;
+        const int *r = rotation[axis];
+        pose[axis] = r[0] * centre[0] + r[1] * centre[1] + corner[axis] * (length - 1)
+                     + (double)(axis ? y : x);
+        right_of[axis] = r[0] * u + r[1] * v;
+        spread[axis] =
+            options->square_radius_sigma * (r[0] * depth_slope[0] + r[1] * depth_slope[1]);
     }
     pose[2] = atan2(-right_of[1], right_of[0]);
     double jacobian[3][PARAMETERS] = {{0}}, solved[PARAMETERS * 3];
@@ -1571,11 +1636,24 @@ static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *
     for (int k = 0; k < PARAMETERS; k++)
         for (int side = 0; side < 3; side++) solved[3 * k + side] = jacobian[side][k];
     if (!solve_linear(normal, solved, 3)) return 0;
+    const int degrees = 2 * inliers - 8 > 1 ? 2 * inliers - 8 : 1;
+    double inlier_variance = sum / (options->gated_variance * degrees);
+    if (!(inlier_variance > min_variance)) inlier_variance = min_variance;
+    double coherent[3] = {0}, apart[PARAMETERS * 3] = {0};
+    for (int k = 0; k < PARAMETERS; k++)
+        for (int side = 0; side < 3; side++) {
+            coherent[side] += solved[3 * k + side] * together[k];
+            for (int l = 0; l < PARAMETERS; l++)
+                apart[3 * k + side] += 0.5 * gate_square * outliers[k][l] * solved[3 * l + side];
+        }
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) {
-            double sum = 0;
-            for (int k = 0; k < PARAMETERS; k++) sum += jacobian[i][k] * solved[3 * k + j];
-            covariance[3 * i + j] = sum * variance;
+            double known = 0, hidden = coherent[i] * coherent[j];
+            for (int k = 0; k < PARAMETERS; k++) {
+                known += jacobian[i][k] * solved[3 * k + j];
+                hidden += solved[3 * k + i] * apart[3 * k + j];
+            }
+            covariance[3 * i + j] = inlier_variance * known + hidden + spread[i] * spread[j];
         }
     return 1;
 }
@@ -1583,31 +1661,31 @@ static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *
 static PyObject *poses(PyObject *self, PyObject *args)
 {
     (void)self;
-    enum { WINDOW_COLUMNS = 5 };
+    enum { WINDOW_COLUMNS = 5, MAX_REFIT_STEPS = 1000 };
     Call call = {0};
-    PyObject *points_array, *valid_array, *uv_array, *cells_array, *prior_array, *windows_array,
-        *parameters_array, *pose_array, *covariance_array;
+    PyObject *points_array, *valid_array, *prior_array, *windows_array, *parameters_array,
+        *pose_array, *covariance_array;
     CodecArrays arrays;
-    long long n, m, half_width, range, smallest_shift;
-    int lens;
-    double offset, gate, min_sigma;
-    if (!parse_arguments(args, "OOOOLLLpOOOOOOOOOLLdddOOO:poses", &points_array, &valid_array,
-                         &uv_array, &cells_array, &n, &m, &half_width, &lens, &prior_array,
-                         &windows_array, &arrays.lengths, &arrays.weights, &arrays.prefixes,
-                         &arrays.crt, &arrays.signs, &arrays.digits, &arrays.masks, &range,
-                         &smallest_shift, &offset, &gate, &min_sigma, &parameters_array,
-                         &pose_array, &covariance_array))
+    long long n, m, half_width, range, smallest_shift, steps;
+    PoseOptions options = {0};
+    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLddddOOO:poses", &points_array, &valid_array,
+                         &n, &m, &half_width, &options.lens, &prior_array, &windows_array,
+                         &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
+                         &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
+                         &options.offset, &options.symbol_gate, &options.min_sigma, &steps,
+                         &options.gate_sigmas, &options.gated_variance, &options.square_radius,
+                         &options.square_radius_sigma, &parameters_array, &pose_array,
+                         &covariance_array))
         return NULL;
     Codec codec = {0};
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "half_width", half_width, 1, MAX_WINDOW_CELLS / 2);
+    check_range(&call, "steps", steps, 1, MAX_REFIT_STEPS);
     if (call.failed) return NULL;
     const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
     const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
-    const float *uv = input(&call, uv_array, "uv", ITEM_FLOAT32, ITEMS(n, m, 2));
-    const float *cells = input(&call, cells_array, "cells", ITEM_FLOAT32, ITEMS(n, m, 2));
-    const double *prior = input(&call, prior_array, "prior", ITEM_FLOAT64, PARAMETERS);
+    options.prior = input(&call, prior_array, "prior", ITEM_FLOAT64, PARAMETERS);
     const int64_t *windows =
         input(&call, windows_array, "windows", ITEM_INT64, ITEMS(n, WINDOW_COLUMNS));
     check_items(&call, "windows", windows, ITEM_INT64, (Py_ssize_t)n * WINDOW_COLUMNS,
@@ -1620,19 +1698,21 @@ static PyObject *poses(PyObject *self, PyObject *args)
     double *pose = output(&call, pose_array, "pose", ITEM_FLOAT64, ITEMS(n, 3));
     double *covariance = output(&call, covariance_array, "covariance", ITEM_FLOAT64, ITEMS(n, 9));
     if (call.failed) return finish_call(&call, 1);
+    options.half_width = (int)half_width;
+    options.steps = (int)steps;
     Dots d;
     const int has_dots = new_dots(&d, (int)m);
     int64_t *phases = malloc(4 * (size_t)half_width * sizeof(int64_t));
-    const int has_memory = has_dots && phases;
+    float *squares = malloc(2 * ((size_t)m + 1) * sizeof(float));
+    const int has_memory = has_dots && phases && squares;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             load_dots(&d, points + 2 * dot, valid + dot, (int)m);
-            if (!estimate_pose(&codec, valid + dot, uv + 2 * dot, cells + 2 * dot, (int)m,
-                               (int)half_width, lens, prior, windows + k * WINDOW_COLUMNS, offset,
-                               gate, min_sigma, &d, phases, parameters + k * PARAMETERS,
-                               pose + 3 * k, covariance + 9 * k)) {
+            if (!estimate_pose(&codec, &options, windows + k * WINDOW_COLUMNS, &d, (int)m, phases,
+                               squares, parameters + k * PARAMETERS, pose + 3 * k,
+                               covariance + 9 * k)) {
                 for (int i = 0; i < 3; i++) pose[3 * k + i] = NAN;
                 for (int i = 0; i < 9; i++) covariance[9 * k + i] = NAN;
             }
@@ -1641,6 +1721,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     }
     if (has_dots) free(d.x);
     free(phases);
+    free(squares);
     return finish_call(&call, has_memory);
 }
 
@@ -1743,9 +1824,10 @@ static PyMethodDef methods[] = {
      " digits, masks, range, smallest_shift, log_hypotheses, positions, evidence, /)\n--\n\n"
      "Read positions from windows of soft bits; twin of locatk.core.dots.identification.phase_voting.estimate_windows_numpy."},
     {"poses", poses, METH_VARARGS,
-     "poses($module, points, valid, uv, cells, n, m, half_width, lens, prior, windows, lengths,"
-     " weights, prefixes, crt, signs, digits, masks, range, smallest_shift, offset, gate,"
-     " min_sigma, parameters, pose, covariance, /)\n--\n\n"
+     "poses($module, points, valid, n, m, half_width, lens, prior, windows, lengths, weights,"
+     " prefixes, crt, signs, digits, masks, range, smallest_shift, offset, symbol_gate, min_sigma,"
+     " steps, gate_sigmas, gated_variance, square_radius, square_radius_sigma, parameters, pose,"
+     " covariance, /)\n--\n\n"
      "Estimate poses from decoded dots; twin of locatk.core.dots.localization.pose.localize_windows_numpy."},
     {"ddtw", ddtw, METH_VARARGS,
      "ddtw($module, query, slopes, n, length, count, cost, /)\n--\n\n"

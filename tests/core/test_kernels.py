@@ -157,15 +157,13 @@ def read_windows() -> Arguments:
 
 
 def poses() -> Arguments:
-    uv, cells = lattice_coordinates(2)
-    n, m = cells.shape[:2]
+    points = lattice_points(2)
+    n, m = points.shape[:2]
     half_width = 4
     windows = np.array([[10, 20, 3, 4, 0], [-5, 400, 62, 0, 3]])
     return {
-        "points": lattice_points(n),
+        "points": points,
         "valid": np.ones((n, m), bool),
-        "uv": uv,
-        "cells": cells,
         "n": n,
         "m": m,
         "half_width": half_width,
@@ -174,8 +172,13 @@ def poses() -> Arguments:
         "windows": windows,
         **codec(2 * half_width),
         "offset": 1 / 6,
-        "gate": 0.5,
+        "symbol_gate": 0.5,
         "min_sigma": 0.001,
+        "steps": 3,
+        "gate_sigmas": 3.0,
+        "gated_variance": 0.95,
+        "square_radius": 0.0174,
+        "square_radius_sigma": 0.007,
         "parameters": np.tile([10.0, 0, 0, 0, 10.0, 0, 0, 0, 0], (n, 1)),
         "pose": np.zeros((n, 3)),
         "covariance": np.zeros((n, 3, 3)),

@@ -16,7 +16,7 @@ twin, take 380 us and the whole localization of a frame 140 us.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,9 +284,9 @@ def _step(
 
 
 def refit_lattices(
-    lattices: DotLattices, residual: NDArray[np.float32], used: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Fit lattices to the dots in ``used``, whose symbols are known.
+    lattices: DotLattices, residual: NDArray[np.float32], used: NDArray[np.bool_], sigma: Array
+) -> tuple[DotLattices, Array]:
+    """Fit lattices to the dots in ``used``, whose symbols are known, by a Gauss-Newton step.
 
     Parameters
     ----------
@@ -294,20 +294,28 @@ def refit_lattices(
     residual : (n, m, 2) float32 ndarray
         Lattice coordinates of the dots minus those of their symbols.
     used : (n, m) bool ndarray
+    sigma : (n,) float64 ndarray
+        Standard deviation of the dots, for the priors.
 
     Returns
     -------
-    parameters : (n, 9) ndarray
-    covariance : (n, 9, 9) ndarray
-        From the scatter of the dots, at least :data:`MIN_SIGMA_PITCHES`.
+    lattices : DotLattices
+    normal : (n, 9, 9) ndarray
+        Normal matrix per ``sigma``.
     """
     parameters = lattices.parameters.copy()
     uv, z = _project(parameters, lattices.points)
-    count = used.sum(axis=1)
-    squares = ((residual * residual).sum(axis=2) * used).sum(axis=1, dtype=np.float64)
-    variance = np.maximum(squares / np.maximum(2 * count - 8, 1), MIN_SIGMA_PITCHES**2)
-    normal = _step(parameters, z, uv, -residual, used, np.sqrt(variance), lens=lattices.lens)
-    return parameters, np.linalg.inv(normal) * variance[:, None, None]
+    normal = _step(parameters, z, uv, -residual, used, sigma, lens=lattices.lens)
+    uv, _ = _project(parameters, lattices.points)
+    return replace(lattices, parameters=parameters, uv=uv, nodes=np.rint(uv)), normal
+
+
+def sum_normal_equations(
+    lattices: DotLattices, residual: NDArray[np.float32], used: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Return :func:`normal_equations` of the residuals of lattices, without priors."""
+    uv, z = _project(lattices.parameters, lattices.points)
+    return normal_equations(lattices.parameters, z, uv, -residual, used, lens=lattices.lens)
 
 
 def slope_at_centre(parameters: Array) -> Array:

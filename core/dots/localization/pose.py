@@ -7,6 +7,7 @@ from the fit. (Hostettler et al. 2016, II-B.8, use one corner of the decoded win
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,11 +27,13 @@ from locatk.core.dots.detection.lattice import (
     C_U,
     C_V,
     MIN_SIGMA_PITCHES,
+    PERSPECTIVE,
     SYMBOL_GATE_PITCHES,
     DotLattices,
     prior_weights,
     refit_lattices,
     slope_at_centre,
+    sum_normal_equations,
 )
 from locatk.core.dots.identification.decoding import DecodedWindows
 from locatk.core.dots.identification.phase_voting import kernel_tables
@@ -38,6 +41,21 @@ from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 from locatk.core.kernels import kernels
 
 Array = NDArray[np.float64]
+
+REFIT_STEPS = 3
+"""Number of Gauss-Newton steps after decoding, each with its own inliers."""
+
+INLIER_GATE_SIGMAS = 3.0
+"""Radius of the gate of a dot's residual, in standard deviations of an axis; 1.1 % of Gaussian
+residuals are beyond it (chi-square with two degrees of freedom)."""
+
+GATED_VARIANCE_RATIO = 1 - 0.5 * INLIER_GATE_SIGMAS**2 / math.expm1(0.5 * INLIER_GATE_SIGMAS**2)
+"""Variance of Gaussian residuals within the gate, relative to that of all."""
+
+SQUARED_DOT_RADIUS = 0.0174
+SQUARED_DOT_RADIUS_SIGMA = 0.007
+"""Mean and standard deviation of the squared radius of printed dots [squared pitches], if widths
+from 1/6 (nominal) to 0.35 pitches (with dot gain) are equally likely."""
 
 IMAGE_TO_PRINT = np.array(
     [[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]], np.int64
@@ -103,9 +121,11 @@ def localize_windows(
     kernels.poses(
         np.ascontiguousarray(lattices.points),
         np.ascontiguousarray(lattices.valid),
-        *(lattices.uv, lattices.nodes, n, m, half, lattices.lens, prior_weights(True), decoded),
+        *(n, m, half, lattices.lens, prior_weights(True), decoded),
         *kernel_tables(codec),
         *(SECTION_LENGTH, MIN_SHIFT, DOT_OFFSET_PITCHES, SYMBOL_GATE_PITCHES, MIN_SIGMA_PITCHES),
+        *(REFIT_STEPS, INLIER_GATE_SIGMAS, GATED_VARIANCE_RATIO),
+        *(SQUARED_DOT_RADIUS, SQUARED_DOT_RADIUS_SIGMA),
         *(lattices.parameters.copy(), pose, covariance),
     )
     return GridPoses(pose[:, :2], pose[:, 2], covariance)
@@ -115,18 +135,87 @@ def localize_windows_numpy(
     lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
 ) -> GridPoses:
     """Estimate poses as :func:`localize_windows`, without the compiled kernel."""
-    dots = assign_dots(lattices, half, windows, codec)
-    parameters, covariance = refit_lattices(lattices, dots.residual, dots.used)
+    fit = _fit_robustly(lattices, half, windows, codec)
+    parameters = fit.lattices.parameters
     rotation = IMAGE_TO_PRINT[windows.rotation]
     corner = PRINTED_CORNERS[windows.rotation] * (2 * half - 1)
-    centre = parameters[:, [C_U, C_V]] + half
     slope = slope_at_centre(parameters)
+    depth_slope = np.linalg.solve(slope.transpose(0, 2, 1), parameters[:, PERSPECTIVE, None])[
+        ..., 0
+    ]
+    centre = parameters[:, [C_U, C_V]] + half + SQUARED_DOT_RADIUS * depth_slope
     right = np.einsum("nij,nj->ni", rotation, slope[:, :, 0])
+    covariance = _pose_covariance(fit.covariance, slope, rotation)
+    spread = SQUARED_DOT_RADIUS_SIGMA * np.einsum("nij,nj->ni", rotation, depth_slope)
+    covariance[:, :2, :2] += spread[:, :, None] * spread[:, None]
     return GridPoses(
-        grid=np.einsum("nij,nj->ni", rotation, centre) + corner + dots.origin,
+        grid=np.einsum("nij,nj->ni", rotation, centre)
+        + corner
+        + np.stack([windows.x, windows.y], 1),
         heading=np.arctan2(-right[:, 1], right[:, 0]),
-        covariance=_pose_covariance(covariance, slope, rotation),
+        covariance=covariance,
     )
+
+
+def _depth_slope(slope: Array, perspective: Array) -> Array:
+    """Return the slope (n, 2) of the logarithm of the inverse depth on the paper, per pitch."""
+    (uu, uv), (vu, vv) = slope.transpose(1, 2, 0)
+    first, second = perspective.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        area = uu * vv - uv * vu
+        return (
+            np.stack([first * vv - second * vu, second * uu - first * uv], axis=1) / area[:, None]
+        )
+
+
+@dataclass(frozen=True)
+class _RobustFit:
+    """Lattices fitted to decoded dots, and the covariance (n, 9, 9) of their parameters."""
+
+    lattices: DotLattices
+    covariance: Array
+
+
+def _fit_robustly(
+    lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
+) -> _RobustFit:
+    """Fit lattices to the dots of decoded windows within the gate of each frame."""
+    fitted = lattices
+    for _ in range(REFIT_STEPS):
+        current = fitted
+        dots = assign_dots(current, half, windows, codec)
+        squared = (dots.residual * dots.residual).sum(axis=2)
+        variance = np.maximum(_median_variance(squared, dots.used), MIN_SIGMA_PITCHES**2)
+        is_inlier = dots.used & (squared < (INLIER_GATE_SIGMAS**2 * variance)[:, None])
+        fitted, normal = refit_lattices(current, dots.residual, is_inlier, np.sqrt(variance))
+    count = is_inlier.sum(axis=1)
+    squares = (squared * is_inlier).sum(axis=1, dtype=np.float64)
+    inlier_variance = np.maximum(
+        squares / (GATED_VARIANCE_RATIO * np.maximum(2 * count - 8, 1)), MIN_SIGMA_PITCHES**2
+    )
+    inverse = np.linalg.inv(normal)
+    # Outliers count as if at the gate: in directions of their own, and all together.
+    is_outlier = dots.used & ~is_inlier
+    gate = INLIER_GATE_SIGMAS * np.sqrt(variance)
+    clipped = dots.residual * (gate[:, None] / np.sqrt(np.maximum(squared, 1e-12)))[..., None]
+    outlier_normal, outlier_sum = sum_normal_equations(
+        current, clipped.astype(np.float32), is_outlier
+    )
+    hidden = 0.5 * (gate * gate)[:, None, None] * outlier_normal
+    hidden += outlier_sum[:, :, None] * outlier_sum[:, None]
+    covariance = inlier_variance[:, None, None] * inverse + inverse @ hidden @ inverse
+    return _RobustFit(fitted, covariance)
+
+
+def _median_variance(squared: NDArray[np.float32], used: NDArray[np.bool_]) -> Array:
+    """Return the variance (n,) of dots per axis from the median of their squared residuals."""
+    count = used.sum(axis=1)
+    ordered = np.sort(np.where(used, squared, np.float32(np.inf)), axis=1)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[:, None] // 2, axis=1)[:, 0]
+    middle = np.where(count > 0, middle, 0).astype(np.float64)
+    degrees = 2 * count / np.maximum(2 * count - 8, 1)
+    result: Array = middle / (2 * math.log(2)) * degrees
+    return result
 
 
 def assign_dots(
