@@ -67,17 +67,20 @@ def test_displaced_dots_at_one_side_hardly_move_the_pose(decoded: Decoded) -> No
 
 @pytest.mark.usefixtures("implementation")
 def test_outliers_widen_the_covariance_more_if_they_agree(decoded: Decoded) -> None:
-    sigmas = []
-    rng = np.random.default_rng(5)
-    n, m = decoded[0].valid.shape
-    some = rng.random((n, m)) < 0.1
-    angle = rng.uniform(0, 2 * np.pi, (n, m))
-    apart = 0.08 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    for displaced, by in ((some & False, apart), (some, apart), (some, np.array([0.08, 0.0]))):
+    def sigma(displaced: NDArray[np.bool_], by: NDArray[np.float64]) -> float:
         covariance = with_displaced(decoded, displaced, by).covariance[0]
-        sigmas.append(np.sqrt(np.trace(covariance[:2, :2])))
-    assert sigmas[1] > 1.2 * sigmas[0]
-    assert sigmas[2] > 1.5 * sigmas[1]
+        return float(np.sqrt(np.trace(covariance[:2, :2])))
+
+    n, m = decoded[0].valid.shape
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        some = rng.random((n, m)) < 0.12
+        angle = rng.uniform(0, 2 * np.pi, (n, m))
+        apart = 0.08 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        clean = sigma(some & False, apart)
+        # A tenth of the dots at three sigma, in any direction, alone adds half of the variance.
+        assert sigma(some, apart) > 1.4 * clean
+        assert sigma(some, np.array([0.08, 0.0])) > 1.3 * sigma(some, apart)
 
 
 def standardized_errors(
