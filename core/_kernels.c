@@ -1495,10 +1495,10 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
 
 /* Constants of the robust fit; those of locatk.core.dots.localization.pose. */
 typedef struct {
-    int half_width, lens, steps;
+    int half_width, lens, max_steps;
     const double *prior;
-    double offset, symbol_gate, min_sigma, gate_sigmas, gated_variance, square_radius,
-        square_radius_sigma;
+    double offset, symbol_gate, min_sigma, second_lens_sigma, second_lens_odds, gate_sigmas, gated_variance,
+        square_radius, square_radius_sigma;
 } PoseOptions;
 
 static const int ROTATIONS[4][2][2] = {
@@ -1550,37 +1550,121 @@ static double median_variance(const float *squares, int m, float *ordered)
     return median / (2 * log(2.0)) * (2.0 * count / degrees);
 }
 
+/* Second radial coefficient c of an unknown lens, which moves the points p to p (1 + c |p|^4), and
+ * its part of the normal equations. */
+typedef struct {
+    int is_fitted;
+    double value, coupling[PARAMETERS], weight;
+} SecondLens;
+
+/* Derivatives by the second radial coefficient along an axis, negative; write the sums of their
+ * squares and of their products with the residuals. */
+HOT static void second_lens_column(const double *parameters, const Dots *d, int axis,
+                                   float *restrict column, double *squares, double *products)
+{
+    const float a0 = (float)parameters[3 * axis], a1 = (float)parameters[3 * axis + 1];
+    const float g0 = (float)parameters[PERSPECTIVE], g1 = (float)parameters[PERSPECTIVE + 1];
+    const float *restrict value = axis ? d->v : d->u, *restrict residual = d->residual[axis];
+    const float *restrict x = d->x, *restrict y = d->y, *restrict q0 = d->q[0];
+    const float *restrict q1 = d->q[1], *restrict lens_slope = d->lens_slope;
+    const float *restrict depth = d->depth, *restrict use = d->use;
+    float sums[2][LANES] = {{0}};
+    for (int i = 0; i < d->count; i += LANES)
+        for (int l = 0; l < LANES; l++) {
+            const int k = i + l;
+            const float slope = a0 * q0[k] + a1 * q1[k] - value[k] * (g0 * q0[k] + g1 * q1[k]);
+            column[k] = -slope * lens_slope[k] * depth[k] * (x[k] * x[k] + y[k] * y[k]) * use[k];
+            sums[0][l] += column[k] * column[k];
+            sums[1][l] += column[k] * residual[k];
+        }
+    *squares += sum_lanes(sums[0]);
+    *products += sum_lanes(sums[1]);
+}
+
+/* Add the second radial coefficient to solved normal equations of the dots in use: correct the step
+ * `solved`, and change the coefficient. It is fitted if a first change is beyond `threshold`, in
+ * squares of residuals. `columns` are scratch (2 d->count). */
+static int fit_second_lens(const double *parameters, const Dots *d, double normal[][PARAMETERS],
+                           double prior, double threshold, float *columns, double *step,
+                           SecondLens *lens)
+{
+    static const double no_prior[PARAMETERS] = {0};
+    double weight = prior, gain = -prior * lens->value;
+    Dots other = *d;
+    for (int axis = 0; axis < 2; axis++) {
+        other.residual[axis] = columns + axis * d->count;
+        second_lens_column(parameters, d, axis, other.residual[axis], &weight, &gain);
+    }
+    double unused[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], cross[PARAMETERS];
+    normal_equations(parameters, &other, 0, 1, no_prior, unused, cross);
+    memcpy(copy, normal, sizeof(copy));
+    memcpy(lens->coupling, cross, sizeof(cross));
+    if (!solve_linear(copy, lens->coupling, 1)) return 0;
+    for (int k = 0; k < PARAMETERS; k++) {
+        weight -= cross[k] * lens->coupling[k];
+        gain -= cross[k] * step[k];
+    }
+    const double change = gain / weight;
+    lens->is_fitted = lens->is_fitted || gain * change > threshold;
+    if (!lens->is_fitted) return 1;
+    lens->weight = weight;
+    lens->value += change;
+    for (int k = 0; k < PARAMETERS; k++) step[k] -= lens->coupling[k] * change;
+    return 1;
+}
+
 /* Refit the lattice robustly to the dots that agree with the decoded pattern, and derive the pose
  * and its covariance from it. Return 0 if the equations are singular. */
 static int estimate_pose(const Codec *codec, const PoseOptions *options, const int64_t *window,
-                         const Dots *d, int m, int64_t *phases, float *squares, double *parameters,
-                         double *pose, double *covariance)
+                         const float *points, const Dots *d, int m, int64_t *phases, float *scratch,
+                         double *parameters, double *pose, double *covariance)
 {
     static const double no_prior[PARAMETERS] = {0};
     const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
     const int half_width = options->half_width, length = 2 * half_width;
-    int64_t *columns = phases, *rows = phases + length;
+    int64_t *rows = phases + length;
     for (int k = 0; k < length; k++) {
         const int64_t column_position = remainder_of(x + k, codec->range);
         const int64_t row_position = remainder_of(y + k, codec->range);
-        columns[k] = remainder_of(phase_at(codec, column_position) + section[0] + y, PERIOD);
+        phases[k] = remainder_of(phase_at(codec, column_position) + section[0] + y, PERIOD);
         rows[k] = remainder_of(phase_at(codec, row_position) + section[1] + x, PERIOD);
     }
     const double min_variance = options->min_sigma * options->min_sigma;
-    double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], right[PARAMETERS];
+    double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], step[PARAMETERS];
     double variance = min_variance, gate_square = 0;
-    for (int step = 0; step < options->steps; step++) {
+    float *squares = scratch, *ordered = squares + m, *columns = ordered + m;
+    SecondLens lens = {0};
+    memset(d->use, 0, (size_t)d->count * sizeof(float));
+    for (int k = 0; k < options->max_steps; k++) {
         project(parameters, d);
-        match_pattern(codec, options, columns, rows, (int)window[4], d, m, squares);
-        variance = median_variance(squares, m, squares + m);
+        match_pattern(codec, options, phases, rows, (int)window[4], d, m, squares);
+        variance = median_variance(squares, m, ordered);
         if (!(variance > min_variance)) variance = min_variance;
         gate_square = options->gate_sigmas * options->gate_sigmas * variance;
-        for (int i = 0; i < m; i++) d->use[i] = squares[i] >= 0 && squares[i] < gate_square;
+        int is_changed = 0;
+        for (int i = 0; i < m; i++) {
+            const float use = squares[i] >= 0 && squares[i] < gate_square;
+            is_changed |= use != d->use[i];
+            d->use[i] = use;
+        }
         normal_equations(parameters, d, sqrt(variance), options->lens, options->prior, normal,
-                         right);
-        if (step + 1 < options->steps) {
-            if (!solve_linear(normal, right, 1)) return 0;
-            for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
+                         step);
+        memcpy(copy, normal, sizeof(normal));
+        if (!solve_linear(copy, step, 1)) return 0;
+        if (options->lens && (k == 0 || lens.is_fitted)) {
+            const double prior =
+                variance / (options->second_lens_sigma * options->second_lens_sigma);
+            const double threshold = options->second_lens_odds * variance;
+            if (!fit_second_lens(parameters, d, normal, prior, threshold, columns, step, &lens))
+                return 0;
+        }
+        if (!is_changed || k + 1 == options->max_steps) break;
+        for (int j = 0; j < PARAMETERS; j++) parameters[j] += step[j];
+        for (int i = 0; lens.is_fitted && i < m; i++) {
+            const double px = points[2 * i], py = points[2 * i + 1], square = px * px + py * py;
+            const double factor = 1 + lens.value * square * square;
+            d->x[i] = (float)(px * factor);
+            d->y[i] = (float)(py * factor);
         }
     }
     int inliers = 0;
@@ -1600,9 +1684,7 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
     }
     double outliers[PARAMETERS][PARAMETERS], together[PARAMETERS];
     normal_equations(parameters, d, 0, options->lens, no_prior, outliers, together);
-    memcpy(copy, normal, sizeof(normal));
-    if (!solve_linear(copy, right, 1)) return 0;
-    for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
+    for (int k = 0; k < PARAMETERS; k++) parameters[k] += step[k];
 
     const double *t = parameters, *g = t + PERSPECTIVE;
     const double slope[2][2] = {{t[A_U] - t[C_U] * g[0], t[A_U + 1] - t[C_U] * g[1]},
@@ -1636,6 +1718,12 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
     for (int k = 0; k < PARAMETERS; k++)
         for (int side = 0; side < 3; side++) solved[3 * k + side] = jacobian[side][k];
     if (!solve_linear(normal, solved, 3)) return 0;
+    for (int side = 0; lens.is_fitted && side < 3; side++) {
+        double along = 0;
+        for (int k = 0; k < PARAMETERS; k++) along += jacobian[side][k] * lens.coupling[k];
+        for (int k = 0; k < PARAMETERS; k++)
+            solved[3 * k + side] += lens.coupling[k] * along / lens.weight;
+    }
     const int degrees = 2 * inliers - 8 > 1 ? 2 * inliers - 8 : 1;
     double inlier_variance = sum / (options->gated_variance * degrees);
     if (!(inlier_variance > min_variance)) inlier_variance = min_variance;
@@ -1668,12 +1756,12 @@ static PyObject *poses(PyObject *self, PyObject *args)
     CodecArrays arrays;
     long long n, m, half_width, range, smallest_shift, steps;
     PoseOptions options = {0};
-    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLddddOOO:poses", &points_array, &valid_array,
+    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLddddddOOO:poses", &points_array, &valid_array,
                          &n, &m, &half_width, &options.lens, &prior_array, &windows_array,
                          &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
                          &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
                          &options.offset, &options.symbol_gate, &options.min_sigma, &steps,
-                         &options.gate_sigmas, &options.gated_variance, &options.square_radius,
+                         &options.second_lens_sigma, &options.second_lens_odds, &options.gate_sigmas, &options.gated_variance, &options.square_radius,
                          &options.square_radius_sigma, &parameters_array, &pose_array,
                          &covariance_array))
         return NULL;
@@ -1681,7 +1769,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "half_width", half_width, 1, MAX_WINDOW_CELLS / 2);
-    check_range(&call, "steps", steps, 1, MAX_REFIT_STEPS);
+    check_range(&call, "max_steps", steps, 1, MAX_REFIT_STEPS);
     if (call.failed) return NULL;
     const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
     const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
@@ -1699,19 +1787,19 @@ static PyObject *poses(PyObject *self, PyObject *args)
     double *covariance = output(&call, covariance_array, "covariance", ITEM_FLOAT64, ITEMS(n, 9));
     if (call.failed) return finish_call(&call, 1);
     options.half_width = (int)half_width;
-    options.steps = (int)steps;
+    options.max_steps = (int)steps;
     Dots d;
     const int has_dots = new_dots(&d, (int)m);
     int64_t *phases = malloc(4 * (size_t)half_width * sizeof(int64_t));
-    float *squares = malloc(2 * ((size_t)m + 1) * sizeof(float));
-    const int has_memory = has_dots && phases && squares;
+    float *scratch = has_dots ? malloc((2 * ((size_t)m + 1) + 2 * (size_t)d.count) * sizeof(float)) : NULL;
+    const int has_memory = has_dots && phases && scratch;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             load_dots(&d, points + 2 * dot, valid + dot, (int)m);
-            if (!estimate_pose(&codec, &options, windows + k * WINDOW_COLUMNS, &d, (int)m, phases,
-                               squares, parameters + k * PARAMETERS, pose + 3 * k,
+            if (!estimate_pose(&codec, &options, windows + k * WINDOW_COLUMNS, points + 2 * dot, &d,
+                               (int)m, phases, scratch, parameters + k * PARAMETERS, pose + 3 * k,
                                covariance + 9 * k)) {
                 for (int i = 0; i < 3; i++) pose[3 * k + i] = NAN;
                 for (int i = 0; i < 9; i++) covariance[9 * k + i] = NAN;
@@ -1721,7 +1809,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     }
     if (has_dots) free(d.x);
     free(phases);
-    free(squares);
+    free(scratch);
     return finish_call(&call, has_memory);
 }
 
@@ -1826,7 +1914,7 @@ static PyMethodDef methods[] = {
     {"poses", poses, METH_VARARGS,
      "poses($module, points, valid, n, m, half_width, lens, prior, windows, lengths, weights,"
      " prefixes, crt, signs, digits, masks, range, smallest_shift, offset, symbol_gate, min_sigma,"
-     " steps, gate_sigmas, gated_variance, square_radius, square_radius_sigma, parameters, pose,"
+     " max_steps, second_lens_sigma, second_lens_odds, gate_sigmas, gated_variance, square_radius, square_radius_sigma, parameters, pose,"
      " covariance, /)\n--\n\n"
      "Estimate poses from decoded dots; twin of locatk.core.dots.localization.pose.localize_windows_numpy."},
     {"ddtw", ddtw, METH_VARARGS,

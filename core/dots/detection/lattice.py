@@ -283,39 +283,34 @@ def _step(
     return normal
 
 
-def refit_lattices(
-    lattices: DotLattices, residual: NDArray[np.float32], used: NDArray[np.bool_], sigma: Array
-) -> tuple[DotLattices, Array]:
-    """Fit lattices to the dots in ``used``, whose symbols are known, by a Gauss-Newton step.
-
-    Parameters
-    ----------
-    lattices : DotLattices
-    residual : (n, m, 2) float32 ndarray
-        Lattice coordinates of the dots minus those of their symbols.
-    used : (n, m) bool ndarray
-    sigma : (n,) float64 ndarray
-        Standard deviation of the dots, for the priors.
-
-    Returns
-    -------
-    lattices : DotLattices
-    normal : (n, 9, 9) ndarray
-        Normal matrix per ``sigma``.
-    """
-    parameters = lattices.parameters.copy()
-    uv, z = _project(parameters, lattices.points)
-    normal = _step(parameters, z, uv, -residual, used, sigma, lens=lattices.lens)
-    uv, _ = _project(parameters, lattices.points)
-    return replace(lattices, parameters=parameters, uv=uv, nodes=np.rint(uv)), normal
+def project_lattices(lattices: DotLattices, parameters: Array, points: Array) -> DotLattices:
+    """Return lattices with other parameters (n, 9) and positions of the dots (n, m, 2)."""
+    positions = points.astype(np.float32)
+    uv, _ = _project(parameters, positions)
+    return replace(lattices, parameters=parameters, points=positions, uv=uv, nodes=np.rint(uv))
 
 
-def sum_normal_equations(
+def sum_equations(
     lattices: DotLattices, residual: NDArray[np.float32], used: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Return :func:`normal_equations` of the residuals of lattices, without priors."""
+    """Return :func:`normal_equations` of lattices whose dots in ``used`` have these residuals."""
     uv, z = _project(lattices.parameters, lattices.points)
     return normal_equations(lattices.parameters, z, uv, -residual, used, lens=lattices.lens)
+
+
+def second_lens_columns(lattices: DotLattices) -> NDArray[np.float32]:
+    """Return the derivatives (n, m, 2) of lattice coordinates by a second radial coefficient.
+
+    The coefficient c moves the points p to ``p (1 + c |p|^4)``; terms of its second order are left
+    out.
+    """
+    uv, z = _project(lattices.parameters, lattices.points)
+    t = lattices.parameters.astype(np.float32)
+    q = z[..., :2]
+    by_axis = q @ np.stack([t[:, A_U], t[:, A_V]], axis=2) - uv * (q @ t[:, PERSPECTIVE, None])
+    squared = (lattices.points * lattices.points).sum(axis=2)
+    result: NDArray[np.float32] = by_axis * (z[..., 2] * z[..., 3] * squared)[..., None]
+    return result
 
 
 def slope_at_centre(parameters: Array) -> Array:

@@ -30,10 +30,12 @@ from locatk.core.dots.detection.lattice import (
     PERSPECTIVE,
     SYMBOL_GATE_PITCHES,
     DotLattices,
+    add_prior,
     prior_weights,
-    refit_lattices,
+    project_lattices,
+    second_lens_columns,
     slope_at_centre,
-    sum_normal_equations,
+    sum_equations,
 )
 from locatk.core.dots.identification.decoding import DecodedWindows
 from locatk.core.dots.identification.phase_voting import kernel_tables
@@ -42,8 +44,17 @@ from locatk.core.kernels import kernels
 
 Array = NDArray[np.float64]
 
-REFIT_STEPS = 3
-"""Number of Gauss-Newton steps after decoding, each with its own inliers."""
+MAX_REFIT_STEPS = 8
+"""Maximum number of Gauss-Newton steps after decoding, each with its own inliers. Sharp frames need
+three until no dot changes its side of the gate, strongly bent ones more."""
+
+SECOND_LENS_SIGMA = 0.15
+"""Prior standard deviation of the second radial coefficient at the corner of the frame, as that of
+the first."""
+
+MIN_SECOND_LENS_SIGMAS = 5.0
+"""Least first estimate of the second radial coefficient, in its standard deviations; below it, the
+first coefficient suffices."""
 
 INLIER_GATE_SIGMAS = 3.0
 """Radius of the gate of a dot's residual, in standard deviations of an axis; 1.1 % of Gaussian
@@ -124,7 +135,13 @@ def localize_windows(
         *(n, m, half, lattices.lens, prior_weights(True), decoded),
         *kernel_tables(codec),
         *(SECTION_LENGTH, MIN_SHIFT, DOT_OFFSET_PITCHES, SYMBOL_GATE_PITCHES, MIN_SIGMA_PITCHES),
-        *(REFIT_STEPS, INLIER_GATE_SIGMAS, GATED_VARIANCE_RATIO),
+        *(
+            MAX_REFIT_STEPS,
+            SECOND_LENS_SIGMA,
+            MIN_SECOND_LENS_SIGMAS**2,
+            INLIER_GATE_SIGMAS,
+            GATED_VARIANCE_RATIO,
+        ),
         *(SQUARED_DOT_RADIUS, SQUARED_DOT_RADIUS_SIGMA),
         *(lattices.parameters.copy(), pose, covariance),
     )
@@ -179,28 +196,57 @@ class _RobustFit:
 def _fit_robustly(
     lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
 ) -> _RobustFit:
-    """Fit lattices to the dots of decoded windows within the gate of each frame."""
-    fitted = lattices
-    for _ in range(REFIT_STEPS):
+    """Fit lattices to the dots of decoded windows within the gate of each frame.
+
+    If the lens is unknown, a second radial coefficient is fitted to the frames that show one.
+    """
+    n = len(lattices.parameters)
+    squared_radius = (lattices.points.astype(np.float64) ** 2).sum(axis=2)
+    bend, has_second_lens = np.zeros(n), np.full(n, lattices.lens)
+    fitted, previous = lattices, np.zeros_like(lattices.valid)
+    for _ in range(MAX_REFIT_STEPS):
         current = fitted
         dots = assign_dots(current, half, windows, codec)
         squared = (dots.residual * dots.residual).sum(axis=2)
         variance = np.maximum(_median_variance(squared, dots.used), MIN_SIGMA_PITCHES**2)
         is_inlier = dots.used & (squared < (INLIER_GATE_SIGMAS**2 * variance)[:, None])
-        fitted, normal = refit_lattices(current, dots.residual, is_inlier, np.sqrt(variance))
+        normal, right = sum_equations(current, dots.residual, is_inlier)
+        add_prior(normal, right, current.parameters, np.sqrt(variance), lens=lattices.lens)
+        inverse = np.linalg.inv(normal)
+        step = np.einsum("nij,nj->ni", inverse, right)
+        if has_second_lens.any():
+            columns = second_lens_columns(current) * is_inlier[..., None]
+            _, cross = sum_equations(current, -columns, is_inlier)
+            coupling = np.einsum("nij,nj->ni", inverse, cross)
+            prior = variance * SECOND_LENS_SIGMA**-2.0
+            weight = (columns.astype(np.float64) ** 2).sum(axis=(1, 2)) + prior
+            weight -= np.einsum("ni,ni->n", cross, coupling)
+            gain = -(columns.astype(np.float64) * dots.residual).sum(axis=(1, 2)) - prior * bend
+            gain -= np.einsum("ni,ni->n", cross, step)
+            if current is lattices:
+                has_second_lens = gain * gain > MIN_SECOND_LENS_SIGMAS**2 * variance * weight
+            change = np.where(has_second_lens, gain / weight, 0)
+            bend = bend + change
+            step -= coupling * change[:, None]
+            coupling = np.where(has_second_lens[:, None], coupling, 0)
+            inverse += coupling[:, :, None] * (coupling / weight[:, None])[:, None]
+        factor = 1 + bend[:, None] * squared_radius**2
+        fitted = project_lattices(
+            lattices, current.parameters + step, lattices.points * factor[..., None]
+        )
+        if (is_inlier == previous).all():
+            break
+        previous = is_inlier
     count = is_inlier.sum(axis=1)
     squares = (squared * is_inlier).sum(axis=1, dtype=np.float64)
     inlier_variance = np.maximum(
         squares / (GATED_VARIANCE_RATIO * np.maximum(2 * count - 8, 1)), MIN_SIGMA_PITCHES**2
     )
-    inverse = np.linalg.inv(normal)
     # Outliers count as if at the gate: in directions of their own, and all together.
     is_outlier = dots.used & ~is_inlier
     gate = INLIER_GATE_SIGMAS * np.sqrt(variance)
     clipped = dots.residual * (gate[:, None] / np.sqrt(np.maximum(squared, 1e-12)))[..., None]
-    outlier_normal, outlier_sum = sum_normal_equations(
-        current, clipped.astype(np.float32), is_outlier
-    )
+    outlier_normal, outlier_sum = sum_equations(current, clipped.astype(np.float32), is_outlier)
     hidden = 0.5 * (gate * gate)[:, None, None] * outlier_normal
     hidden += outlier_sum[:, :, None] * outlier_sum[:, None]
     covariance = inlier_variance[:, None, None] * inverse + inverse @ hidden @ inverse
