@@ -1,8 +1,17 @@
 """Pose of the camera from a decoded window.
 
 Once a window is decoded, the symbol of every dot is known and with it the dot's true position. The
-lattice is fitted once more to all dots at these positions, and the pose and its covariance follow
+lattice is fitted once more to the dots at these positions, and the pose and its covariance follow
 from the fit. (Hostettler et al. 2016, II-B.8, use one corner of the decoded window instead.)
+
+Near hands, ink and reflections some dots are displaced. Those beyond a gate, whose width follows
+from the median residual of the frame, are not used. They show that others within the gate are
+displaced as well, which no residual reveals: the covariance therefore contains them as if they were
+at the gate, in directions of their own and all together.
+
+In tilted frames the image of a disc is displaced from the image of its centre. To second order of
+its radius r, in pitches, the displacement on the paper is r^2 times the slope of the logarithm of
+the inverse depth, the same for all dots, so that the residuals do not show it either.
 """
 
 from __future__ import annotations
@@ -135,13 +144,8 @@ def localize_windows(
         *(n, m, half, lattices.lens, prior_weights(True), decoded),
         *kernel_tables(codec),
         *(SECTION_LENGTH, MIN_SHIFT, DOT_OFFSET_PITCHES, SYMBOL_GATE_PITCHES, MIN_SIGMA_PITCHES),
-        *(
-            MAX_REFIT_STEPS,
-            SECOND_LENS_SIGMA,
-            MIN_SECOND_LENS_SIGMAS**2,
-            INLIER_GATE_SIGMAS,
-            GATED_VARIANCE_RATIO,
-        ),
+        *(MAX_REFIT_STEPS, SECOND_LENS_SIGMA, MIN_SECOND_LENS_SIGMAS**2),
+        *(INLIER_GATE_SIGMAS, GATED_VARIANCE_RATIO),
         *(SQUARED_DOT_RADIUS, SQUARED_DOT_RADIUS_SIGMA),
         *(lattices.parameters.copy(), pose, covariance),
     )
@@ -157,18 +161,15 @@ def localize_windows_numpy(
     rotation = IMAGE_TO_PRINT[windows.rotation]
     corner = PRINTED_CORNERS[windows.rotation] * (2 * half - 1)
     slope = slope_at_centre(parameters)
-    depth_slope = np.linalg.solve(slope.transpose(0, 2, 1), parameters[:, PERSPECTIVE, None])[
-        ..., 0
-    ]
+    depth_slope = _depth_slope(slope, parameters[:, PERSPECTIVE])
     centre = parameters[:, [C_U, C_V]] + half + SQUARED_DOT_RADIUS * depth_slope
     right = np.einsum("nij,nj->ni", rotation, slope[:, :, 0])
     covariance = _pose_covariance(fit.covariance, slope, rotation)
     spread = SQUARED_DOT_RADIUS_SIGMA * np.einsum("nij,nj->ni", rotation, depth_slope)
     covariance[:, :2, :2] += spread[:, :, None] * spread[:, None]
+    origin = np.stack([windows.x, windows.y], axis=1)
     return GridPoses(
-        grid=np.einsum("nij,nj->ni", rotation, centre)
-        + corner
-        + np.stack([windows.x, windows.y], 1),
+        grid=np.einsum("nij,nj->ni", rotation, centre) + corner + origin,
         heading=np.arctan2(-right[:, 1], right[:, 0]),
         covariance=covariance,
     )
@@ -180,9 +181,9 @@ def _depth_slope(slope: Array, perspective: Array) -> Array:
     first, second = perspective.T
     with np.errstate(invalid="ignore", divide="ignore"):
         area = uu * vv - uv * vu
-        return (
-            np.stack([first * vv - second * vu, second * uu - first * uv], axis=1) / area[:, None]
-        )
+        solved = [first * vv - second * vu, second * uu - first * uv]
+        result: Array = np.stack(solved, axis=1) / area[:, None]
+    return result
 
 
 @dataclass(frozen=True)

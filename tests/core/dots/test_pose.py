@@ -111,3 +111,23 @@ def test_tilted_discs_are_corrected_for_their_eccentricity(shoot: Any) -> None:
 def test_light_from_one_side_moves_no_pose(shoot: Any) -> None:
     errors = standardized_errors(shoot, 24, gradient=0.85, paper=130.0, ink=35.0, noise=1.0)
     assert 0.2 < np.mean(errors**2) < 2
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("implementation")
+def test_a_lens_of_another_model_is_followed(shoot: Any) -> None:
+    # The renderer's lens is the division model, to which a term of the fourth power is added.
+    dots = detect_dots(shoot(at=AT, heading=0.4, noise=1.0)[None])
+    points = (dots.xy - (SIZE - 1) / 2) / np.hypot(*SIZE) * 2
+    squared = (points * points).sum(axis=2, keepdims=True)
+    sigmas = []
+    for bend in (0.0, 0.12):
+        bent = (points * (1 + bend * squared**2)).astype(np.float32)
+        lattices = fit_lattices(bent, dots.valid, lens=True)
+        half = window_half_width(lattices)
+        windows = identify_windows(*soft_bits(lattices, half), ANOTO, other_codec_odds=0)
+        poses = localize_windows(lattices, half, windows, ANOTO)
+        assert np.abs(poses.grid[0] - AT).max() < 1e-3
+        sigmas.append(np.sqrt(np.trace(poses.covariance[0, :2, :2])))
+    # 13 times with one coefficient.
+    assert sigmas[1] < 4 * sigmas[0]
