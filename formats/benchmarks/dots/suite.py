@@ -35,6 +35,7 @@ from locatk.core.dots.solver import METHODS, SolveOptions, solve
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.paper_sizes import paper_size
 from locatk.formats import images as image_files
+from locatk.formats.benchmarks.dots.disturbances import disturbance_figures
 from locatk.formats.benchmarks.dots.printing import codec_figures, default_sheet, print_figures
 from locatk.formats.benchmarks.figures import Duration, Figure, measure_or_explain
 from locatk.formats.benchmarks.timing import (
@@ -157,6 +158,7 @@ def figures(data: Path) -> list[Figure]:
         *codec_figures(),
         *print_figures(),
         *condition_figures(),
+        *disturbance_figures(),
         *decoy_figures(),
         *paper_method_figures(),
         *speed_figures(),
