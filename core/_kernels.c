@@ -1084,18 +1084,37 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
 
 /* ---- Soft bits -------------------------------------------------------------------------- */
 
+/* Distance of a dot's offset from the nearest symbol, the larger of both axes. */
+static inline float symbol_distance(const float *rest, float offset)
+{
+    float symbol[2];
+    nearest_symbol(rest, offset, symbol);
+    const float a = fabsf(rest[0] - symbol[0]), b = fabsf(rest[1] - symbol[1]);
+    return a > b ? a : b;
+}
+
 /* Soft bits of a frame's dots in the central square of 2 half_width cells a side. If several dots
  * are in one cell, the one nearest to a symbol counts. */
 static void frame_soft_bits(const float *uv, const float *cells, const uint8_t *valid, int m,
-                            int half_width, float sigma, float offset, float likelihood_floor,
-                            float *distances, float *x_bits, float *y_bits)
+                            int half_width, float sigma, float offset, float symbol_gate,
+                            float wrong_symbol, float *distances, float *x_bits, float *y_bits)
 {
     const int length = 2 * half_width;
-    const float exponent = -0.25f / (sigma * sigma);
+    const float exponent = -0.5f / (sigma * sigma);
     for (int k = 0; k < length * length; k++) {
         distances[k] = FLT_MAX;
         x_bits[k] = y_bits[k] = 0;
     }
+    int dots = 0, outliers = 0;
+    for (int i = 0; i < m; i++) {
+        if (!valid[i]) continue;
+        const float rest[2] = {uv[2 * i] - cells[2 * i], uv[2 * i + 1] - cells[2 * i + 1]};
+        dots++;
+        outliers += symbol_distance(rest, offset) >= symbol_gate;
+    }
+    /* One outlier in a cell, relative to the peak of the Gaussian; a bit has two symbols. */
+    const float outlier_fraction = (float)(outliers + 1) / (float)(dots + 2);
+    const float floor = 2 * 6.2831853f * sigma * sigma * outlier_fraction + wrong_symbol;
     for (int i = 0; i < m; i++) {
         if (!valid[i]) continue;
         const float u = cells[2 * i], v = cells[2 * i + 1];
@@ -1104,21 +1123,17 @@ static void frame_soft_bits(const float *uv, const float *cells, const uint8_t *
         const int column = (int)u + half_width, row = (int)v + half_width;
         if (column < 0 || column >= length || row < 0 || row >= length) continue;
         const float rest[2] = {uv[2 * i] - u, uv[2 * i + 1] - v};
-        float symbol[2];
-        nearest_symbol(rest, offset, symbol);
-        const float a = fabsf(rest[0] - symbol[0]), b = fabsf(rest[1] - symbol[1]);
-        const float distance = a > b ? a : b;
+        const float distance = symbol_distance(rest, offset);
         const int cell = row * length + column;
         if (distance >= distances[cell]) continue;
         distances[cell] = distance;
-        for (int axis = 0; axis < 2; axis++) {
-            const float along = axis ? rest[1] + rest[0] : rest[1] - rest[0];
-            const float one =
-                expf(exponent * (along - offset) * (along - offset)) + likelihood_floor;
-            const float zero =
-                expf(exponent * (along + offset) * (along + offset)) + likelihood_floor;
-            (axis ? y_bits : x_bits)[cell] = logf(one / zero);
-        }
+        const float square = rest[0] * rest[0] + rest[1] * rest[1] + offset * offset;
+        const float up = expf(exponent * (square + 2 * offset * rest[1]));
+        const float left = expf(exponent * (square + 2 * offset * rest[0]));
+        const float right = expf(exponent * (square - 2 * offset * rest[0]));
+        const float down = expf(exponent * (square - 2 * offset * rest[1]));
+        x_bits[cell] = logf((left + down + floor) / (up + right + floor));
+        y_bits[cell] = logf((right + down + floor) / (up + left + floor));
     }
 }
 
@@ -1131,10 +1146,10 @@ static PyObject *soft_bits(PyObject *self, PyObject *args)
     Call call = {0};
     PyObject *uv_array, *cells_array, *valid_array, *found_array, *sigma_array, *x_array, *y_array;
     long long n, m, half_width;
-    float offset, likelihood_floor;
-    if (!parse_arguments(args, "OOOOOLLLffOO:soft_bits", &uv_array, &cells_array, &valid_array,
+    float offset, symbol_gate, wrong_symbol;
+    if (!parse_arguments(args, "OOOOOLLLfffOO:soft_bits", &uv_array, &cells_array, &valid_array,
                          &found_array, &sigma_array, &n, &m, &half_width, &offset,
-                         &likelihood_floor, &x_array, &y_array))
+                         &symbol_gate, &wrong_symbol, &x_array, &y_array))
         return NULL;
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
@@ -1156,7 +1171,8 @@ static PyObject *soft_bits(PyObject *self, PyObject *args)
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             frame_soft_bits(uv + 2 * dot, cells + 2 * dot, valid + dot, found[k] ? (int)m : 0,
-                            (int)half_width, (float)sigma[k], offset, likelihood_floor, distances,
+                            (int)half_width, (float)sigma[k], offset, symbol_gate,
+                            wrong_symbol, distances,
                             x_bits + k * size, y_bits + k * size);
         }
         Py_END_ALLOW_THREADS
@@ -1721,7 +1737,7 @@ static PyMethodDef methods[] = {
      "Fit lattices to dots; twin of locatk.core.dots.detection.lattice.fit_lattices_numpy."},
     {"soft_bits", soft_bits, METH_VARARGS,
      "soft_bits($module, uv, cells, valid, found, sigma, n, m, half_width, offset,"
-     " likelihood_floor, x_bits, y_bits, /)\n--\n\n"
+     " symbol_gate, wrong_symbol, x_bits, y_bits, /)\n--\n\n"
      "Compute the soft bits of dots; twin of locatk.core.dots.identification.soft_bits.soft_bits_numpy."},
     {"read_windows", read_windows, METH_VARARGS,
      "read_windows($module, x_bits, y_bits, n, length, lengths, weights, prefixes, crt, signs,"

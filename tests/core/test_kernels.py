@@ -114,7 +114,8 @@ def soft_bits() -> Arguments:
         "m": m,
         "half_width": half_width,
         "offset": 1 / 6,
-        "likelihood_floor": 0.018,
+        "symbol_gate": 0.12,
+        "wrong_symbol": 0.002,
         "x_bits": np.zeros((n, 2 * half_width, 2 * half_width), np.float32),
         "y_bits": np.zeros((n, 2 * half_width, 2 * half_width), np.float32),
     }

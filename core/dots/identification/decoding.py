@@ -62,9 +62,9 @@ CERTAIN_LOG_ODDS = 40.0
 MAX_CERTAIN_WRONG_FRACTION = 0.08
 """Fraction of wrong bits beyond which another position may be as likely, whatever the odds."""
 
-MIN_CERTAIN_LEAD = 10.0
+MIN_CERTAIN_LEAD = 13.0
 """Lead in votes from which no other position can be the right one; a lead below it may rest on a
-single line."""
+single bit (twice 6.2) of a single line."""
 
 MAX_SMALL_WINDOW_LINES = 16
 """Columns and rows up to which a window is small: wrong bits may hide its rotation or its position,
@@ -130,7 +130,7 @@ def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> Decoded
     column_bits, row_bits : (n, rows, columns) float32 ndarray
         As observed, in any rotation: log likelihood ratio that the dot is displaced left or down
         (column bit 1), and right or down (row bit 1); 0 without a dot. Bits of symbols that are
-        certain: plus or minus 4.
+        certain: plus or minus 6.
     codec : Codec
 
     Raises
