@@ -405,22 +405,9 @@ HOT static void mark_minima(const float *restrict smooth, int h, int w, float *r
     }
 }
 
-/* Moving sums over `window` values of a line with a stride, mirrored at its ends. */
-static void moving_sum(const float *line, int count, int stride, int window, float *out)
-{
-    const int half = window / 2;
-    float sum = 0;
-    for (int k = -half; k <= half; k++) sum += line[mirror_index(k, count) * stride];
-    for (int k = 0; k < count; k++) {
-        out[k * stride] = sum;
-        sum += line[mirror_index(k + half + 1, count) * stride]
-               - line[mirror_index(k - half, count) * stride];
-    }
-}
-
-/* Brightness of the paper: means of blocks, averaged over squares of `window` blocks a side. */
-static void paper_image(const uint8_t *image, int w, int rows, int columns, int block, int window,
-                        int *restrict sums, float *means, float *across, float *paper)
+/* Means of the blocks of an image. */
+static void block_means(const uint8_t *image, int w, int rows, int columns, int block,
+                        int *restrict sums, float *means)
 {
     for (int r = 0; r < rows; r++) {
         memset(sums, 0, (size_t)w * sizeof(int));
@@ -435,11 +422,6 @@ static void paper_image(const uint8_t *image, int w, int rows, int columns, int 
             means[r * columns + c] = (float)((2 * sum + block * block) / (2 * block * block));
         }
     }
-    for (int r = 0; r < rows; r++)
-        moving_sum(means + r * columns, columns, 1, window, across + r * columns);
-    for (int c = 0; c < columns; c++) moving_sum(across + c, rows, columns, window, paper + c);
-    const float scale = 1.0f / (float)(window * window);
-    for (int k = 0; k < rows * columns; k++) paper[k] *= scale;
 }
 
 /* Median contrast of the dots, which are the minima above the split by Otsu's criterion. If fewer
@@ -468,7 +450,7 @@ static float median_contrast(float *contrasts, int count, int min_dots, int spli
     return contrasts[count - 1 - (count - 1) / 2];
 }
 
-/* Slope along one axis of the plane fitted to the paper's brightness [grey levels per pixel]. */
+/* Slope along one axis of the plane fitted to the brightness of blocks [grey levels per pixel]. */
 static float paper_slope(const float *paper, int count, int step, int across, int across_step,
                          int block)
 {
@@ -499,6 +481,24 @@ static float minimum_offset(const float *minimum, int step, float brightness, fl
     return offset < -0.5f ? -0.5f : offset > 0.5f ? 0.5f : offset;
 }
 
+/* Grey levels on a ring of four pixels about a minimum, within the image, in ascending order. */
+enum { RING_SAMPLES = 8 };
+
+static void sample_ring(const float *smooth, int h, int w, int x, int y, float *ring)
+{
+    static const int steps[RING_SAMPLES][2] = {{4, 0},  {3, 3},   {0, 4},  {-3, 3},
+                                               {-4, 0}, {-3, -3}, {0, -4}, {3, -3}};
+    for (int k = 0; k < RING_SAMPLES; k++) {
+        int column = x + steps[k][0], row = y + steps[k][1];
+        column = column < 0 ? 0 : column >= w ? w - 1 : column;
+        row = row < 0 ? 0 : row >= h ? h - 1 : row;
+        const float value = smooth[(size_t)row * w + column];
+        int j = k;
+        for (; j > 0 && ring[j - 1] > value; j--) ring[j] = ring[j - 1];
+        ring[j] = value;
+    }
+}
+
 typedef struct {
     float x, y, contrast, square_radius; /* square_radius: from the centre of the image */
 } Dot;
@@ -511,10 +511,10 @@ static int by_square_radius(const void *a, const void *b)
 }
 
 typedef struct {
-    int h, w, block, window, min_dots, splits, max_dots, rows, columns;
+    int h, w, block, min_dots, splits, max_dots, rows, columns;
     float min_contrast, contrast_fraction;
     const float *taps;
-    float *smooth, *across, *line, *means, *blurred, *paper, *contrasts, *brightnesses;
+    float *smooth, *across, *line, *means, *contrasts, *brightnesses;
     int *sums;
     uint8_t *marks;
     Dot *dots;
@@ -526,33 +526,33 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
     const int h = d->h, w = d->w;
     Dot *dots = d->dots;
     smooth_image(image, h, w, d->taps, d->line, d->smooth);
-    paper_image(image, w, d->rows, d->columns, d->block, d->window, d->sums, d->means, d->blurred,
-                d->paper);
+    block_means(image, w, d->rows, d->columns, d->block, d->sums, d->means);
     mark_minima(d->smooth, h, w, d->across, d->marks);
     int minima = 0;
     for (int y = 2; y < h - 2; y++) {
         const uint8_t *mark = d->marks + (size_t)y * w, *end = mark + w - 2;
-        const int row = y / d->block < d->rows ? y / d->block : d->rows - 1;
         for (const uint8_t *pixel = mark + 2; (pixel = memchr(pixel, 1, (size_t)(end - pixel)));
              pixel++) {
             const int x = (int)(pixel - mark);
-            const int column = x / d->block < d->columns ? x / d->block : d->columns - 1;
-            const float brightness = d->paper[row * d->columns + column];
-            const float contrast = brightness - d->smooth[(size_t)y * w + x];
+            float ring[RING_SAMPLES];
+            sample_ring(d->smooth, h, w, x, y, ring);
+            /* Two of the samples may be on neighbouring dots, but not three. */
+            const float grey = d->smooth[(size_t)y * w + x], contrast = ring[2] - grey;
             if (!(contrast > d->min_contrast)) continue;
-            d->brightnesses[minima] = brightness;
-            d->contrasts[minima] = contrast / brightness;
+            d->brightnesses[minima] = 0.5f * (ring[4] + ring[5]);
+            d->contrasts[minima] = contrast / ring[2];
             dots[minima].x = (float)x;
             dots[minima].y = (float)y;
-            dots[minima++].contrast = contrast;
+            dots[minima].contrast = d->brightnesses[minima] - grey;
+            minima++;
         }
     }
     memcpy(d->across, d->contrasts, (size_t)minima * sizeof(float));
     const float threshold =
         d->contrast_fraction * median_contrast(d->across, minima, d->min_dots, d->splits);
     const int rows = d->rows, columns = d->columns;
-    const float slope_x = paper_slope(d->paper, columns, 1, rows, columns, d->block);
-    const float slope_y = paper_slope(d->paper, rows, columns, columns, 1, d->block);
+    const float slope_x = paper_slope(d->means, columns, 1, rows, columns, d->block);
+    const float slope_y = paper_slope(d->means, rows, columns, columns, 1, d->block);
     int kept = 0;
     for (int k = 0; k < minima; k++) {
         if (!(d->contrasts[k] > threshold)) continue;
@@ -579,17 +579,17 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
 
 /* Largest sides of images and blocks [pixels]. Below them, indices and sums of grey levels fit
  * into an int: 2 * 255 * MAX_BLOCK^2 + MAX_BLOCK^2 < 2^31. */
-enum { MIN_SIDE = 5, MAX_SIDE = 1 << 15, MAX_BLOCK = 2048, MAX_WINDOW = 1023, MAX_SPLITS = 1000 };
+enum { MIN_SIDE = 5, MAX_SIDE = 1 << 15, MAX_BLOCK = 2048, MAX_SPLITS = 1000 };
 
 static PyObject *find_dots(PyObject *self, PyObject *args)
 {
     (void)self;
     Call call = {0};
     PyObject *images_array, *taps_array, *xy_array, *counts_array;
-    long long n, h, w, block, window, min_dots, splits, max_dots;
+    long long n, h, w, block, min_dots, splits, max_dots;
     Detector d;
-    if (!parse_arguments(args, "OLLLOLLffLLLOO:find_dots", &images_array, &n, &h, &w, &taps_array,
-                         &block, &window, &d.min_contrast, &d.contrast_fraction, &min_dots,
+    if (!parse_arguments(args, "OLLLOLffLLLOO:find_dots", &images_array, &n, &h, &w, &taps_array,
+                         &block, &d.min_contrast, &d.contrast_fraction, &min_dots,
                          &splits, &max_dots, &xy_array, &counts_array))
         return NULL;
     check_range(&call, "n", n, 0, INT_MAX);
@@ -598,7 +598,6 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     /* At least one block fits into the image, since each pixel needs the brightness of one. */
     check_range(&call, "block", block, 1, h < w ? h : w);
     check_range(&call, "block", block, 1, MAX_BLOCK);
-    check_range(&call, "window", window, 1, MAX_WINDOW);
     check_range(&call, "min_dots", min_dots, 0, INT_MAX);
     check_range(&call, "splits", splits, 0, MAX_SPLITS);
     check_range(&call, "max_dots", max_dots, 0, INT_MAX);
@@ -611,14 +610,13 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     d.h = (int)h;
     d.w = (int)w;
     d.block = (int)block;
-    d.window = (int)window;
     d.min_dots = (int)min_dots;
     d.splits = (int)splits;
     d.max_dots = (int)max_dots;
     d.rows = d.h / d.block;
     d.columns = d.w / d.block;
     const size_t area = (size_t)d.h * (size_t)d.w, blocks = (size_t)d.rows * (size_t)d.columns;
-    d.smooth = malloc((4 * area + (size_t)d.w + 4 + 3 * blocks) * sizeof(float));
+    d.smooth = malloc((4 * area + (size_t)d.w + 4 + blocks) * sizeof(float));
     d.dots = malloc(area * sizeof(Dot));
     d.sums = malloc((size_t)d.w * sizeof(int));
     d.marks = malloc(area);
@@ -629,8 +627,6 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
         d.brightnesses = d.contrasts + area;
         d.line = d.brightnesses + area;
         d.means = d.line + d.w + 4;
-        d.blurred = d.means + blocks;
-        d.paper = d.blurred + blocks;
         Py_BEGIN_ALLOW_THREADS
         for (size_t k = 0; k < (size_t)n; k++)
             counts[k] = detect_dots(&d, images + k * area, xy + 2 * k * (size_t)d.max_dots);
@@ -1727,7 +1723,7 @@ static PyObject *ddtw(PyObject *self, PyObject *args)
 /* The first line of a docstring is the signature that Python's inspect module reads. */
 static PyMethodDef methods[] = {
     {"find_dots", find_dots, METH_VARARGS,
-     "find_dots($module, images, n, height, width, taps, block, window, min_contrast,"
+     "find_dots($module, images, n, height, width, taps, block, min_contrast,"
      " contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
      "Detect the dots of images; twin of locatk.core.dots.detection.blobs.detect_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,

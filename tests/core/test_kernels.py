@@ -47,7 +47,6 @@ def find_dots() -> Arguments:
         "width": width,
         "taps": np.array([0.1, 0.2, 0.4], np.float32),
         "block": 4,
-        "window": 7,
         "min_contrast": 1.5,
         "contrast_fraction": 0.45,
         "min_dots": 2,

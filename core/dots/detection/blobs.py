@@ -1,9 +1,10 @@
 """Detection of dots in grey images, to a fraction of a pixel.
 
 The image is smoothed once by about the width of a dot; a dot is a local minimum that is darker than
-its surroundings. There is no global threshold: the least contrast of a dot follows from the minima
-of the same frame relative to the paper around each, so that vignettes, uneven light and exposure
-have no effect.
+a ring of pixels about it. On a line, on a hand or at its edge at least three pixels of the ring are
+as dark as the minimum. There is no global threshold: the least contrast of a dot follows from the
+minima of the same frame relative to the paper around each, so that vignettes, uneven light and
+exposure have no effect.
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ SMOOTHING_SIGMA_PX = 1.1
 SMOOTHING_RADIUS_PX = 2
 """Radius of the smoothing kernel, and of the neighbourhood of a minimum [px]."""
 
-PAPER_BLOCK_PX = 4
-"""Side of the blocks over which the brightness of the paper is averaged first [px]."""
+RING_PX = np.array([[4, 0], [3, 3], [0, 4], [-3, 3], [-4, 0], [-3, -3], [0, -4], [3, -3]])
+"""(8, 2) ring of pixels about a minimum that are beyond its dot."""
 
-PAPER_WINDOW_BLOCKS = 7
-"""Side of the window over which blocks are averaged then: about two pitches."""
+MAX_DARK_RING_PIXELS = 2
+"""Pixels of the ring that may be on neighbouring dots; the next brighter one gives the contrast."""
+
+PAPER_BLOCK_PX = 4
+"""Side of the blocks to whose means the gradient of the light is fitted [px]."""
 
 MIN_CONTRAST_LEVELS = 1.5
 """Least contrast of a dot after smoothing [grey levels]."""
@@ -81,7 +85,7 @@ def detect_dots(images: NDArray[np.uint8], max_dots: int = 4096) -> DetectedDots
         np.ascontiguousarray(images, np.uint8),
         *(n, h, w),
         _smoothing_taps(),
-        *(PAPER_BLOCK_PX, PAPER_WINDOW_BLOCKS, MIN_CONTRAST_LEVELS, MIN_CONTRAST_FRACTION),
+        *(PAPER_BLOCK_PX, MIN_CONTRAST_LEVELS, MIN_CONTRAST_FRACTION),
         *(MIN_PATTERN_DOTS, MAX_DIRT_SPLITS, max_dots),
         xy,
         counts,
@@ -108,7 +112,7 @@ def detect_dots_numpy(images: NDArray[np.uint8], max_dots: int = 4096) -> Detect
     smooth = np.empty((n, h, w), np.float32)
     minima = np.zeros((n, h, w), bool)
     rows, columns = h // block, w // block
-    paper = np.empty((n, rows, columns), np.float32)
+    means = np.empty((n, rows, columns), np.float32)
     # The first of equal minima counts: the pixels before it have to be brighter.
     before = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     before.ravel()[before.size // 2 :] = 0
@@ -121,41 +125,42 @@ def detect_dots_numpy(images: NDArray[np.uint8], max_dots: int = 4096) -> Detect
         minima[k][inner] = is_minimum[inner]
         # Whole blocks only: other ratios of sizes cost ten times as much.
         cropped = image[: rows * block, : columns * block]
-        small = cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA)
-        window = (PAPER_WINDOW_BLOCKS, PAPER_WINDOW_BLOCKS)
-        cv2.blur(small.astype(np.float32), window, dst=paper[k])
+        means[k] = cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA)
 
     index = np.flatnonzero(minima)
     line, column = np.divmod(index, w)
     frame, row = np.divmod(line, h)
-    light = paper[
-        frame, np.minimum(row // block, rows - 1), np.minimum(column // block, columns - 1)
-    ]
     flat = smooth.reshape(-1)
-    contrast = light - flat[index]
+    ring_x = np.clip(column[:, None] + RING_PX[:, 0], 0, w - 1)
+    ring_y = np.clip(row[:, None] + RING_PX[:, 1], 0, h - 1)
+    ring = np.sort(smooth[frame[:, None], ring_y, ring_x], axis=1)
+    contrast = ring[:, MAX_DARK_RING_PIXELS] - flat[index]
     keep = contrast > MIN_CONTRAST_LEVELS
     index, frame, row, column = index[keep], frame[keep], row[keep], column[keep]
-    light, contrast = light[keep], contrast[keep]
-
-    relative = contrast / light
+    ring = ring[keep]
+    relative = contrast[keep] / ring[:, MAX_DARK_RING_PIXELS]
     keep = relative > (MIN_CONTRAST_FRACTION * _median_dots(relative, frame, n))[frame]
-    index, frame, light, contrast = index[keep], frame[keep], light[keep], contrast[keep]
-    slope_y, slope_x = _paper_slopes(paper)
+    index, frame = index[keep], frame[keep]
+    light = np.float32(0.5) * (ring[keep, 4] + ring[keep, 5])
+    contrast = light - flat[index]
+    slope_y, slope_x = _brightness_slopes(means)
     x = column[keep] + _subpixel_offset(flat, index, 1, light, contrast, slope_x[frame])
     y = row[keep] + _subpixel_offset(flat, index, w, light, contrast, slope_y[frame])
     return _pad(frame, x, y, ((w - 1) / 2, (h - 1) / 2), n, max_dots)
 
 
-def _paper_slopes(paper: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the gradients (n,) of the paper's brightness, down and to the right [levels / px].
+def _brightness_slopes(
+    means: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the gradients (n,) of the means of blocks, down and to the right [levels / px].
 
     They are those of a plane through the whole frame: light from one side would displace the tops
     of all dots.
     """
     slopes = []
     for axis in (1, 2):
-        steps = np.arange(paper.shape[axis]) - (paper.shape[axis] - 1) / 2
-        profile = paper.mean(axis=3 - axis) @ steps
+        steps = np.arange(means.shape[axis]) - (means.shape[axis] - 1) / 2
+        profile = means.mean(axis=3 - axis) @ steps
         slope = profile / max(float(steps @ steps), 1.0) / PAPER_BLOCK_PX
         slopes.append(slope.astype(np.float32))
     return slopes[0], slopes[1]

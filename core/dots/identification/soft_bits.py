@@ -25,10 +25,10 @@ from locatk.core.kernels import kernels
 MAX_WINDOW_DOTS = 40
 """Largest number of columns and rows, about the middle of a frame, that are decoded."""
 
-WRONG_SYMBOL_LIKELIHOOD = 0.002
+WRONG_SYMBOL_LIKELIHOOD = 0.0004
 """Likelihood of a bit against which the position of its dot speaks with certainty: a print with
-defects, where two dots in a thousand are those of another symbol. It limits a soft bit to about 6:
-one wrong bit does not carry a confidence of 0.999, two do."""
+defects, where four dots in ten thousand are those of another symbol. It limits a soft bit to 7.5.
+"""
 
 MIN_BIT_SIGMA_PITCHES = 0.03
 """Least standard deviation of a dot for its soft bits; the largest is twice as much."""
