@@ -27,6 +27,7 @@ from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, Codec, 
 from locatk.core.dots.codec.lookup import decode_exact
 from locatk.core.dots.identification.phase_voting import (
     LOG_HYPOTHESES,
+    MAX_LIKELY_PHASE_GAP,
     MAX_WINDOW_LINES,
     Bits,
     Integers,
@@ -69,17 +70,17 @@ CERTAIN_LOG_ODDS = 40.0
 MAX_CERTAIN_WRONG_FRACTION = 0.08
 """Fraction of wrong bits beyond which another position may be as likely, whatever the odds."""
 
-MIN_CERTAIN_LEAD = 15.5
+MIN_CERTAIN_LEAD = 16.0
 """Lead in votes from which no other position can be the right one; a lead below it may rest on a
-single bit (twice 7.5) of a single line."""
+single bit (twice 8) of a single line."""
 
 MAX_SMALL_WINDOW_LINES = 16
 """Columns and rows up to which a window is decoded by look-up, if no bit is wrong."""
 
 MAX_SMALL_WINDOW_DOTS = 128
-"""Dots up to which a window is small, as half of 16 columns and rows: short lines and wrong bits may
-hide its rotation or its position, so that the second rotation, misread columns and more candidates
-are tried too."""
+"""Dots up to which a window is small, half of those of 16 columns and rows: short lines and wrong
+bits may hide its rotation or its position, so that the second rotation, misread columns and more
+candidates are tried too."""
 
 MIN_EXACT_LINES = 8
 """Columns and rows from which a window without a wrong bit has one position only."""
@@ -214,18 +215,19 @@ def resolve_doubts(
 
     A better position and its evidence replace those in ``estimates``.
     """
-    rivals = np.zeros_like(estimates.log_odds)
+    n = len(column_bits)
+    rivals, alternatives = np.zeros((n, 2)), np.zeros((n, 2))
     dots = np.count_nonzero(column_bits, axis=(1, 2))
+    is_small = dots <= MAX_SMALL_WINDOW_DOTS
     for axis in range(2):
         log_odds, wrong = estimates.log_odds[:, axis], estimates.wrong[:, axis]
         is_doubtful = (wrong > 0) & (log_odds < CERTAIN_LOG_ODDS)
         is_doubtful |= estimates.lead[:, axis] < MIN_CERTAIN_LEAD
         is_doubtful |= wrong > MAX_CERTAIN_WRONG_FRACTION * dots
-        is_small = dots <= MAX_SMALL_WINDOW_DOTS
-        for doubtful in (
-            np.flatnonzero(is_doubtful & is_small),
-            np.flatnonzero(is_doubtful & ~is_small),
-        ):
+        # The second axis cannot save a window whose first axis has no position.
+        is_doubtful &= alternatives[:, 0] < 1 - MIN_CONFIDENCE
+        for kind in (is_small, ~is_small):
+            doubtful = np.flatnonzero(is_doubtful & kind)
             if not len(doubtful):
                 continue
             printed = rotate_to_print(
@@ -233,21 +235,14 @@ def resolve_doubts(
             )
             lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
             scores = phase_scores(lines)
-            # Evidence if every line had its best phase; no position has more.
-            normalization = np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
-            bound = 0.5 * scores.max(axis=2).sum(axis=1) - normalization
-            is_decodable = bound > LOG_HYPOTHESES + MIN_LOG_ODDS
-            if not is_decodable.any():
+            kept = is_decodable(lines, scores)
+            if not kept.any():
                 continue
-            doubtful, lines, scores = (
-                doubtful[is_decodable],
-                lines[is_decodable],
-                scores[is_decodable],
-            )
+            doubtful, lines, scores = doubtful[kept], lines[kept], scores[kept]
             position, shift, rivals[doubtful, axis] = search_position(
                 scores,
                 codec,
-                try_misread_columns=bool(is_small[doubtful[0]]),
+                try_misread_columns=kind is is_small,
                 beam_width=beam_width,
             )
             estimates.position[doubtful, axis], estimates.shift[doubtful, axis] = position, shift
@@ -256,11 +251,30 @@ def resolve_doubts(
             estimates.order_log_odds[doubtful, axis] = compare_with_any_order(
                 position, shift, scores, codec
             )
+        with np.errstate(over="ignore"):
+            alternatives[:, axis] = (
+                UNLISTED_RIVALS_FACTOR * rivals[:, axis]
+                + np.exp(-estimates.log_odds[:, axis])
+                + FOREIGN_CODEC_ODDS
+                * AGREEING_AXIS_FRACTION
+                * np.exp(-estimates.order_log_odds[:, axis])
+            )
     with np.errstate(over="ignore"):
-        own_axis = UNLISTED_RIVALS_FACTOR * rivals + np.exp(-estimates.log_odds)
-        own_axis += FOREIGN_CODEC_ODDS * AGREEING_AXIS_FRACTION * np.exp(-estimates.order_log_odds)
         foreign = FOREIGN_CODEC_ODDS * np.exp(-estimates.order_log_odds.sum(axis=1))
-    result: NDArray[np.float64] = (1 / (1 + own_axis)).prod(axis=1) / (1 + foreign)
+    result: NDArray[np.float64] = (1 / (1 + alternatives)).prod(axis=1) / (1 + foreign)
+    return result
+
+
+def is_decodable(lines: Bits, scores: Bits) -> NDArray[np.bool_]:
+    """Return whether windows (n,) could be accepted if each line had its best phase."""
+    best = scores.max(axis=2)
+    evidence = 0.5 * best.sum(axis=1) - np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
+    likely = (scores > best[..., None] - MAX_LIKELY_PHASE_GAP).sum(axis=2)
+    order = np.log(MAIN_SEQUENCE_LENGTH / likely).sum(axis=1)
+    result: NDArray[np.bool_] = (evidence > LOG_HYPOTHESES + MIN_LOG_ODDS) & (
+        order
+        > LOG_HYPOTHESES + MIN_LOG_ODDS + math.log(FOREIGN_CODEC_ODDS * AGREEING_AXIS_FRACTION)
+    )
     return result
 
 

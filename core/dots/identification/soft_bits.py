@@ -4,8 +4,8 @@ A bit is one if the dot is beyond the diagonal through its grid position (Hostet
 Fig. 6). A dot is either about the nominal offset of one of the four symbols, with the scatter of
 the frame's own dots, or an outlier (dirt, texture) anywhere in its cell. The log likelihood ratio
 of a bit, one over zero, compares the two symbols that have it with the two that do not. The
-fraction of outliers is that of the frame: its dots far from all symbols count, and one more (rule of
-succession). (The paper uses the polynomial of Eq. 9 instead.)
+fraction of outliers is that of the frame: its dots far from all symbols, and one more by the rule
+of succession. (The paper uses the polynomial of Eq. 9 instead.)
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from locatk.core.kernels import kernels
 MAX_WINDOW_DOTS = 40
 """Largest number of columns and rows, about the middle of a frame, that are decoded."""
 
-WRONG_SYMBOL_LIKELIHOOD = 0.0004
+WRONG_SYMBOL_LIKELIHOOD = 0.0002
 """Likelihood of a bit against which the position of its dot speaks with certainty: a print with
-defects, where four dots in ten thousand are those of another symbol. It limits a soft bit to 7.5.
+defects, where two dots in ten thousand are those of another symbol. It limits a soft bit to 8.
 """
 
 MIN_BIT_SIGMA_PITCHES = 0.03
