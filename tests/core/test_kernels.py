@@ -88,6 +88,7 @@ def fit_lattices() -> Arguments:
         "symbol_sigma": 0.03,
         "lens_radius": 4.0,
         "offset": 1 / 6,
+        "min_seed_power": 0.2,
         "parameters": np.zeros((n, 9)),
         "uv": np.zeros((n, m, 2), np.float32),
         "cells": np.zeros((n, m, 2), np.float32),

@@ -131,7 +131,9 @@ class DecodedWindows:
     border: NDArray[np.bool_]
 
 
-def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWindows:
+def identify_windows(
+    column_bits: Bits, row_bits: Bits, codec: Codec, *, is_thorough: bool = True
+) -> DecodedWindows:
     """Decode position, section and rotation of n windows.
 
     Parameters
@@ -141,6 +143,8 @@ def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> Decoded
         (column bit 1), and right or down (row bit 1); 0 without a dot. Bits of symbols that are
         certain: plus or minus 7.
     codec : Codec
+    is_thorough : bool
+        Search small windows twice if they have no certain position.
 
     Raises
     ------
@@ -151,11 +155,11 @@ def identify_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> Decoded
     if max(rows, columns) > MAX_WINDOW_LINES:
         raise InputError(f"a window of {columns} x {rows} positions, more than {MAX_WINDOW_LINES}")
     if not MIN_EXACT_LINES <= min(rows, columns) <= max(rows, columns) <= MAX_SMALL_WINDOW_LINES:
-        return _decode_soft(column_bits, row_bits, codec)
+        return _decode_soft(column_bits, row_bits, codec, is_thorough)
     result = _decode_exact(column_bits, row_bits, codec)
     doubtful = np.flatnonzero(result.confidence < MIN_CONFIDENCE)
     if len(doubtful):
-        soft = _decode_soft(column_bits[doubtful], row_bits[doubtful], codec)
+        soft = _decode_soft(column_bits[doubtful], row_bits[doubtful], codec, is_thorough)
         for field in fields(DecodedWindows):
             getattr(result, field.name)[doubtful] = getattr(soft, field.name)
     return result
@@ -182,7 +186,9 @@ def _decode_exact(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWin
     )
 
 
-def _decode_soft(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWindows:
+def _decode_soft(
+    column_bits: Bits, row_bits: Bits, codec: Codec, is_thorough: bool
+) -> DecodedWindows:
     """Decode windows with missing or wrong dots."""
     windows = _pad_to_square(column_bits), _pad_to_square(row_bits)
     length = windows[0].shape[1]
@@ -190,7 +196,7 @@ def _decode_soft(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWind
     confidence = resolve_doubts(estimates, *windows, codec)
     dots = np.count_nonzero(windows[0], axis=(1, 2))
     doubtful = np.flatnonzero((confidence < MIN_CONFIDENCE) & (dots <= MAX_SMALL_WINDOW_DOTS))
-    if len(doubtful):
+    if is_thorough and len(doubtful):
         part = windows[0][doubtful], windows[1][doubtful]
         for rotation in np.argsort(-rotation_scores(*part), axis=0)[:2]:
             other = estimate_rotated_windows(*part, rotation, codec)

@@ -204,7 +204,7 @@ def _localize_dots(
     if len(fitted) < n:
         lattices = lattices.select(fitted)
     half = window_half_width(lattices)
-    windows = identify_windows(*soft_bits(lattices, half), codec)
+    windows = identify_windows(*soft_bits(lattices, half), codec, is_thorough=is_thorough)
     poses = localize_windows(lattices, half, windows, codec)
     rejected = np.full(len(fitted), "", object)
     rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
