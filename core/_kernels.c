@@ -481,22 +481,42 @@ static float minimum_offset(const float *minimum, int step, float brightness, fl
     return offset < -0.5f ? -0.5f : offset > 0.5f ? 0.5f : offset;
 }
 
-/* Grey levels on a ring of four pixels about a minimum, within the image, in ascending order. */
-enum { RING_SAMPLES = 8 };
+/* Read the grey levels on a ring of four pixels about a minimum, within the image, in ascending
+ * order; return 0 if three of them are not brighter than `least`. */
+enum { RING_SAMPLES = 8, MAX_DARK_SAMPLES = 2, RING_RADIUS = 4 };
 
-static void sample_ring(const float *smooth, int h, int w, int x, int y, float *ring)
+static inline void order(float *values, int i, int j)
+{
+    const float a = values[i], b = values[j];
+    values[i] = a < b ? a : b;
+    values[j] = a < b ? b : a;
+}
+
+static int sample_ring(const float *smooth, int h, int w, int x, int y, float least, float *ring)
 {
     static const int steps[RING_SAMPLES][2] = {{4, 0},  {3, 3},   {0, 4},  {-3, 3},
                                                {-4, 0}, {-3, -3}, {0, -4}, {3, -3}};
+    const float *centre = smooth + (size_t)y * w + x;
+    const int is_inside =
+        x >= RING_RADIUS && x < w - RING_RADIUS && y >= RING_RADIUS && y < h - RING_RADIUS;
+    int dark = 0;
     for (int k = 0; k < RING_SAMPLES; k++) {
-        int column = x + steps[k][0], row = y + steps[k][1];
-        column = column < 0 ? 0 : column >= w ? w - 1 : column;
-        row = row < 0 ? 0 : row >= h ? h - 1 : row;
-        const float value = smooth[(size_t)row * w + column];
-        int j = k;
-        for (; j > 0 && ring[j - 1] > value; j--) ring[j] = ring[j - 1];
-        ring[j] = value;
+        int dx = steps[k][0], dy = steps[k][1];
+        if (!is_inside) {
+            dx = x + dx < 0 ? -x : x + dx >= w ? w - 1 - x : dx;
+            dy = y + dy < 0 ? -y : y + dy >= h ? h - 1 - y : dy;
+        }
+        ring[k] = centre[(Py_ssize_t)dy * w + dx];
+        dark += !(ring[k] > least);
     }
+    if (dark > MAX_DARK_SAMPLES) return 0;
+    /* A sorting network of eight values, without branches. */
+    float *r = ring;
+    order(r, 0, 1), order(r, 2, 3), order(r, 4, 5), order(r, 6, 7), order(r, 0, 2);
+    order(r, 1, 3), order(r, 4, 6), order(r, 5, 7), order(r, 1, 2), order(r, 5, 6);
+    order(r, 0, 4), order(r, 3, 7), order(r, 1, 5), order(r, 2, 6), order(r, 1, 4);
+    order(r, 3, 6), order(r, 2, 4), order(r, 3, 5), order(r, 3, 4);
+    return 1;
 }
 
 typedef struct {
@@ -535,10 +555,10 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
              pixel++) {
             const int x = (int)(pixel - mark);
             float ring[RING_SAMPLES];
-            sample_ring(d->smooth, h, w, x, y, ring);
-            /* Two of the samples may be on neighbouring dots, but not three. */
-            const float grey = d->smooth[(size_t)y * w + x], contrast = ring[2] - grey;
-            if (!(contrast > d->min_contrast)) continue;
+            /* Two of the samples may be on neighbouring dots. */
+            const float grey = d->smooth[(size_t)y * w + x];
+            if (!sample_ring(d->smooth, h, w, x, y, grey + d->min_contrast, ring)) continue;
+            const float contrast = ring[MAX_DARK_SAMPLES] - grey;
             d->brightnesses[minima] = 0.5f * (ring[4] + ring[5]);
             d->contrasts[minima] = contrast / ring[2];
             dots[minima].x = (float)x;

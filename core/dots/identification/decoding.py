@@ -221,54 +221,79 @@ def resolve_doubts(
 
     A better position and its evidence replace those in ``estimates``.
     """
-    n = len(column_bits)
-    rivals, alternatives = np.zeros((n, 2)), np.zeros((n, 2))
+    rivals = np.zeros_like(estimates.log_odds)
+    is_doubtful = (estimates.wrong > 0) & (estimates.log_odds < CERTAIN_LOG_ODDS)
+    is_doubtful |= estimates.lead < MIN_CERTAIN_LEAD
     dots = np.count_nonzero(column_bits, axis=(1, 2))
-    is_small = dots <= MAX_SMALL_WINDOW_DOTS
-    for axis in range(2):
-        log_odds, wrong = estimates.log_odds[:, axis], estimates.wrong[:, axis]
-        is_doubtful = (wrong > 0) & (log_odds < CERTAIN_LOG_ODDS)
-        is_doubtful |= estimates.lead[:, axis] < MIN_CERTAIN_LEAD
-        is_doubtful |= wrong > MAX_CERTAIN_WRONG_FRACTION * dots
-        # The second axis cannot save a window whose first axis has no position.
-        is_doubtful &= alternatives[:, 0] < 1 - MIN_CONFIDENCE
-        for kind in (is_small, ~is_small):
-            doubtful = np.flatnonzero(is_doubtful & kind)
-            if not len(doubtful):
-                continue
-            printed = rotate_to_print(
-                column_bits[doubtful], row_bits[doubtful], estimates.rotation[doubtful]
-            )
-            lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
-            scores = phase_scores(lines)
-            kept = is_decodable(lines, scores)
-            if not kept.any():
-                continue
-            doubtful, lines, scores = doubtful[kept], lines[kept], scores[kept]
-            position, shift, rivals[doubtful, axis] = search_position(
-                scores,
-                codec,
-                try_misread_columns=kind is is_small,
-                beam_width=beam_width,
-            )
-            estimates.position[doubtful, axis], estimates.shift[doubtful, axis] = position, shift
-            log_odds, wrong = compare_with_pattern(position, shift, lines, codec)
-            estimates.log_odds[doubtful, axis], estimates.wrong[doubtful, axis] = log_odds, wrong
-            estimates.order_log_odds[doubtful, axis] = compare_with_any_order(
-                position, shift, scores, codec
-            )
-        with np.errstate(over="ignore"):
-            alternatives[:, axis] = (
-                UNLISTED_RIVALS_FACTOR * rivals[:, axis]
-                + np.exp(-estimates.log_odds[:, axis])
-                + FOREIGN_CODEC_ODDS
-                * AGREEING_AXIS_FRACTION
-                * np.exp(-estimates.order_log_odds[:, axis])
-            )
+    is_doubtful |= estimates.wrong > MAX_CERTAIN_WRONG_FRACTION * dots[:, None]
+    if is_doubtful.any():
+        is_small = dots <= MAX_SMALL_WINDOW_DOTS
+        for axis in range(2):
+            if axis:
+                # The second axis cannot save a window whose first axis has no position.
+                alternatives = _alternatives(estimates, rivals)
+                is_doubtful[:, axis] &= alternatives[:, 0] < 1 - MIN_CONFIDENCE
+            for kind in (is_small, ~is_small):
+                doubtful = np.flatnonzero(is_doubtful[:, axis] & kind)
+                rivals[doubtful, axis] = _search_axis(
+                    estimates,
+                    doubtful,
+                    axis,
+                    (column_bits, row_bits),
+                    codec,
+                    try_misread_columns=kind is is_small,
+                    beam_width=beam_width,
+                )
     with np.errstate(over="ignore"):
         foreign = FOREIGN_CODEC_ODDS * np.exp(-estimates.order_log_odds.sum(axis=1))
-    result: NDArray[np.float64] = (1 / (1 + alternatives)).prod(axis=1) / (1 + foreign)
+    likelihood = 1 / (1 + _alternatives(estimates, rivals))
+    result: NDArray[np.float64] = likelihood[:, 0] * likelihood[:, 1] / (1 + foreign)
     return result
+
+
+def _alternatives(estimates: WindowEstimates, rivals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the odds (n, 2) against the position on each axis."""
+    foreign = FOREIGN_CODEC_ODDS * AGREEING_AXIS_FRACTION
+    with np.errstate(over="ignore"):
+        result: NDArray[np.float64] = UNLISTED_RIVALS_FACTOR * rivals + np.exp(-estimates.log_odds)
+        result += foreign * np.exp(-estimates.order_log_odds)
+    return result
+
+
+def _search_axis(
+    estimates: WindowEstimates,
+    doubtful: Integers,
+    axis: int,
+    bits: tuple[Bits, Bits],
+    codec: Codec,
+    *,
+    try_misread_columns: bool,
+    beam_width: int,
+) -> NDArray[np.float64]:
+    """Search the positions of doubtful windows (k,) on an axis, and replace those in ``estimates``.
+
+    Return the likelihood (k,) of rivals; 0 for windows that cannot be accepted in any case.
+    """
+    rivals = np.zeros(len(doubtful))
+    if not len(doubtful):
+        return rivals
+    printed = rotate_to_print(bits[0][doubtful], bits[1][doubtful], estimates.rotation[doubtful])
+    lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
+    scores = phase_scores(lines)
+    kept = is_decodable(lines, scores)
+    if not kept.any():
+        return rivals
+    doubtful, lines, scores = doubtful[kept], lines[kept], scores[kept]
+    position, shift, rivals[kept] = search_position(
+        scores, codec, try_misread_columns=try_misread_columns, beam_width=beam_width
+    )
+    estimates.position[doubtful, axis], estimates.shift[doubtful, axis] = position, shift
+    log_odds, wrong = compare_with_pattern(position, shift, lines, codec)
+    estimates.log_odds[doubtful, axis], estimates.wrong[doubtful, axis] = log_odds, wrong
+    estimates.order_log_odds[doubtful, axis] = compare_with_any_order(
+        position, shift, scores, codec
+    )
+    return rivals
 
 
 def is_decodable(lines: Bits, scores: Bits) -> NDArray[np.bool_]:

@@ -148,6 +148,9 @@ def localize_frames(
             points, dots = _detect_points(images[remaining], camera, level)
             part, _, _ = _localize_dots(points, dots, codec, camera is None, min_confidence)
             # Strong tilt, strong distortion and covered frames take longer than all others.
+            if part.accepted.all():
+                result.update(remaining, part)
+                break
             again = np.flatnonzero(~part.accepted & (part.rejected != TOO_FEW_DOTS))
             if len(again):
                 thorough, _, _ = _localize_dots(
@@ -194,23 +197,33 @@ def _localize_dots(
     is_thorough: bool = False,
 ) -> tuple[LocalizedFrames, DotLattices, DecodedWindows | None]:
     """Localize frames by their dots; return also the lattices and windows of those with a grid."""
-    n = len(points)
-    frames = unlocalized_frames(n, NO_GRID)
-    frames.rejected[dots.counts < MIN_LATTICE_DOTS] = TOO_FEW_DOTS
     lattices = fit_lattices(points, dots.valid, lens=lens, is_thorough=is_thorough)
-    fitted = np.flatnonzero(lattices.fitted)
-    if not len(fitted):
-        return frames, lattices, None
-    if len(fitted) < n:
-        lattices = lattices.select(fitted)
+    if not lattices.fitted.all():
+        frames = unlocalized_frames(len(points), NO_GRID)
+        frames.rejected[dots.counts < MIN_LATTICE_DOTS] = TOO_FEW_DOTS
+        fitted = np.flatnonzero(lattices.fitted)
+        if not len(fitted):
+            return frames, lattices, None
+        part, lattices, windows = _localize_lattices(
+            lattices.select(fitted), codec, min_confidence, is_thorough=is_thorough
+        )
+        frames.update(fitted, part)
+        return frames, lattices, windows
+    return _localize_lattices(lattices, codec, min_confidence, is_thorough=is_thorough)
+
+
+def _localize_lattices(
+    lattices: DotLattices, codec: Codec, min_confidence: float, *, is_thorough: bool
+) -> tuple[LocalizedFrames, DotLattices, DecodedWindows]:
+    """Localize frames that all have a lattice."""
     half = window_half_width(lattices)
     windows = identify_windows(*soft_bits(lattices, half), codec, is_thorough=is_thorough)
     poses = localize_windows(lattices, half, windows, codec)
-    rejected = np.full(len(fitted), "", object)
+    rejected = np.full(len(windows.confidence), "", object)
     rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
     rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
     rejected[(rejected != "") & windows.border] = SECTION_BORDER
-    part = LocalizedFrames(
+    frames = LocalizedFrames(
         grid=poses.grid,
         section=windows.section,
         heading=poses.heading,
@@ -220,9 +233,6 @@ def _localize_dots(
         confidence=windows.confidence,
         rejected=rejected,
     )
-    if len(fitted) == n:
-        return part, lattices, windows
-    frames.update(fitted, part)
     return frames, lattices, windows
 
 
