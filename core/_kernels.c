@@ -480,9 +480,14 @@ static float paper_slope(const float *paper, int index, int count, int step, int
     int before = middle - reach, after = middle + reach;
     before = before > 0 ? before : 0;
     after = after < count - 1 ? after : count - 1;
-    if (after <= before || !(*paper > 0)) return 0;
-    const float difference = paper[(after - index) * step] - paper[(before - index) * step];
-    const float slope = difference / (float)((after - before) * block) / *paper;
+    if (before >= middle || middle >= after || !(*paper > 0)) return 0;
+    const float here = paper[(middle - index) * step];
+    const float low = (here - paper[(before - index) * step]) / (float)((middle - before) * block);
+    const float high = (paper[(after - index) * step] - here) / (float)((after - middle) * block);
+    if (!(low * high > 0)) return 0;
+    /* At an edge of the light, the slope is at most twice that of the flatter side. */
+    const float mean = 0.5f * (low + high), least = 2 * (fabsf(low) < fabsf(high) ? low : high);
+    const float slope = (fabsf(least) < fabsf(mean) ? least : mean) / *paper;
     return slope < -limit ? -limit : slope > limit ? limit : slope;
 }
 

@@ -175,21 +175,30 @@ def detect_dots_numpy(images: NDArray[np.uint8], max_dots: int = 4096) -> Detect
 def _paper_slopes(lines: NDArray[np.float32], block: NDArray[np.intp]) -> NDArray[np.float32]:
     """Return the slopes (n,) of the paper's brightness about blocks, relative to it [1 / px].
 
-    ``lines`` (n, blocks) are those with the blocks. The blocks whose difference is taken are moved
-    inwards where the windows over which they are averaged would leave the image.
+    At an edge of the light they are limited to twice the slope of the flatter side (monotonized
+    central differences, van Leer 1977). ``lines`` (n, blocks) are those with the blocks. The blocks
+    whose difference is taken are moved inwards where the windows over which they are averaged would
+    leave the image.
     """
     count = lines.shape[1]
     first = PAPER_WINDOW_BLOCKS // 2 + SLOPE_REACH_BLOCKS
     middle = np.minimum(np.maximum(block, first), count - 1 - first)
     before = np.maximum(middle - SLOPE_REACH_BLOCKS, 0)
     after = np.minimum(middle + SLOPE_REACH_BLOCKS, count - 1)
+    is_known = (before < middle) & (middle < after)
+    before, middle, after = (np.where(is_known, k, block) for k in (before, middle, after))
     order = np.arange(len(lines))
-    difference = lines[order, np.maximum(after, 0)] - lines[order, np.minimum(before, count - 1)]
-    steps = ((after - before) * PAPER_BLOCK_PX).astype(np.float32)
-    brightness = lines[order, block]
+    here, brightness = lines[order, middle], lines[order, block]
+    is_known &= brightness > 0
     with np.errstate(invalid="ignore", divide="ignore"):
-        slope = difference / steps / brightness
-    slope = np.where((steps > 0) & (brightness > 0), slope, 0)
+        low = (here - lines[order, before]) / ((middle - before) * PAPER_BLOCK_PX).astype(
+            np.float32
+        )
+        high = (lines[order, after] - here) / ((after - middle) * PAPER_BLOCK_PX).astype(np.float32)
+        least = 2 * np.minimum(np.abs(low), np.abs(high))
+        mean = np.float32(0.5) * (low + high)
+        slope = np.copysign(np.minimum(np.abs(mean), least), mean) / brightness
+        slope = np.where(is_known & (low * high > 0), slope, 0)
     limit = np.float32(MAX_PAPER_SLOPE_PER_PX)
     result: NDArray[np.float32] = np.clip(slope, -limit, limit).astype(np.float32)
     return result
