@@ -472,7 +472,7 @@ static float median_contrast(float *contrasts, int count, int min_dots, int spli
  * the blocks `reach` before and after. They are moved inwards where the windows of `window` blocks
  * over which they are averaged would leave the image. */
 static float paper_slope(const float *paper, int index, int count, int step, int block, int window,
-                         int reach, float brightness, float limit)
+                         int reach, float limit)
 {
     const int first = window / 2 + reach, last = count - 1 - first;
     int middle = index > first ? index : first;
@@ -480,9 +480,14 @@ static float paper_slope(const float *paper, int index, int count, int step, int
     int before = middle - reach, after = middle + reach;
     before = before > 0 ? before : 0;
     after = after < count - 1 ? after : count - 1;
-    if (after <= before) return 0;
-    const float difference = paper[(after - index) * step] - paper[(before - index) * step];
-    const float slope = difference / (float)((after - before) * block) / brightness;
+    if (before >= middle || middle >= after || !(*paper > 0)) return 0;
+    const float here = paper[(middle - index) * step];
+    const float low = (here - paper[(before - index) * step]) / (float)((middle - before) * block);
+    const float high = (paper[(after - index) * step] - here) / (float)((after - middle) * block);
+    if (!(low * high > 0)) return 0;
+    /* At an edge of the light, the slope is at most twice that of the flatter side. */
+    const float mean = 0.5f * (low + high), least = 2 * (fabsf(low) < fabsf(high) ? low : high);
+    const float slope = (fabsf(least) < fabsf(mean) ? least : mean) / *paper;
     return slope < -limit ? -limit : slope > limit ? limit : slope;
 }
 
@@ -500,6 +505,44 @@ static float minimum_offset(const float *minimum, int step, float brightness, fl
     curvature = curvature > 1e-6f ? curvature : 1e-6f;
     const float offset = 0.5f * (b - a) / curvature + smoothing_variance * slope;
     return offset < -1.0f ? -1.0f : offset > 1.0f ? 1.0f : offset;
+}
+
+/* Read the grey levels on a ring of four pixels about a minimum, within the image, in ascending
+ * order; return 0 if three of them are not brighter than `least`. */
+enum { RING_SAMPLES = 8, MAX_DARK_SAMPLES = 2, RING_RADIUS = 4 };
+
+static inline void order(float *values, int i, int j)
+{
+    const float a = values[i], b = values[j];
+    values[i] = a < b ? a : b;
+    values[j] = a < b ? b : a;
+}
+
+static int sample_ring(const float *smooth, int h, int w, int x, int y, float least, float *ring)
+{
+    static const int steps[RING_SAMPLES][2] = {{4, 0},  {3, 3},   {0, 4},  {-3, 3},
+                                               {-4, 0}, {-3, -3}, {0, -4}, {3, -3}};
+    const float *centre = smooth + (size_t)y * w + x;
+    const int is_inside =
+        x >= RING_RADIUS && x < w - RING_RADIUS && y >= RING_RADIUS && y < h - RING_RADIUS;
+    int dark = 0;
+    for (int k = 0; k < RING_SAMPLES; k++) {
+        int dx = steps[k][0], dy = steps[k][1];
+        if (!is_inside) {
+            dx = x + dx < 0 ? -x : x + dx >= w ? w - 1 - x : dx;
+            dy = y + dy < 0 ? -y : y + dy >= h ? h - 1 - y : dy;
+        }
+        ring[k] = centre[(Py_ssize_t)dy * w + dx];
+        dark += !(ring[k] > least);
+    }
+    if (dark > MAX_DARK_SAMPLES) return 0;
+    /* A sorting network of eight values, without branches. */
+    float *r = ring;
+    order(r, 0, 1), order(r, 2, 3), order(r, 4, 5), order(r, 6, 7), order(r, 0, 2);
+    order(r, 1, 3), order(r, 4, 6), order(r, 5, 7), order(r, 1, 2), order(r, 5, 6);
+    order(r, 0, 4), order(r, 3, 7), order(r, 1, 5), order(r, 2, 6), order(r, 1, 4);
+    order(r, 3, 6), order(r, 2, 4), order(r, 3, 5), order(r, 3, 4);
+    return 1;
 }
 
 typedef struct {
@@ -535,16 +578,16 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
     int minima = 0;
     for (int y = 2; y < h - 2; y++) {
         const uint8_t *mark = d->marks + (size_t)y * w, *end = mark + w - 2;
-        const int row = y / d->block < d->rows ? y / d->block : d->rows - 1;
         for (const uint8_t *pixel = mark + 2; (pixel = memchr(pixel, 1, (size_t)(end - pixel)));
              pixel++) {
             const int x = (int)(pixel - mark);
-            const int column = x / d->block < d->columns ? x / d->block : d->columns - 1;
-            const float brightness = d->paper[row * d->columns + column];
-            const float contrast = brightness - d->smooth[(size_t)y * w + x];
-            if (!(contrast > d->min_contrast)) continue;
-            d->brightnesses[minima] = brightness;
-            d->contrasts[minima] = contrast / brightness;
+            float ring[RING_SAMPLES];
+            /* Two of the samples may be on neighbouring dots. */
+            const float grey = d->smooth[(size_t)y * w + x];
+            if (!sample_ring(d->smooth, h, w, x, y, grey + d->min_contrast, ring)) continue;
+            const float contrast = ring[MAX_DARK_SAMPLES] - grey;
+            d->brightnesses[minima] = 0.5f * (ring[4] + ring[5]);
+            d->contrasts[minima] = contrast / ring[2];
             dots[minima].x = (float)x;
             dots[minima++].y = (float)y;
         }
@@ -558,16 +601,17 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
     int kept = 0;
     for (int k = 0; k < minima; k++) {
         if (!(d->contrasts[k] > threshold)) continue;
-        const float brightness = d->brightnesses[k], ink = d->contrasts[k], top = logf(ink);
+        const float brightness = d->brightnesses[k];
         const int px = (int)dots[k].x, py = (int)dots[k].y;
         const float *minimum = d->smooth + (size_t)py * w + (size_t)px;
+        const float ink = 1 - *minimum / brightness, top = logf(ink);
         const int row = py / d->block < rows ? py / d->block : rows - 1;
         const int column = px / d->block < columns ? px / d->block : columns - 1;
         const float *paper = d->paper + row * columns + column;
         const float slope_x = paper_slope(paper, column, columns, 1, d->block, d->window,
-                                          d->slope_reach, brightness, d->max_slope);
+                                          d->slope_reach, d->max_slope);
         const float slope_y = paper_slope(paper, row, rows, columns, d->block, d->window,
-                                          d->slope_reach, brightness, d->max_slope);
+                                          d->slope_reach, d->max_slope);
         const float x = dots[k].x
                         + minimum_offset(minimum, 1, brightness, slope_x, ink, top,
                                          smoothing_variance);
@@ -663,12 +707,15 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
 enum { A_U = 0, C_U = 2, A_V = 3, C_V = 5, PERSPECTIVE = 6, LENS = 8, PARAMETERS = 9 };
 
 typedef struct {
-    int seeds, min_dots, rings;
+    int seeds, min_dots, rings, passes; /* passes: steps in each ring */
+    int is_thorough;                    /* seeds from spectra of patches instead of the centre */
     const double *ring, *prior;          /* radii; inverse variances of the parameters */
     double min_neighbour, max_neighbour; /* of square distances of neighbours [square pitches] */
     double cell_gate, cell_sigma;        /* gate and sigma of dots about cell centres [pitches] */
     double symbol_gate, symbol_sigma;    /* gate and sigma of dots about their symbols [pitches] */
     double lens_radius, offset; /* radius from which the lens is fitted; of a symbol [pitches] */
+    double min_seed_power;      /* least power of both peaks of a spectrum */
+    double min_sigmas;          /* least number of dots, in standard deviations beyond chance */
 } LatticeOptions;
 
 enum { LANES = 8 };
@@ -985,28 +1032,211 @@ static int estimate_seed(const float *points, const uint8_t *valid, int m,
     return 1;
 }
 
-/* Fit the lattice of the dots of a frame; return 0 if there is none. */
-static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid, int m, int lens,
-                       const LatticeOptions *options, float *scratch, double *parameters,
-                       float *uv, float *cells, double *sigma)
+/* Number of frequencies along an axis of a spectrum; the other has half of them and zero. */
+enum { MAX_FREQUENCIES = 48 };
+
+/* Estimate the lattice of the dots nearest to `middle` from the two highest peaks of their spectrum
+ * in different directions, which no tilt and few foreign dots change; node (0, 0) is at the median
+ * of the dots. Return 0 if the peaks are weak. `scratch` holds m floats and, for each seed, 10 and
+ * 6 for each frequency. */
+static int spectral_seed(const float *points, const uint8_t *valid, int m, const float *middle,
+                         const LatticeOptions *options, float *scratch, double *parameters)
 {
-    if (!estimate_seed(points, valid, m, options, scratch, parameters)) return 0;
+    const int seeds = options->seeds;
+    float *squares = scratch, *x = squares + m, *y = x + seeds, *work = y + seeds;
+    int dots = 0, count = 0;
+    for (int i = 0; i < m; i++) {
+        const float dx = points[2 * i] - middle[0], dy = points[2 * i + 1] - middle[1];
+        if (valid[i]) squares[dots++] = dx * dx + dy * dy;
+    }
+    if (dots < options->min_dots) return 0;
+    const int wanted = dots < seeds ? dots : seeds;
+    const float threshold = nth_smallest(squares, dots, wanted - 1);
+    for (int i = 0; i < m && count < wanted; i++) {
+        const float dx = points[2 * i] - middle[0], dy = points[2 * i + 1] - middle[1];
+        if (!valid[i] || dx * dx + dy * dy > threshold) continue;
+        x[count] = points[2 * i];
+        y[count++] = points[2 * i + 1];
+    }
+    float centre[2];
+    memcpy(work, x, (size_t)count * sizeof(float));
+    centre[0] = nth_smallest(work, count, count / 2);
+    memcpy(work, y, (size_t)count * sizeof(float));
+    centre[1] = nth_smallest(work, count, count / 2);
+    float radius = 0;
+    for (int i = 0; i < count; i++) {
+        x[i] -= centre[0];
+        y[i] -= centre[1];
+        const float square = x[i] * x[i] + y[i] * y[i];
+        radius = square > radius ? square : radius;
+    }
+    radius = sqrtf(radius);
+    float *third = work + 2 * seeds;
+    third_nearest(x, y, count, work, work + seeds, third);
+    const float pitch = sqrtf(nth_smallest(third, count, count / 2));
+    if (!(pitch > 0)) return 0;
+    /* Frequencies up to 1.7 per pitch, so near to each other that no peak is missed. */
+    const int half = (int)lesser(ceilf(1.7f / pitch / (0.3f / radius)), MAX_FREQUENCIES / 2 - 1);
+    const float step = 1.7f / pitch / (float)half;
+    const float two_pi = 6.2831853f;
+    float *waves[2][2]; /* cosine and sine of x and y, for each frequency and dot */
+    for (int axis = 0; axis < 2; axis++)
+        for (int part = 0; part < 2; part++)
+            waves[axis][part] = work + (2 * axis + part) * MAX_FREQUENCIES / 2 * seeds;
+    for (int axis = 0; axis < 2; axis++)
+        for (int k = 0; k <= half; k++)
+            for (int i = 0; i < count; i++) {
+                const float phase = two_pi * step * (float)k * (axis ? y[i] : x[i]);
+                waves[axis][0][k * count + i] = cosf(phase);
+                waves[axis][1][k * count + i] = sinf(phase);
+            }
+    float *power = work + 4 * MAX_FREQUENCIES / 2 * seeds;
+    float best[2] = {0, 0}, frequency[2][2] = {{0}};
+    double phasor[2][2] = {{0}};
+    for (int row = 0; row <= half; row++)
+        for (int column = 0; column <= half; column++) {
+            const float *restrict a = waves[0][0] + column * count, *restrict b = waves[0][1] + column * count;
+            const float *restrict c = waves[1][0] + row * count, *restrict d = waves[1][1] + row * count;
+            float sums[4][LANES] = {{0}};
+            int i = 0;
+            for (; i + LANES <= count; i += LANES)
+                for (int l = 0; l < LANES; l++) {
+                    sums[0][l] += a[i + l] * c[i + l];
+                    sums[1][l] += b[i + l] * d[i + l];
+                    sums[2][l] += a[i + l] * d[i + l];
+                    sums[3][l] += b[i + l] * c[i + l];
+                }
+            float total[4];
+            for (int k = 0; k < 4; k++) total[k] = (float)sum_lanes(sums[k]);
+            for (; i < count; i++) {
+                total[0] += a[i] * c[i];
+                total[1] += b[i] * d[i];
+                total[2] += a[i] * d[i];
+                total[3] += b[i] * c[i];
+            }
+            /* Frequencies (column, row) and (-column, row). */
+            for (int side = 0; side < 2; side++) {
+                const float re = side ? total[0] + total[1] : total[0] - total[1];
+                const float im = side ? total[2] - total[3] : total[2] + total[3];
+                power[(row * (half + 1) + column) * 2 + side] = (re * re + im * im) / (float)(count * count);
+            }
+        }
+    for (int peak = 0; peak < 2; peak++) {
+        int index = -1;
+        for (int k = 0; k < 2 * (half + 1) * (half + 1); k++) {
+            if (!(power[k] > best[peak])) continue;
+            const float fx = (float)(k / 2 % (half + 1)) * step * (k % 2 ? -1.0f : 1.0f);
+            const float fy = (float)(k / 2 / (half + 1)) * step, size = hypotf(fx, fy);
+            if (size < 0.5f / pitch || size > 1.700001f / pitch) continue;
+            if (peak) {
+                const float first = hypotf(frequency[0][0], frequency[0][1]);
+                const float sine = fabsf(fx * frequency[0][1] - fy * frequency[0][0]) / (size * first);
+                if (sine < 0.6f || size < 0.5f * first || size > 2 * first) continue;
+            }
+            best[peak] = power[k];
+            frequency[peak][0] = fx;
+            frequency[peak][1] = fy;
+            index = k;
+        }
+        if (index < 0 || best[peak] < options->min_seed_power) return 0;
+        for (int i = 0; i < count; i++) {
+            const double phase = 6.283185307179586 * (frequency[peak][0] * x[i] + frequency[peak][1] * y[i]);
+            phasor[peak][0] += cos(phase);
+            phasor[peak][1] += sin(phase);
+        }
+    }
+    memset(parameters, 0, PARAMETERS * sizeof(double));
+    const int is_swapped = fabsf(frequency[0][0]) < fabsf(frequency[1][0]);
+    for (int axis = 0; axis < 2; axis++) {
+        const int peak = is_swapped ? 1 - axis : axis;
+        const double sign = frequency[peak][axis] < 0 ? -1 : 1;
+        double *a = parameters + 3 * axis;
+        a[0] = sign * frequency[peak][0];
+        a[1] = sign * frequency[peak][1];
+        a[2] = -sign * atan2(phasor[peak][1], phasor[peak][0]) / 6.283185307179586
+               - a[0] * centre[0] - a[1] * centre[1];
+    }
+    return 1;
+}
+
+/* Grow the lattice from a seed about node (0, 0) over all dots; return the number of dots near the
+ * offset of a symbol, or -1 if a step fails. */
+static int grow_lattice(const Dots *d, int lens, const LatticeOptions *options, double *parameters)
+{
     for (int r = 0, beyond = 1; r < options->rings && beyond; r++) {
-        project(parameters, d);
         const double ring = options->ring[r] * options->ring[r];
-        beyond = match_cells(d, (float)ring, (float)options->cell_gate);
         const int with_lens = lens && options->ring[r] > options->lens_radius;
-        if (!gauss_newton_step(parameters, d, options->cell_sigma, with_lens, options->prior))
-            return 0;
+        for (int pass = 0; pass < options->passes; pass++) {
+            project(parameters, d);
+            beyond = match_cells(d, (float)ring, (float)options->cell_gate);
+            if (!gauss_newton_step(parameters, d, options->cell_sigma, with_lens, options->prior))
+                return -1;
+        }
     }
     for (int pass = 0; pass < 2; pass++) {
         project(parameters, d);
         match_symbols(d, (float)options->offset, (float)options->symbol_gate);
         if (!gauss_newton_step(parameters, d, options->symbol_sigma, lens, options->prior))
-            return 0;
+            return -1;
     }
     project(parameters, d);
     match_symbols(d, (float)options->offset, (float)options->symbol_gate);
+    for (int k = 0; k < PARAMETERS; k++)
+        if (!isfinite(parameters[k])) return -1;
+    int count = 0;
+    for (int i = 0; i < d->count; i++) count += d->use[i] > 0;
+    return count;
+}
+
+/* Grow lattices from patches of the frame, and return the count of the one with most dots. */
+static int grow_from_patches(const Dots *d, const float *points, const uint8_t *valid, int m,
+                             int lens, const LatticeOptions *options, float *scratch,
+                             double *parameters)
+{
+    float low[2], high[2];
+    int dots = 0;
+    for (int axis = 0; axis < 2; axis++) {
+        dots = 0;
+        for (int i = 0; i < m; i++)
+            if (valid[i]) scratch[dots++] = points[2 * i + axis];
+        if (dots < options->min_dots) return -1;
+        low[axis] = nth_smallest(scratch, dots, dots / 10);
+        high[axis] = nth_smallest(scratch, dots, dots - 1 - dots / 10);
+    }
+    static const float fractions[][2] = {
+        {0.5f, 0.5f}, {0.15f, 0.15f}, {0.85f, 0.15f}, {0.15f, 0.85f}, {0.85f, 0.85f}};
+    int most = -1;
+    for (int patch = 0; patch < 5; patch++) {
+        const float middle[2] = {low[0] + (high[0] - low[0]) * fractions[patch][0],
+                                 low[1] + (high[1] - low[1]) * fractions[patch][1]};
+        double candidate[PARAMETERS];
+        if (!spectral_seed(points, valid, m, middle, options, scratch, candidate)) continue;
+        const int count = grow_lattice(d, lens, options, candidate);
+        if (count <= most) continue;
+        most = count;
+        memcpy(parameters, candidate, sizeof(candidate));
+        /* Of dots without a lattice, a quarter are near an offset. */
+        if (2 * count > dots) break;
+    }
+    if (most < 0) return -1;
+    project(parameters, d);
+    match_symbols(d, (float)options->offset, (float)options->symbol_gate);
+    return most;
+}
+
+/* Fit the lattice of the dots of a frame; return 0 if there is none. */
+static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid, int m, int lens,
+                       const LatticeOptions *options, float *scratch, double *parameters,
+                       float *uv, float *cells, double *sigma)
+{
+    int count;
+    if (options->is_thorough) {
+        count = grow_from_patches(d, points, valid, m, lens, options, scratch, parameters);
+    } else {
+        if (!estimate_seed(points, valid, m, options, scratch, parameters)) return 0;
+        count = grow_lattice(d, lens, options, parameters);
+    }
+    if (count < 0) return 0;
     /* The central cell becomes the origin. */
     double shift[2];
     for (int axis = 0; axis < 2; axis++) {
@@ -1016,28 +1246,29 @@ static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid,
         a[1] -= shift[axis] * parameters[PERSPECTIVE + 1];
         a[2] -= shift[axis];
     }
-    int count = 0;
     double squares = 0;
     for (int i = 0; i < m; i++) {
         uv[2 * i] = d->u[i] - (float)shift[0];
         uv[2 * i + 1] = d->v[i] - (float)shift[1];
         cells[2 * i] = rintf(uv[2 * i]);
         cells[2 * i + 1] = rintf(uv[2 * i + 1]);
-        if (d->use[i] > 0) {
-            count++;
+        if (d->use[i] > 0)
             squares += (double)(d->residual[0][i] * d->residual[0][i]
                                 + d->residual[1][i] * d->residual[1][i]);
-        }
     }
     *sigma = sqrt(squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1));
-    for (int k = 0; k < PARAMETERS; k++)
-        if (!isfinite(parameters[k])) return 0;
-    return count >= options->min_dots;
+    /* Some of any dots are near the offset of a symbol. */
+    int dots = 0;
+    for (int i = 0; i < m; i++) dots += valid[i] != 0;
+    const double chance = 16 * options->symbol_gate * options->symbol_gate;
+    const double least =
+        chance * dots + options->min_sigmas * sqrt(chance * (1 - chance > 0 ? 1 - chance : 0) * dots);
+    return count >= options->min_dots && count >= least;
 }
 
 /* Largest numbers of dots of a frame and of dots that seed a lattice. Pairs of seeds are stored.
  */
-enum { MAX_DOTS = 1 << 24, MAX_SEEDS = 4096 };
+enum { MAX_DOTS = 1 << 24, MAX_SEEDS = 4096, MAX_PASSES = 100 };
 
 static PyObject *fit_lattices(PyObject *self, PyObject *args)
 {
@@ -1045,18 +1276,21 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
     Call call = {0};
     PyObject *points_array, *valid_array, *ring_array, *prior_array, *parameters_array, *uv_array,
         *cells_array, *sigma_array, *found_array;
-    long long n, m, seeds, min_dots;
+    long long n, m, passes, seeds, min_dots;
     int lens;
     LatticeOptions options;
-    if (!parse_arguments(args, "OOLLpOOLLddddddddOOOOO:fit_lattices", &points_array, &valid_array,
-                         &n, &m, &lens, &ring_array, &prior_array, &seeds, &min_dots,
+    if (!parse_arguments(args, "OOLLppLOOLLddddddddddOOOOO:fit_lattices", &points_array, &valid_array,
+                         &n, &m, &lens, &options.is_thorough, &passes, &ring_array,
+                         &prior_array, &seeds, &min_dots, &options.min_sigmas,
                          &options.min_neighbour, &options.max_neighbour, &options.cell_gate,
                          &options.cell_sigma, &options.symbol_gate, &options.symbol_sigma,
-                         &options.lens_radius, &options.offset, &parameters_array, &uv_array,
+                         &options.lens_radius, &options.offset, &options.min_seed_power,
+                         &parameters_array, &uv_array,
                          &cells_array, &sigma_array, &found_array))
         return NULL;
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
+    check_range(&call, "passes", passes, 1, MAX_PASSES);
     check_range(&call, "seeds", seeds, 1, MAX_SEEDS);
     check_range(&call, "min_dots", min_dots, 1, INT_MAX);
     if (call.failed) return NULL;
@@ -1073,13 +1307,16 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
     uint8_t *found = output(&call, found_array, "found", ITEM_FLAG, n);
     check_range(&call, "number of ring_radii", rings, 0, INT_MAX);
     if (call.failed) return finish_call(&call, 1);
+    options.passes = (int)passes;
     options.seeds = (int)seeds;
     options.min_dots = (int)min_dots;
     options.rings = (int)rings;
     Dots d;
     const int has_dots = new_dots(&d, (int)m);
-    float *scratch =
-        malloc(((size_t)m + 1 + (size_t)(7 * seeds + seeds * (seeds + 1))) * sizeof(float));
+    const size_t pairs = (size_t)(7 * seeds + seeds * (seeds + 1));
+    const size_t spectrum = (size_t)(2 * seeds) + (size_t)(2 * MAX_FREQUENCIES * seeds)
+                            + (size_t)(MAX_FREQUENCIES * MAX_FREQUENCIES / 2) + 3 * (size_t)seeds;
+    float *scratch = malloc(((size_t)m + 1 + (pairs > spectrum ? pairs : spectrum)) * sizeof(float));
     const int has_memory = has_dots && scratch;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS
@@ -1099,18 +1336,37 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
 
 /* ---- Soft bits -------------------------------------------------------------------------- */
 
+/* Distance of a dot's offset from the nearest symbol, the larger of both axes. */
+static inline float symbol_distance(const float *rest, float offset)
+{
+    float symbol[2];
+    nearest_symbol(rest, offset, symbol);
+    const float a = fabsf(rest[0] - symbol[0]), b = fabsf(rest[1] - symbol[1]);
+    return a > b ? a : b;
+}
+
 /* Soft bits of a frame's dots in the central square of 2 half_width cells a side. If several dots
  * are in one cell, the one nearest to a symbol counts. */
 static void frame_soft_bits(const float *uv, const float *cells, const uint8_t *valid, int m,
-                            int half_width, float sigma, float offset, float likelihood_floor,
-                            float *distances, float *x_bits, float *y_bits)
+                            int half_width, float sigma, float offset, float symbol_gate,
+                            float wrong_symbol, float *distances, float *x_bits, float *y_bits)
 {
     const int length = 2 * half_width;
-    const float exponent = -0.25f / (sigma * sigma);
+    const float exponent = -0.5f / (sigma * sigma);
     for (int k = 0; k < length * length; k++) {
         distances[k] = FLT_MAX;
         x_bits[k] = y_bits[k] = 0;
     }
+    int dots = 0, outliers = 0;
+    for (int i = 0; i < m; i++) {
+        if (!valid[i]) continue;
+        const float rest[2] = {uv[2 * i] - cells[2 * i], uv[2 * i + 1] - cells[2 * i + 1]};
+        dots++;
+        outliers += symbol_distance(rest, offset) >= symbol_gate;
+    }
+    /* One outlier in a cell, relative to the peak of the Gaussian; a bit has two symbols. */
+    const float outlier_fraction = (float)(outliers + 1) / (float)(dots + 2);
+    const float floor = 2 * 6.2831853f * sigma * sigma * outlier_fraction + wrong_symbol;
     for (int i = 0; i < m; i++) {
         if (!valid[i]) continue;
         const float u = cells[2 * i], v = cells[2 * i + 1];
@@ -1119,21 +1375,17 @@ static void frame_soft_bits(const float *uv, const float *cells, const uint8_t *
         const int column = (int)u + half_width, row = (int)v + half_width;
         if (column < 0 || column >= length || row < 0 || row >= length) continue;
         const float rest[2] = {uv[2 * i] - u, uv[2 * i + 1] - v};
-        float symbol[2];
-        nearest_symbol(rest, offset, symbol);
-        const float a = fabsf(rest[0] - symbol[0]), b = fabsf(rest[1] - symbol[1]);
-        const float distance = a > b ? a : b;
+        const float distance = symbol_distance(rest, offset);
         const int cell = row * length + column;
         if (distance >= distances[cell]) continue;
         distances[cell] = distance;
-        for (int axis = 0; axis < 2; axis++) {
-            const float along = axis ? rest[1] + rest[0] : rest[1] - rest[0];
-            const float one =
-                expf(exponent * (along - offset) * (along - offset)) + likelihood_floor;
-            const float zero =
-                expf(exponent * (along + offset) * (along + offset)) + likelihood_floor;
-            (axis ? y_bits : x_bits)[cell] = logf(one / zero);
-        }
+        const float square = rest[0] * rest[0] + rest[1] * rest[1] + offset * offset;
+        const float up = expf(exponent * (square + 2 * offset * rest[1]));
+        const float left = expf(exponent * (square + 2 * offset * rest[0]));
+        const float right = expf(exponent * (square - 2 * offset * rest[0]));
+        const float down = expf(exponent * (square - 2 * offset * rest[1]));
+        x_bits[cell] = logf((left + down + floor) / (up + right + floor));
+        y_bits[cell] = logf((right + down + floor) / (up + left + floor));
     }
 }
 
@@ -1146,10 +1398,10 @@ static PyObject *soft_bits(PyObject *self, PyObject *args)
     Call call = {0};
     PyObject *uv_array, *cells_array, *valid_array, *found_array, *sigma_array, *x_array, *y_array;
     long long n, m, half_width;
-    float offset, likelihood_floor;
-    if (!parse_arguments(args, "OOOOOLLLffOO:soft_bits", &uv_array, &cells_array, &valid_array,
+    float offset, symbol_gate, wrong_symbol;
+    if (!parse_arguments(args, "OOOOOLLLfffOO:soft_bits", &uv_array, &cells_array, &valid_array,
                          &found_array, &sigma_array, &n, &m, &half_width, &offset,
-                         &likelihood_floor, &x_array, &y_array))
+                         &symbol_gate, &wrong_symbol, &x_array, &y_array))
         return NULL;
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
@@ -1171,7 +1423,8 @@ static PyObject *soft_bits(PyObject *self, PyObject *args)
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             frame_soft_bits(uv + 2 * dot, cells + 2 * dot, valid + dot, found[k] ? (int)m : 0,
-                            (int)half_width, (float)sigma[k], offset, likelihood_floor, distances,
+                            (int)half_width, (float)sigma[k], offset, symbol_gate,
+                            wrong_symbol, distances,
                             x_bits + k * size, y_bits + k * size);
         }
         Py_END_ALLOW_THREADS
@@ -1493,37 +1746,33 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
 
 /* ---- Poses ------------------------------------------------------------------------------ */
 
-/* Refit the lattice to the dots that agree with the decoded pattern, and derive the pose and its
- * covariance from it. Return 0 if the equations are singular. */
-static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *uv,
-                         const float *cells, int m, int half_width, int lens, const double *prior,
-                         const int64_t *window, double offset, double gate, double min_sigma,
-                         const Dots *d, int64_t *phases, double *parameters, double *pose,
-                         double *covariance)
+/* Constants of the robust fit; those of locatk.core.dots.localization.pose. */
+typedef struct {
+    int half_width, lens, max_steps;
+    const double *prior;
+    double offset, symbol_gate, min_sigma, second_lens_sigma, second_lens_odds, gate_sigmas, gated_variance,
+        square_radius, square_radius_sigma;
+} PoseOptions;
+
+static const int ROTATIONS[4][2][2] = {
+    {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
+static const int CORNERS[4][2] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
+
+/* Residuals of the projected dots from the symbols at their cells in the decoded window. Squared
+ * residuals of the dots that agree with their symbol are written to `squares`, -1 for others. */
+static void match_pattern(const Codec *codec, const PoseOptions *options, const int64_t *columns,
+                          const int64_t *rows, int quarter, const Dots *d, int m, float *squares)
 {
-    static const int rotations[4][2][2] = {
-        {{1, 0}, {0, 1}}, {{0, -1}, {1, 0}}, {{-1, 0}, {0, -1}}, {{0, 1}, {-1, 0}}};
-    static const int corners[4][2] = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
-    const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
-    const int(*rotation)[2] = rotations[window[4]], *corner = corners[window[4]],
-          length = 2 * half_width;
-    int64_t *columns = phases, *rows = phases + length;
-    for (int k = 0; k < length; k++) {
-        const int64_t column_position = remainder_of(x + k, codec->range);
-        const int64_t row_position = remainder_of(y + k, codec->range);
-        columns[k] = remainder_of(phase_at(codec, column_position) + section[0] + y, PERIOD);
-        rows[k] = remainder_of(phase_at(codec, row_position) + section[1] + x, PERIOD);
-    }
-    int count = 0;
-    double squares = 0;
+    const int(*rotation)[2] = ROTATIONS[quarter], *corner = CORNERS[quarter];
+    const int half_width = options->half_width, length = 2 * half_width;
+    const float offset = (float)options->offset, gate = (float)options->symbol_gate;
     for (int i = 0; i < m; i++) {
-        d->use[i] = 0;
-        if (!valid[i]) continue;
+        squares[i] = -1;
+        if (d->valid[i] == 0) continue;
+        const float u = rintf(d->u[i]), v = rintf(d->v[i]);
         /* Outside of the window, and for NaN, a conversion to int may be undefined. */
-        if (!(fabsf(cells[2 * i]) <= (float)half_width
-              && fabsf(cells[2 * i + 1]) <= (float)half_width))
-            continue;
-        const int a = (int)cells[2 * i] + half_width, b = (int)cells[2 * i + 1] + half_width;
+        if (!(fabsf(u) <= (float)half_width && fabsf(v) <= (float)half_width)) continue;
+        const int a = (int)u + half_width, b = (int)v + half_width;
         const int column = rotation[0][0] * a + rotation[0][1] * b + corner[0] * (length - 1);
         const int row = rotation[1][0] * a + rotation[1][1] * b + corner[1] * (length - 1);
         if (column < 0 || column >= length || row < 0 || row >= length) continue;
@@ -1531,34 +1780,185 @@ static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *
         const int row_bit = codec->signs[rows[row] + column] > 0;
         /* Up 00, left 10, right 01, down 11 (column bit, row bit). */
         const int dx = row_bit - column_bit, dy = row_bit + column_bit - 1;
-        const float du = uv[2 * i] - cells[2 * i]
-                         - (float)offset * (float)(rotation[0][0] * dx + rotation[1][0] * dy);
-        const float dv = uv[2 * i + 1] - cells[2 * i + 1]
-                         - (float)offset * (float)(rotation[0][1] * dx + rotation[1][1] * dy);
-        if (!(fabsf(du) < (float)gate && fabsf(dv) < (float)gate)) continue;
-        d->use[i] = 1;
+        const float du =
+            d->u[i] - u - offset * (float)(rotation[0][0] * dx + rotation[1][0] * dy);
+        const float dv =
+            d->v[i] - v - offset * (float)(rotation[0][1] * dx + rotation[1][1] * dy);
+        if (!(fabsf(du) < gate && fabsf(dv) < gate)) continue;
         d->residual[0][i] = du;
         d->residual[1][i] = dv;
-        count++;
-        squares += (double)(du * du + dv * dv);
+        squares[i] = du * du + dv * dv;
     }
-    double variance = squares / (2 * count - 8 > 1 ? 2 * count - 8 : 1);
-    if (variance < min_sigma * min_sigma) variance = min_sigma * min_sigma;
-    project(parameters, d);
-    double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], right[PARAMETERS];
-    normal_equations(parameters, d, sqrt(variance), lens, prior, normal, right);
-    memcpy(copy, normal, sizeof(normal));
-    if (!solve_linear(copy, right, 1)) return 0;
-    for (int k = 0; k < PARAMETERS; k++) parameters[k] += right[k];
+}
 
-    const double *t = parameters;
-    const double centre[2] = {t[C_U] + half_width, t[C_V] + half_width};
-    const double u = t[A_U] - t[C_U] * t[PERSPECTIVE], v = t[A_V] - t[C_V] * t[PERSPECTIVE];
-    double right_of[2];
+/* Variance of the dots per axis from the median of their squared residuals (-1: no residual). */
+static double median_variance(const float *squares, int m, float *ordered)
+{
+    int count = 0;
+    for (int i = 0; i < m; i++)
+        if (squares[i] >= 0) ordered[count++] = squares[i];
+    if (!count) return 0;
+    const double median = nth_smallest(ordered, count, (count - 1) / 2);
+    const int degrees = 2 * count - 8 > 1 ? 2 * count - 8 : 1;
+    return median / (2 * log(2.0)) * (2.0 * count / degrees);
+}
+
+/* Second radial coefficient c of an unknown lens, which moves the points p to p (1 + c |p|^4), and
+ * its part of the normal equations. */
+typedef struct {
+    int is_fitted;
+    double value, coupling[PARAMETERS], weight;
+} SecondLens;
+
+/* Derivatives by the second radial coefficient along an axis, negative; write the sums of their
+ * squares and of their products with the residuals. */
+HOT static void second_lens_column(const double *parameters, const Dots *d, int axis,
+                                   float *restrict column, double *squares, double *products)
+{
+    const float a0 = (float)parameters[3 * axis], a1 = (float)parameters[3 * axis + 1];
+    const float g0 = (float)parameters[PERSPECTIVE], g1 = (float)parameters[PERSPECTIVE + 1];
+    const float *restrict value = axis ? d->v : d->u, *restrict residual = d->residual[axis];
+    const float *restrict x = d->x, *restrict y = d->y, *restrict q0 = d->q[0];
+    const float *restrict q1 = d->q[1], *restrict lens_slope = d->lens_slope;
+    const float *restrict depth = d->depth, *restrict use = d->use;
+    float sums[2][LANES] = {{0}};
+    for (int i = 0; i < d->count; i += LANES)
+        for (int l = 0; l < LANES; l++) {
+            const int k = i + l;
+            const float slope = a0 * q0[k] + a1 * q1[k] - value[k] * (g0 * q0[k] + g1 * q1[k]);
+            column[k] = -slope * lens_slope[k] * depth[k] * (x[k] * x[k] + y[k] * y[k]) * use[k];
+            sums[0][l] += column[k] * column[k];
+            sums[1][l] += column[k] * residual[k];
+        }
+    *squares += sum_lanes(sums[0]);
+    *products += sum_lanes(sums[1]);
+}
+
+/* Add the second radial coefficient to solved normal equations of the dots in use: correct the step
+ * `solved`, and change the coefficient. It is fitted if a first change is beyond `threshold`, in
+ * squares of residuals. `columns` are scratch (2 d->count). */
+static int fit_second_lens(const double *parameters, const Dots *d, double normal[][PARAMETERS],
+                           double prior, double threshold, float *columns, double *step,
+                           SecondLens *lens)
+{
+    static const double no_prior[PARAMETERS] = {0};
+    double weight = prior, gain = -prior * lens->value;
+    Dots other = *d;
     for (int axis = 0; axis < 2; axis++) {
-        pose[axis] = rotation[axis][0] * centre[0] + rotation[axis][1] * centre[1]
-                     + corner[axis] * (length - 1) + (double)(axis ? y : x);
-        right_of[axis] = rotation[axis][0] * u + rotation[axis][1] * v;
+        other.residual[axis] = columns + axis * d->count;
+        second_lens_column(parameters, d, axis, other.residual[axis], &weight, &gain);
+    }
+    double unused[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], cross[PARAMETERS];
+    normal_equations(parameters, &other, 0, 1, no_prior, unused, cross);
+    memcpy(copy, normal, sizeof(copy));
+    memcpy(lens->coupling, cross, sizeof(cross));
+    if (!solve_linear(copy, lens->coupling, 1)) return 0;
+    for (int k = 0; k < PARAMETERS; k++) {
+        weight -= cross[k] * lens->coupling[k];
+        gain -= cross[k] * step[k];
+    }
+    const double change = gain / weight;
+    lens->is_fitted = lens->is_fitted || gain * change > threshold;
+    if (!lens->is_fitted) return 1;
+    lens->weight = weight;
+    lens->value += change;
+    for (int k = 0; k < PARAMETERS; k++) step[k] -= lens->coupling[k] * change;
+    return 1;
+}
+
+/* Refit the lattice robustly to the dots that agree with the decoded pattern, and derive the pose
+ * and its covariance from it. Return 0 if the equations are singular. */
+static int estimate_pose(const Codec *codec, const PoseOptions *options, const int64_t *window,
+                         const float *points, const Dots *d, int m, int64_t *phases, float *scratch,
+                         double *parameters, double *pose, double *covariance)
+{
+    static const double no_prior[PARAMETERS] = {0};
+    const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
+    const int half_width = options->half_width, length = 2 * half_width;
+    int64_t *rows = phases + length;
+    for (int k = 0; k < length; k++) {
+        const int64_t column_position = remainder_of(x + k, codec->range);
+        const int64_t row_position = remainder_of(y + k, codec->range);
+        phases[k] = remainder_of(phase_at(codec, column_position) + section[0] + y, PERIOD);
+        rows[k] = remainder_of(phase_at(codec, row_position) + section[1] + x, PERIOD);
+    }
+    const double min_variance = options->min_sigma * options->min_sigma;
+    double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], step[PARAMETERS];
+    double variance = min_variance, gate_square = 0;
+    float *squares = scratch, *ordered = squares + m, *columns = ordered + m;
+    SecondLens lens = {0};
+    memset(d->use, 0, (size_t)d->count * sizeof(float));
+    for (int k = 0; k < options->max_steps; k++) {
+        project(parameters, d);
+        match_pattern(codec, options, phases, rows, (int)window[4], d, m, squares);
+        variance = median_variance(squares, m, ordered);
+        if (!(variance > min_variance)) variance = min_variance;
+        gate_square = options->gate_sigmas * options->gate_sigmas * variance;
+        int is_changed = 0;
+        for (int i = 0; i < m; i++) {
+            const float use = squares[i] >= 0 && squares[i] < gate_square;
+            is_changed |= use != d->use[i];
+            d->use[i] = use;
+        }
+        normal_equations(parameters, d, sqrt(variance), options->lens, options->prior, normal,
+                         step);
+        memcpy(copy, normal, sizeof(normal));
+        if (!solve_linear(copy, step, 1)) return 0;
+        if (options->lens && (k == 0 || lens.is_fitted)) {
+            const double prior =
+                variance / (options->second_lens_sigma * options->second_lens_sigma);
+            const double threshold = options->second_lens_odds * variance;
+            if (!fit_second_lens(parameters, d, normal, prior, threshold, columns, step, &lens))
+                return 0;
+        }
+        if (!is_changed || k + 1 == options->max_steps) break;
+        for (int j = 0; j < PARAMETERS; j++) parameters[j] += step[j];
+        for (int i = 0; lens.is_fitted && i < m; i++) {
+            const double px = points[2 * i], py = points[2 * i + 1], square = px * px + py * py;
+            const double factor = 1 + lens.value * square * square;
+            d->x[i] = (float)(px * factor);
+            d->y[i] = (float)(py * factor);
+        }
+    }
+    int inliers = 0;
+    double sum = 0;
+    /* Outliers count as if at the gate: in directions of their own, and all together. */
+    for (int i = 0; i < m; i++) {
+        if (d->use[i] != 0) {
+            inliers++;
+            sum += squares[i];
+            d->use[i] = 0;
+        } else if (squares[i] >= 0) {
+            const float scale = (float)sqrt(gate_square / squares[i]);
+            d->residual[0][i] *= scale;
+            d->residual[1][i] *= scale;
+            d->use[i] = 1;
+        }
+    }
+    double outliers[PARAMETERS][PARAMETERS], together[PARAMETERS];
+    normal_equations(parameters, d, 0, options->lens, no_prior, outliers, together);
+    for (int k = 0; k < PARAMETERS; k++) parameters[k] += step[k];
+
+    const double *t = parameters, *g = t + PERSPECTIVE;
+    const double slope[2][2] = {{t[A_U] - t[C_U] * g[0], t[A_U + 1] - t[C_U] * g[1]},
+                                {t[A_V] - t[C_V] * g[0], t[A_V + 1] - t[C_V] * g[1]}};
+    const double area = slope[0][0] * slope[1][1] - slope[0][1] * slope[1][0];
+    if (!(fabs(area) > 0)) return 0;
+    /* Slope of the logarithm of the inverse depth on the paper. */
+    const double depth_slope[2] = {(g[0] * slope[1][1] - g[1] * slope[1][0]) / area,
+                                   (g[1] * slope[0][0] - g[0] * slope[0][1]) / area};
+    const double centre[2] = {t[C_U] + half_width + options->square_radius * depth_slope[0],
+                              t[C_V] + half_width + options->square_radius * depth_slope[1]};
+    const int(*rotation)[2] = ROTATIONS[window[4]], *corner = CORNERS[window[4]];
+    const double u = slope[0][0], v = slope[1][0];
+    double right_of[2], spread[3] = {0};
+    for (int axis = 0; axis < 2; axis++) {
+        const int *r = rotation[axis];
+        pose[axis] = r[0] * centre[0] + r[1] * centre[1] + corner[axis] * (length - 1)
+                     + (double)(axis ? y : x);
+        right_of[axis] = r[0] * u + r[1] * v;
+        spread[axis] =
+            options->square_radius_sigma * (r[0] * depth_slope[0] + r[1] * depth_slope[1]);
     }
     pose[2] = atan2(-right_of[1], right_of[0]);
     double jacobian[3][PARAMETERS] = {{0}}, solved[PARAMETERS * 3];
@@ -1571,11 +1971,30 @@ static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *
     for (int k = 0; k < PARAMETERS; k++)
         for (int side = 0; side < 3; side++) solved[3 * k + side] = jacobian[side][k];
     if (!solve_linear(normal, solved, 3)) return 0;
+    for (int side = 0; lens.is_fitted && side < 3; side++) {
+        double along = 0;
+        for (int k = 0; k < PARAMETERS; k++) along += jacobian[side][k] * lens.coupling[k];
+        for (int k = 0; k < PARAMETERS; k++)
+            solved[3 * k + side] += lens.coupling[k] * along / lens.weight;
+    }
+    const int degrees = 2 * inliers - 8 > 1 ? 2 * inliers - 8 : 1;
+    double inlier_variance = sum / (options->gated_variance * degrees);
+    if (!(inlier_variance > min_variance)) inlier_variance = min_variance;
+    double coherent[3] = {0}, apart[PARAMETERS * 3] = {0};
+    for (int k = 0; k < PARAMETERS; k++)
+        for (int side = 0; side < 3; side++) {
+            coherent[side] += solved[3 * k + side] * together[k];
+            for (int l = 0; l < PARAMETERS; l++)
+                apart[3 * k + side] += 0.5 * gate_square * outliers[k][l] * solved[3 * l + side];
+        }
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) {
-            double sum = 0;
-            for (int k = 0; k < PARAMETERS; k++) sum += jacobian[i][k] * solved[3 * k + j];
-            covariance[3 * i + j] = sum * variance;
+            double known = 0, hidden = coherent[i] * coherent[j];
+            for (int k = 0; k < PARAMETERS; k++) {
+                known += jacobian[i][k] * solved[3 * k + j];
+                hidden += solved[3 * k + i] * apart[3 * k + j];
+            }
+            covariance[3 * i + j] = inlier_variance * known + hidden + spread[i] * spread[j];
         }
     return 1;
 }
@@ -1583,31 +2002,31 @@ static int estimate_pose(const Codec *codec, const uint8_t *valid, const float *
 static PyObject *poses(PyObject *self, PyObject *args)
 {
     (void)self;
-    enum { WINDOW_COLUMNS = 5 };
+    enum { WINDOW_COLUMNS = 5, MAX_REFIT_STEPS = 1000 };
     Call call = {0};
-    PyObject *points_array, *valid_array, *uv_array, *cells_array, *prior_array, *windows_array,
-        *parameters_array, *pose_array, *covariance_array;
+    PyObject *points_array, *valid_array, *prior_array, *windows_array, *parameters_array,
+        *pose_array, *covariance_array;
     CodecArrays arrays;
-    long long n, m, half_width, range, smallest_shift;
-    int lens;
-    double offset, gate, min_sigma;
-    if (!parse_arguments(args, "OOOOLLLpOOOOOOOOOLLdddOOO:poses", &points_array, &valid_array,
-                         &uv_array, &cells_array, &n, &m, &half_width, &lens, &prior_array,
-                         &windows_array, &arrays.lengths, &arrays.weights, &arrays.prefixes,
-                         &arrays.crt, &arrays.signs, &arrays.digits, &arrays.masks, &range,
-                         &smallest_shift, &offset, &gate, &min_sigma, &parameters_array,
-                         &pose_array, &covariance_array))
+    long long n, m, half_width, range, smallest_shift, steps;
+    PoseOptions options = {0};
+    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLddddddOOO:poses", &points_array, &valid_array,
+                         &n, &m, &half_width, &options.lens, &prior_array, &windows_array,
+                         &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
+                         &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
+                         &options.offset, &options.symbol_gate, &options.min_sigma, &steps,
+                         &options.second_lens_sigma, &options.second_lens_odds, &options.gate_sigmas, &options.gated_variance, &options.square_radius,
+                         &options.square_radius_sigma, &parameters_array, &pose_array,
+                         &covariance_array))
         return NULL;
     Codec codec = {0};
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "half_width", half_width, 1, MAX_WINDOW_CELLS / 2);
+    check_range(&call, "max_steps", steps, 1, MAX_REFIT_STEPS);
     if (call.failed) return NULL;
     const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
     const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
-    const float *uv = input(&call, uv_array, "uv", ITEM_FLOAT32, ITEMS(n, m, 2));
-    const float *cells = input(&call, cells_array, "cells", ITEM_FLOAT32, ITEMS(n, m, 2));
-    const double *prior = input(&call, prior_array, "prior", ITEM_FLOAT64, PARAMETERS);
+    options.prior = input(&call, prior_array, "prior", ITEM_FLOAT64, PARAMETERS);
     const int64_t *windows =
         input(&call, windows_array, "windows", ITEM_INT64, ITEMS(n, WINDOW_COLUMNS));
     check_items(&call, "windows", windows, ITEM_INT64, (Py_ssize_t)n * WINDOW_COLUMNS,
@@ -1620,19 +2039,21 @@ static PyObject *poses(PyObject *self, PyObject *args)
     double *pose = output(&call, pose_array, "pose", ITEM_FLOAT64, ITEMS(n, 3));
     double *covariance = output(&call, covariance_array, "covariance", ITEM_FLOAT64, ITEMS(n, 9));
     if (call.failed) return finish_call(&call, 1);
+    options.half_width = (int)half_width;
+    options.max_steps = (int)steps;
     Dots d;
     const int has_dots = new_dots(&d, (int)m);
     int64_t *phases = malloc(4 * (size_t)half_width * sizeof(int64_t));
-    const int has_memory = has_dots && phases;
+    float *scratch = has_dots ? malloc((2 * ((size_t)m + 1) + 2 * (size_t)d.count) * sizeof(float)) : NULL;
+    const int has_memory = has_dots && phases && scratch;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             load_dots(&d, points + 2 * dot, valid + dot, (int)m);
-            if (!estimate_pose(&codec, valid + dot, uv + 2 * dot, cells + 2 * dot, (int)m,
-                               (int)half_width, lens, prior, windows + k * WINDOW_COLUMNS, offset,
-                               gate, min_sigma, &d, phases, parameters + k * PARAMETERS,
-                               pose + 3 * k, covariance + 9 * k)) {
+            if (!estimate_pose(&codec, &options, windows + k * WINDOW_COLUMNS, points + 2 * dot, &d,
+                               (int)m, phases, scratch, parameters + k * PARAMETERS, pose + 3 * k,
+                               covariance + 9 * k)) {
                 for (int i = 0; i < 3; i++) pose[3 * k + i] = NAN;
                 for (int i = 0; i < 9; i++) covariance[9 * k + i] = NAN;
             }
@@ -1641,6 +2062,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     }
     if (has_dots) free(d.x);
     free(phases);
+    free(scratch);
     return finish_call(&call, has_memory);
 }
 
@@ -1730,22 +2152,23 @@ static PyMethodDef methods[] = {
      " contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
      "Detect the dots of images; twin of locatk.core.dots.detection.blobs.detect_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,
-     "fit_lattices($module, points, valid, n, m, lens, ring_radii, prior, seeds, min_dots,"
-     " min_neighbour, max_neighbour, cell_gate, cell_sigma, symbol_gate, symbol_sigma,"
-     " lens_radius, offset, parameters, uv, cells, sigma, found, /)\n--\n\n"
+     "fit_lattices($module, points, valid, n, m, lens, is_thorough, passes, ring_radii, prior,"
+     " seeds, min_dots, min_sigmas, min_neighbour, max_neighbour, cell_gate, cell_sigma, symbol_gate,"
+     " symbol_sigma, lens_radius, offset, min_seed_power, parameters, uv, cells, sigma, found, /)\n--\n\n"
      "Fit lattices to dots; twin of locatk.core.dots.detection.lattice.fit_lattices_numpy."},
     {"soft_bits", soft_bits, METH_VARARGS,
      "soft_bits($module, uv, cells, valid, found, sigma, n, m, half_width, offset,"
-     " likelihood_floor, x_bits, y_bits, /)\n--\n\n"
+     " symbol_gate, wrong_symbol, x_bits, y_bits, /)\n--\n\n"
      "Compute the soft bits of dots; twin of locatk.core.dots.identification.soft_bits.soft_bits_numpy."},
     {"read_windows", read_windows, METH_VARARGS,
      "read_windows($module, x_bits, y_bits, n, length, lengths, weights, prefixes, crt, signs,"
      " digits, masks, range, smallest_shift, log_hypotheses, positions, evidence, /)\n--\n\n"
      "Read positions from windows of soft bits; twin of locatk.core.dots.identification.phase_voting.estimate_windows_numpy."},
     {"poses", poses, METH_VARARGS,
-     "poses($module, points, valid, uv, cells, n, m, half_width, lens, prior, windows, lengths,"
-     " weights, prefixes, crt, signs, digits, masks, range, smallest_shift, offset, gate,"
-     " min_sigma, parameters, pose, covariance, /)\n--\n\n"
+     "poses($module, points, valid, n, m, half_width, lens, prior, windows, lengths, weights,"
+     " prefixes, crt, signs, digits, masks, range, smallest_shift, offset, symbol_gate, min_sigma,"
+     " max_steps, second_lens_sigma, second_lens_odds, gate_sigmas, gated_variance, square_radius, square_radius_sigma, parameters, pose,"
+     " covariance, /)\n--\n\n"
      "Estimate poses from decoded dots; twin of locatk.core.dots.localization.pose.localize_windows_numpy."},
     {"ddtw", ddtw, METH_VARARGS,
      "ddtw($module, query, slopes, n, length, count, cost, /)\n--\n\n"

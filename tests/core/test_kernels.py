@@ -76,10 +76,13 @@ def fit_lattices() -> Arguments:
         "n": n,
         "m": m,
         "lens": True,
+        "is_thorough": True,
+        "passes": 1,
         "ring_radii": np.array([3.2, 6.0]),
         "prior": np.full(9, 1.0),
         "seeds": 20,
         "min_dots": 10,
+        "min_sigmas": 5.0,
         "min_neighbour": 0.36,
         "max_neighbour": 1.32,
         "cell_gate": 0.36,
@@ -88,6 +91,7 @@ def fit_lattices() -> Arguments:
         "symbol_sigma": 0.03,
         "lens_radius": 4.0,
         "offset": 1 / 6,
+        "min_seed_power": 0.2,
         "parameters": np.zeros((n, 9)),
         "uv": np.zeros((n, m, 2), np.float32),
         "cells": np.zeros((n, m, 2), np.float32),
@@ -116,7 +120,8 @@ def soft_bits() -> Arguments:
         "m": m,
         "half_width": half_width,
         "offset": 1 / 6,
-        "likelihood_floor": 0.018,
+        "symbol_gate": 0.12,
+        "wrong_symbol": 0.002,
         "x_bits": np.zeros((n, 2 * half_width, 2 * half_width), np.float32),
         "y_bits": np.zeros((n, 2 * half_width, 2 * half_width), np.float32),
     }
@@ -157,15 +162,13 @@ def read_windows() -> Arguments:
 
 
 def poses() -> Arguments:
-    uv, cells = lattice_coordinates(2)
-    n, m = cells.shape[:2]
+    points = lattice_points(2)
+    n, m = points.shape[:2]
     half_width = 4
     windows = np.array([[10, 20, 3, 4, 0], [-5, 400, 62, 0, 3]])
     return {
-        "points": lattice_points(n),
+        "points": points,
         "valid": np.ones((n, m), bool),
-        "uv": uv,
-        "cells": cells,
         "n": n,
         "m": m,
         "half_width": half_width,
@@ -174,8 +177,15 @@ def poses() -> Arguments:
         "windows": windows,
         **codec(2 * half_width),
         "offset": 1 / 6,
-        "gate": 0.5,
+        "symbol_gate": 0.5,
         "min_sigma": 0.001,
+        "max_steps": 3,
+        "second_lens_sigma": 0.15,
+        "second_lens_odds": 25.0,
+        "gate_sigmas": 3.0,
+        "gated_variance": 0.95,
+        "square_radius": 0.0174,
+        "square_radius_sigma": 0.007,
         "parameters": np.tile([10.0, 0, 0, 0, 10.0, 0, 0, 0, 0], (n, 1)),
         "pose": np.zeros((n, 3)),
         "covariance": np.zeros((n, 3, 3)),

@@ -1,9 +1,10 @@
 """Detection of dots in grey images, to a fraction of a pixel.
 
 The image is smoothed once by about the width of a dot; a dot is a local minimum that is darker than
-its surroundings. There is no global threshold: the least contrast of a dot follows from the minima
-of the same frame relative to the paper around each, so that vignettes, uneven light and exposure
-have no effect.
+a ring of pixels about it. On a line, on a hand or at its edge at least three pixels of the ring are
+as dark as the minimum. There is no global threshold: the least contrast of a dot follows from the
+minima of the same frame relative to the paper around each, so that vignettes, uneven light and
+exposure have no effect.
 """
 
 from __future__ import annotations
@@ -23,6 +24,12 @@ SMOOTHING_SIGMA_PX = 1.1
 
 SMOOTHING_RADIUS_PX = 2
 """Radius of the smoothing kernel, and of the neighbourhood of a minimum [px]."""
+
+RING_PX = np.array([[4, 0], [3, 3], [0, 4], [-3, 3], [-4, 0], [-3, -3], [0, -4], [3, -3]])
+"""(8, 2) ring of pixels about a minimum that are beyond its dot."""
+
+MAX_DARK_RING_PIXELS = 2
+"""Pixels of the ring that may be on neighbouring dots; the next brighter one gives the contrast."""
 
 PAPER_BLOCK_PX = 4
 """Side of the blocks over which the brightness of the paper is averaged first [px]."""
@@ -136,52 +143,62 @@ def detect_dots_numpy(images: NDArray[np.uint8], max_dots: int = 4096) -> Detect
         minima[k][inner] = is_minimum[inner]
         # Whole blocks only: other ratios of sizes cost ten times as much.
         cropped = image[: rows * block, : columns * block]
-        small = cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA)
+        means = cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA)
         window = (PAPER_WINDOW_BLOCKS, PAPER_WINDOW_BLOCKS)
-        cv2.blur(small.astype(np.float32), window, dst=paper[k])
+        cv2.blur(means.astype(np.float32), window, dst=paper[k])
 
     index = np.flatnonzero(minima)
     line, column = np.divmod(index, w)
     frame, row = np.divmod(line, h)
-    light = paper[
-        frame, np.minimum(row // block, rows - 1), np.minimum(column // block, columns - 1)
-    ]
     flat = smooth.reshape(-1)
-    contrast = light - flat[index]
+    ring_x = np.clip(column[:, None] + RING_PX[:, 0], 0, w - 1)
+    ring_y = np.clip(row[:, None] + RING_PX[:, 1], 0, h - 1)
+    ring = np.sort(smooth[frame[:, None], ring_y, ring_x], axis=1)
+    contrast = ring[:, MAX_DARK_RING_PIXELS] - flat[index]
     keep = contrast > MIN_CONTRAST_LEVELS
     index, frame, row, column = index[keep], frame[keep], row[keep], column[keep]
-    light, contrast = light[keep], contrast[keep]
-
-    ink = contrast / light
-    keep = ink > (MIN_CONTRAST_FRACTION * _median_dots(ink, frame, n))[frame]
+    ring = ring[keep]
+    relative = contrast[keep] / ring[:, MAX_DARK_RING_PIXELS]
+    keep = relative > (MIN_CONTRAST_FRACTION * _median_dots(relative, frame, n))[frame]
     index, frame, row, column = index[keep], frame[keep], row[keep], column[keep]
-    light, ink = light[keep], ink[keep]
+    light = np.float32(0.5) * (ring[keep, 4] + ring[keep, 5])
+    ink = np.float32(1) - flat[index] / light
     block_row = np.minimum(row // block, rows - 1)
     block_column = np.minimum(column // block, columns - 1)
-    slope_x = _paper_slopes(paper[frame, block_row], block_column, light)
-    slope_y = _paper_slopes(paper.swapaxes(1, 2)[frame, block_column], block_row, light)
+    slope_x = _paper_slopes(paper[frame, block_row], block_column)
+    slope_y = _paper_slopes(paper.swapaxes(1, 2)[frame, block_column], block_row)
     x = column + _subpixel_offset(flat, index, 1, light, ink, slope_x)
     y = row + _subpixel_offset(flat, index, w, light, ink, slope_y)
     return _pad(frame, x, y, ((w - 1) / 2, (h - 1) / 2), n, max_dots)
 
 
-def _paper_slopes(
-    lines: NDArray[np.float32], block: NDArray[np.intp], light: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def _paper_slopes(lines: NDArray[np.float32], block: NDArray[np.intp]) -> NDArray[np.float32]:
     """Return the slopes (n,) of the paper's brightness about blocks, relative to it [1 / px].
 
-    ``lines`` (n, blocks) are those with the blocks. The blocks whose difference is taken are moved
-    inwards where the windows over which they are averaged would leave the image.
+    At an edge of the light they are limited to twice the slope of the flatter side (monotonized
+    central differences, van Leer 1977). ``lines`` (n, blocks) are those with the blocks. The blocks
+    whose difference is taken are moved inwards where the windows over which they are averaged would
+    leave the image.
     """
     count = lines.shape[1]
     first = PAPER_WINDOW_BLOCKS // 2 + SLOPE_REACH_BLOCKS
     middle = np.minimum(np.maximum(block, first), count - 1 - first)
     before = np.maximum(middle - SLOPE_REACH_BLOCKS, 0)
     after = np.minimum(middle + SLOPE_REACH_BLOCKS, count - 1)
+    is_known = (before < middle) & (middle < after)
+    before, middle, after = (np.where(is_known, k, block) for k in (before, middle, after))
     order = np.arange(len(lines))
-    difference = lines[order, np.maximum(after, 0)] - lines[order, np.minimum(before, count - 1)]
-    steps = ((after - before) * PAPER_BLOCK_PX).astype(np.float32)
-    slope = np.where(steps > 0, difference / np.maximum(steps, np.float32(1)) / light, 0)
+    here, brightness = lines[order, middle], lines[order, block]
+    is_known &= brightness > 0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        low = (here - lines[order, before]) / ((middle - before) * PAPER_BLOCK_PX).astype(
+            np.float32
+        )
+        high = (lines[order, after] - here) / ((after - middle) * PAPER_BLOCK_PX).astype(np.float32)
+        least = 2 * np.minimum(np.abs(low), np.abs(high))
+        mean = np.float32(0.5) * (low + high)
+        slope = np.copysign(np.minimum(np.abs(mean), least), mean) / brightness
+        slope = np.where(is_known & (low * high > 0), slope, 0)
     limit = np.float32(MAX_PAPER_SLOPE_PER_PX)
     result: NDArray[np.float32] = np.clip(slope, -limit, limit).astype(np.float32)
     return result

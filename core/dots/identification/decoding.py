@@ -23,10 +23,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, Codec
+from locatk.core.dots.codec import MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, Codec, sequences
 from locatk.core.dots.codec.lookup import decode_exact
 from locatk.core.dots.identification.phase_voting import (
     LOG_HYPOTHESES,
+    MAX_LIKELY_PHASE_GAP,
     MAX_WINDOW_LINES,
     Bits,
     Integers,
@@ -58,8 +59,15 @@ MIN_LOG_ODDS = math.log(MIN_CONFIDENCE / (1 - MIN_CONFIDENCE))
 OTHER_CODEC_ODDS = 0.01
 """Prior odds that the sheet is one of another codec, if nothing but its dots is known."""
 
-UNLISTED_RIVALS_FACTOR = 3.0
-"""Ratio of the likelihood of all rivals of a position to that of those in the list."""
+AGREEING_AXIS_FRACTION = 0.04
+"""Fraction of the positions of a related codec at which one axis agrees with the selected codec
+and the other has columns that fit no position: of the 241 positions of the sequence in which
+``libdots`` and ``anoto`` differ, ten with eight columns."""
+
+UNLISTED_RIVALS_FACTOR = 2.0
+"""Ratio of the likelihood of all rivals of a position to that of those in the list: a list of the
+first search contains half of what one of twenty times its width does (44 to 58 % on average, in
+windows of 8 x 8 with one or two wrong bits)."""
 
 CERTAIN_LOG_ODDS = 40.0
 """Log odds beyond which no other position is nearly as likely, even if bits are wrong."""
@@ -67,22 +75,23 @@ CERTAIN_LOG_ODDS = 40.0
 MAX_CERTAIN_WRONG_FRACTION = 0.08
 """Fraction of wrong bits beyond which another position may be as likely, whatever the odds."""
 
-MIN_CERTAIN_LEAD = 10.0
+MIN_CERTAIN_LEAD = 16.0
 """Lead in votes from which no other position can be the right one; a lead below it may rest on a
-single line."""
+single bit (twice 8) of a single line."""
 
 MAX_SMALL_WINDOW_LINES = 16
-"""Columns and rows up to which a window is small: wrong bits may hide its rotation or its position,
-so that the second rotation and misread columns are tried too."""
+"""Columns and rows up to which a window is decoded by look-up, if no bit is wrong."""
+
+MAX_SMALL_WINDOW_DOTS = 128
+"""Dots up to which a window is small, half of those of 16 columns and rows: short lines and wrong
+bits may hide its rotation or its position, so that the second rotation, misread columns and more
+candidates are tried too."""
 
 MIN_EXACT_LINES = 8
 """Columns and rows from which a window without a wrong bit has one position only."""
 
-MARGINAL_RESIDUES = 6
-"""Residues of each secondary sequence that are combined to candidates."""
-
-MAX_MARGINAL_CANDIDATES = 48
-"""Maximum number of candidates from combined residues."""
+FIRST_BEAM_WIDTH, SECOND_BEAM_WIDTH = 48, 256
+"""Number of candidates of the first search, and of the second one of windows with few dots."""
 
 MISREAD_COLUMNS = 4
 """Number of columns, the least certain ones, whose alternative phases are combined."""
@@ -132,6 +141,7 @@ def identify_windows(
     row_bits: Bits,
     codec: Codec,
     *,
+    is_thorough: bool = True,
     other_codec_odds: float = OTHER_CODEC_ODDS,
 ) -> DecodedWindows:
     """Decode position, section and rotation of n windows.
@@ -141,8 +151,10 @@ def identify_windows(
     column_bits, row_bits : (n, rows, columns) float32 ndarray
         As observed, in any rotation: log likelihood ratio that the dot is displaced left or down
         (column bit 1), and right or down (row bit 1); 0 without a dot. Bits of symbols that are
-        certain: plus or minus 4.
+        certain: plus or minus 7.
     codec : Codec
+    is_thorough : bool
+        Search small windows twice if they have no certain position.
     other_codec_odds : float
         Prior odds that the sheet is one of another known codec; 0 if its codec is certain.
 
@@ -158,10 +170,10 @@ def identify_windows(
         result = _decode_exact(column_bits, row_bits, codec)
         doubtful = np.flatnonzero(result.confidence < MIN_CONFIDENCE)
     else:
-        result = _decode_soft(column_bits, row_bits, codec)
+        result = _decode_soft(column_bits, row_bits, codec, is_thorough)
         doubtful = np.empty(0, np.intp)
     if len(doubtful):
-        soft = _decode_soft(column_bits[doubtful], row_bits[doubtful], codec)
+        soft = _decode_soft(column_bits[doubtful], row_bits[doubtful], codec, is_thorough)
         for field in fields(DecodedWindows):
             getattr(result, field.name)[doubtful] = getattr(soft, field.name)
     if other_codec_odds:
@@ -194,74 +206,125 @@ def _decode_exact(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWin
     )
 
 
-def _decode_soft(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWindows:
+def _decode_soft(
+    column_bits: Bits, row_bits: Bits, codec: Codec, is_thorough: bool
+) -> DecodedWindows:
     """Decode windows with missing or wrong dots."""
     windows = _pad_to_square(column_bits), _pad_to_square(row_bits)
     length = windows[0].shape[1]
     estimates = estimate_windows(*windows, codec)
     confidence = resolve_doubts(estimates, *windows, codec)
-    doubtful = np.flatnonzero(confidence < MIN_CONFIDENCE)
-    if len(doubtful) and length <= MAX_SMALL_WINDOW_LINES:
-        part = windows[0][doubtful], windows[1][doubtful]
-        second_rotation = np.argsort(-rotation_scores(*part), axis=0)[1]
-        other = estimate_rotated_windows(*part, second_rotation, codec)
-        other_confidence = resolve_doubts(other, *part, codec)
-        better = other_confidence > confidence[doubtful]
-        for values, other_values in zip(estimates, other, strict=True):
-            values[doubtful[better]] = other_values[better]
-        confidence[doubtful[better]] = other_confidence[better]
-    _, rows, columns = column_bits.shape
     dots = np.count_nonzero(windows[0], axis=(1, 2))
+    doubtful = np.flatnonzero((confidence < MIN_CONFIDENCE) & (dots <= MAX_SMALL_WINDOW_DOTS))
+    if is_thorough and len(doubtful):
+        part = windows[0][doubtful], windows[1][doubtful]
+        for rotation in np.argsort(-rotation_scores(*part), axis=0)[:2]:
+            other = estimate_rotated_windows(*part, rotation, codec)
+            other_confidence = resolve_doubts(other, *part, codec, beam_width=SECOND_BEAM_WIDTH)
+            better = other_confidence > confidence[doubtful]
+            for values, other_values in zip(estimates, other, strict=True):
+                values[doubtful[better]] = other_values[better]
+            confidence[doubtful[better]] = other_confidence[better]
+    _, rows, columns = column_bits.shape
     return as_decoded(estimates, confidence, dots, (length - rows, length - columns))
 
 
 def resolve_doubts(
-    estimates: WindowEstimates, column_bits: Bits, row_bits: Bits, codec: Codec
+    estimates: WindowEstimates,
+    column_bits: Bits,
+    row_bits: Bits,
+    codec: Codec,
+    *,
+    beam_width: int = FIRST_BEAM_WIDTH,
 ) -> NDArray[np.float64]:
     """Return the confidence (n,) of estimates; search for better ones if in doubt.
 
     A better position and its evidence replace those in ``estimates``.
     """
     rivals = np.zeros_like(estimates.log_odds)
-    is_small = column_bits.shape[1] <= MAX_SMALL_WINDOW_LINES
-    for axis in range(2):
-        log_odds, wrong = estimates.log_odds[:, axis], estimates.wrong[:, axis]
-        is_doubtful = (wrong > 0) & (log_odds < CERTAIN_LOG_ODDS)
-        is_doubtful |= estimates.lead[:, axis] < MIN_CERTAIN_LEAD
-        if wrong.any():
-            dots = np.count_nonzero(column_bits, axis=(1, 2))
-            is_doubtful |= wrong > MAX_CERTAIN_WRONG_FRACTION * dots
-        doubtful = np.flatnonzero(is_doubtful)
-        if not len(doubtful):
-            continue
-        printed = rotate_to_print(
-            column_bits[doubtful], row_bits[doubtful], estimates.rotation[doubtful]
-        )
-        lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
-        scores = phase_scores(lines)
-        # Evidence if every line had its best phase; no position has more.
-        normalization = np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
-        bound = 0.5 * scores.max(axis=2).sum(axis=1) - normalization
-        is_decodable = bound > LOG_HYPOTHESES + MIN_LOG_ODDS
-        if not is_decodable.any():
-            continue
-        doubtful, lines, scores = doubtful[is_decodable], lines[is_decodable], scores[is_decodable]
-        position, shift, rivals[doubtful, axis] = search_position(
-            scores, codec, try_misread_columns=is_small
-        )
-        estimates.position[doubtful, axis], estimates.shift[doubtful, axis] = position, shift
-        log_odds, wrong = compare_with_pattern(position, shift, lines, codec)
-        estimates.log_odds[doubtful, axis], estimates.wrong[doubtful, axis] = log_odds, wrong
-        estimates.order_log_odds[doubtful, axis] = compare_with_any_order(
-            position, shift, scores, codec
-        )
+    is_doubtful = (estimates.wrong > 0) & (estimates.log_odds < CERTAIN_LOG_ODDS)
+    is_doubtful |= estimates.lead < MIN_CERTAIN_LEAD
+    dots = np.count_nonzero(column_bits, axis=(1, 2))
+    is_doubtful |= estimates.wrong > MAX_CERTAIN_WRONG_FRACTION * dots[:, None]
+    if is_doubtful.any():
+        is_small = dots <= MAX_SMALL_WINDOW_DOTS
+        for axis in range(2):
+            if axis:
+                # The second axis cannot save a window whose first axis has no position.
+                alternatives = _alternatives(estimates, rivals)
+                is_doubtful[:, axis] &= alternatives[:, 0] < 1 - MIN_CONFIDENCE
+            for kind in (is_small, ~is_small):
+                doubtful = np.flatnonzero(is_doubtful[:, axis] & kind)
+                rivals[doubtful, axis] = _search_axis(
+                    estimates,
+                    doubtful,
+                    axis,
+                    (column_bits, row_bits),
+                    codec,
+                    try_misread_columns=kind is is_small,
+                    beam_width=beam_width,
+                )
     with np.errstate(over="ignore"):
-        alternatives = (
-            UNLISTED_RIVALS_FACTOR * rivals
-            + np.exp(-estimates.log_odds)
-            + OTHER_CODEC_ODDS * np.exp(-estimates.order_log_odds)
-        )
-    result: NDArray[np.float64] = (1 / (1 + alternatives)).prod(axis=1)
+        foreign = OTHER_CODEC_ODDS * np.exp(-estimates.order_log_odds.sum(axis=1))
+    likelihood = 1 / (1 + _alternatives(estimates, rivals))
+    result: NDArray[np.float64] = likelihood[:, 0] * likelihood[:, 1] / (1 + foreign)
+    return result
+
+
+def _alternatives(estimates: WindowEstimates, rivals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the odds (n, 2) against the position on each axis."""
+    foreign = OTHER_CODEC_ODDS * AGREEING_AXIS_FRACTION
+    with np.errstate(over="ignore"):
+        result: NDArray[np.float64] = UNLISTED_RIVALS_FACTOR * rivals + np.exp(-estimates.log_odds)
+        result += foreign * np.exp(-estimates.order_log_odds)
+    return result
+
+
+def _search_axis(
+    estimates: WindowEstimates,
+    doubtful: Integers,
+    axis: int,
+    bits: tuple[Bits, Bits],
+    codec: Codec,
+    *,
+    try_misread_columns: bool,
+    beam_width: int,
+) -> NDArray[np.float64]:
+    """Search the positions of doubtful windows (k,) on an axis, and replace those in ``estimates``.
+
+    Return the likelihood (k,) of rivals; 0 for windows that cannot be accepted in any case.
+    """
+    rivals = np.zeros(len(doubtful))
+    if not len(doubtful):
+        return rivals
+    printed = rotate_to_print(bits[0][doubtful], bits[1][doubtful], estimates.rotation[doubtful])
+    lines = printed[1] if axis else printed[0].transpose(0, 2, 1)
+    scores = phase_scores(lines)
+    kept = is_decodable(lines, scores)
+    if not kept.any():
+        return rivals
+    doubtful, lines, scores = doubtful[kept], lines[kept], scores[kept]
+    position, shift, rivals[kept] = search_position(
+        scores, codec, try_misread_columns=try_misread_columns, beam_width=beam_width
+    )
+    estimates.position[doubtful, axis], estimates.shift[doubtful, axis] = position, shift
+    log_odds, wrong = compare_with_pattern(position, shift, lines, codec)
+    estimates.log_odds[doubtful, axis], estimates.wrong[doubtful, axis] = log_odds, wrong
+    estimates.order_log_odds[doubtful, axis] = compare_with_any_order(
+        position, shift, scores, codec
+    )
+    return rivals
+
+
+def is_decodable(lines: Bits, scores: Bits) -> NDArray[np.bool_]:
+    """Return whether windows (n,) could be accepted if each line had its best phase."""
+    best = scores.max(axis=2)
+    evidence = 0.5 * best.sum(axis=1) - np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
+    likely = (scores > best[..., None] - MAX_LIKELY_PHASE_GAP).sum(axis=2)
+    order = np.log(MAIN_SEQUENCE_LENGTH / likely).sum(axis=1)
+    result: NDArray[np.bool_] = (evidence > LOG_HYPOTHESES + MIN_LOG_ODDS) & (
+        order > LOG_HYPOTHESES + MIN_LOG_ODDS + math.log(OTHER_CODEC_ODDS * AGREEING_AXIS_FRACTION)
+    )
     return result
 
 
@@ -338,7 +401,7 @@ def _pad_to_square(bits: Bits) -> Bits:
 
 
 def search_position(
-    scores: Bits, codec: Codec, *, try_misread_columns: bool
+    scores: Bits, codec: Codec, *, try_misread_columns: bool, beam_width: int = FIRST_BEAM_WIDTH
 ) -> tuple[Integers, Integers, NDArray[np.float64]]:
     """Search the most likely position on an axis of n windows.
 
@@ -349,6 +412,7 @@ def search_position(
     codec : Codec
     try_misread_columns : bool
         Combine phases of the least certain columns too; in large windows they leave no rival.
+    beam_width : int
 
     Returns
     -------
@@ -357,7 +421,7 @@ def search_position(
         Likelihood of the other candidates relative to this one.
     """
     n, length, _ = scores.shape
-    candidates = _candidates_from_marginals(scores, codec)
+    candidates = _likely_candidates(scores, codec, beam_width)
     if try_misread_columns:
         misread = _candidates_from_misread_columns(scores, codec)
         candidates = np.concatenate([candidates, misread], axis=1)
@@ -380,35 +444,43 @@ def search_position(
     return candidates[np.arange(n), index], shift, rivals
 
 
-def _candidates_from_marginals(scores: Bits, codec: Codec) -> Integers:
-    """Return positions (n, candidates) that combine the best residues of all secondary sequences.
+def _likely_candidates(scores: Bits, codec: Codec, beam_width: int) -> Integers:
+    """Return the positions (n, candidates) that the shifts between adjacent columns make likely.
 
     The probability of a shift from one column to the next is the circular correlation of the
-    probabilities of both phases; summed over shifts it gives the marginal probability of a digit.
+    probabilities of both phases. A beam search selects the residue of one secondary sequence after
+    the other; digits of sequences that are not yet selected are marginalized.
     """
     n, length, _ = scores.shape
     posterior = np.exp(0.5 * (scores - scores.max(axis=2, keepdims=True)).astype(np.float64))
     posterior /= posterior.sum(axis=2, keepdims=True)
     spectrum = np.fft.rfft(posterior, axis=2)
-    shift_probability = np.fft.irfft(
+    probability = np.fft.irfft(
         spectrum[:, 1:] * spectrum[:, :-1].conj(), MAIN_SEQUENCE_LENGTH, axis=2
     )
-    totals, residues = np.zeros((n, 1)), np.zeros((n, 1, 0), np.int64)
-    for digits, ballots in zip(digit_tables(), ballot_tables(codec, length - 1), strict=True):
-        marginal = np.maximum(shift_probability, 0) @ digits
-        votes = np.log(marginal + MIN_MARGINAL_PROBABILITY).reshape(n, -1) @ ballots
-        best = np.argsort(-votes, axis=1)[:, :MARGINAL_RESIDUES]
-        sums = totals[:, :, None] + np.take_along_axis(votes, best, axis=1)[:, None]
-        kept = np.argsort(-sums.reshape(n, -1), axis=1)[:, :MAX_MARGINAL_CANDIDATES]
-        totals = np.take_along_axis(sums.reshape(n, -1), kept, axis=1)
-        previous, added = np.divmod(kept, best.shape[1])
-        residues = np.concatenate(
-            [
-                np.take_along_axis(residues, previous[..., None], axis=1),
-                np.take_along_axis(best, added, axis=1)[..., None],
-            ],
-            axis=2,
-        )
+    window = np.arange(n)[:, None]
+    # Axes: window, entry of the beam, step, then the digits of the last to the first sequence.
+    bases = sequences.DIGIT_BASES
+    shifts = slice(sequences.MIN_SHIFT, sequences.MIN_SHIFT + math.prod(bases))
+    joint = (
+        np.maximum(probability[:, None, :, shifts], 0)
+        .astype(np.float32)
+        .reshape(n, 1, length - 1, *bases[::-1])
+    )
+    residues = np.zeros((n, 1, 0), np.int64)
+    for digits, base, ballots in zip(
+        codec.digits, bases, ballot_tables(codec, length - 1), strict=True
+    ):
+        marginal = joint.reshape(*joint.shape[:3], -1, base).sum(axis=3)
+        votes = np.log(marginal + MIN_MARGINAL_PROBABILITY).reshape(n, -1, len(ballots)) @ ballots
+        votes = votes.reshape(n, -1)
+        width = min(beam_width, votes.shape[1])
+        kept = np.argpartition(-votes, width - 1, axis=1)[:, :width]
+        entry, residue = np.divmod(kept, len(digits))
+        residues = np.concatenate([residues[window, entry], residue[..., None]], axis=2)
+        following = digits[(residue[..., None] + np.arange(length - 1)) % len(digits)]
+        step = np.arange(length - 1)
+        joint = joint[window[..., None], entry[..., None], step, ..., following]
     return codec.position(residues)
 
 

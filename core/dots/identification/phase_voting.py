@@ -89,9 +89,12 @@ def estimate_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> WindowE
         *(SECTION_LENGTH, sequences.MIN_SHIFT, LOG_HYPOTHESES),
         *(integers, reals),
     )
-    position, shift, wrong, first, last = np.moveaxis(integers[:, 1:].reshape(n, 2, 5), 2, 0)
-    evidence = np.moveaxis(reals.reshape(n, 3, 2), 1, 0)
-    return WindowEstimates(integers[:, 0], position, shift, wrong, first, last, *evidence)
+    by_axis = integers[:, 1:].reshape(n, 2, 5)
+    return WindowEstimates(
+        integers[:, 0],
+        *(by_axis[..., k] for k in range(5)),
+        *(reals[:, k : k + 2] for k in (0, 2, 4)),
+    )
 
 
 def estimate_windows_numpy(column_bits: Bits, row_bits: Bits, codec: Codec) -> WindowEstimates:

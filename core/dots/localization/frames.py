@@ -8,6 +8,7 @@ needs, which decides whether the searches for small windows are used.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec
-from locatk.core.dots.detection.blobs import detect_dots
+from locatk.core.dots.detection.blobs import DetectedDots, detect_dots
 from locatk.core.dots.detection.lattice import MIN_LATTICE_DOTS, DotLattices, fit_lattices
 from locatk.core.dots.identification.decoding import (
     MIN_CODE_CONFIDENCE,
@@ -151,9 +152,26 @@ def localize_frames(
     for start in range(0, n, FRAMES_PER_BATCH):
         remaining = np.arange(start, min(start + FRAMES_PER_BATCH, n))
         for level in _levels(height, width):
-            part, _, _ = _localize_batch(
-                images[remaining], codec, camera, level, min_confidence, other_codec_odds
+            points, dots = _detect_points(images[remaining], camera, level)
+            part, _, _ = _localize_dots(
+                points, dots, codec, camera is None, min_confidence, other_codec_odds
             )
+            # Strong tilt, strong distortion and covered frames take longer than all others.
+            if part.accepted.all():
+                result.update(remaining, part)
+                break
+            again = np.flatnonzero(~part.accepted & (part.rejected != TOO_FEW_DOTS))
+            if len(again):
+                thorough, _, _ = _localize_dots(
+                    points[again],
+                    DetectedDots(dots.xy[again], dots.valid[again]),
+                    codec,
+                    camera is None,
+                    min_confidence,
+                    other_codec_odds,
+                    is_thorough=True,
+                )
+                part.update(again, thorough)
             result.update(remaining, part)
             remaining = remaining[~result.accepted[remaining]]
             if not len(remaining):
@@ -161,35 +179,75 @@ def localize_frames(
     return result
 
 
-def _localize_batch(
-    images: Images,
-    codec: Codec,
-    camera: Camera | None,
-    level: int,
-    min_confidence: float,
-    other_codec_odds: float,
-) -> tuple[LocalizedFrames, DotLattices, DecodedWindows]:
-    """Localize frames (n, h, w) at a size that is halved ``level`` times."""
-    n, height, width = images.shape
+def _detect_points(
+    images: Images, camera: Camera | None, level: int
+) -> tuple[NDArray[np.float32], DetectedDots]:
+    """Detect the dots of frames at a size that is halved ``level`` times.
+
+    Return also their positions (n, m, 2) without known distortion, in half diagonals from the
+    centre of the camera.
+    """
+    _, height, width = images.shape
     dots = detect_dots(_shrink(images, level))
     scale = np.float32(1 << level)
     pixels = (dots.xy + np.float32(0.5)) * scale - np.float32(0.5)
     centre, half_diagonal = _normalization(height, width, camera)
     if camera is not None and camera.radial:
         pixels = camera.undistort(pixels.astype(np.float64))
-    points = ((pixels - centre) / half_diagonal).astype(np.float32)
-    lattices = fit_lattices(points, dots.valid, lens=camera is None)
+    return ((pixels - centre) / half_diagonal).astype(np.float32), dots
 
+
+def _localize_dots(
+    points: NDArray[np.float32],
+    dots: DetectedDots,
+    codec: Codec,
+    lens: bool,
+    min_confidence: float,
+    other_codec_odds: float,
+    *,
+    is_thorough: bool = False,
+) -> tuple[LocalizedFrames, DotLattices, DecodedWindows | None]:
+    """Localize frames by their dots; return also the lattices and windows of those with a grid."""
+    lattices = fit_lattices(points, dots.valid, lens=lens, is_thorough=is_thorough)
+    if not lattices.fitted.all():
+        frames = unlocalized_frames(len(points), NO_GRID)
+        frames.rejected[dots.counts < MIN_LATTICE_DOTS] = TOO_FEW_DOTS
+        fitted = np.flatnonzero(lattices.fitted)
+        if not len(fitted):
+            return frames, lattices, None
+        part, lattices, windows = _localize_lattices(
+            lattices.select(fitted),
+            codec,
+            min_confidence,
+            other_codec_odds,
+            is_thorough=is_thorough,
+        )
+        frames.update(fitted, part)
+        return frames, lattices, windows
+    return _localize_lattices(
+        lattices, codec, min_confidence, other_codec_odds, is_thorough=is_thorough
+    )
+
+
+def _localize_lattices(
+    lattices: DotLattices,
+    codec: Codec,
+    min_confidence: float,
+    other_codec_odds: float,
+    *,
+    is_thorough: bool,
+) -> tuple[LocalizedFrames, DotLattices, DecodedWindows]:
+    """Localize frames that all have a lattice."""
     half = window_half_width(lattices)
     bits = soft_bits(lattices, half)
-    windows = identify_windows(*bits, codec, other_codec_odds=other_codec_odds)
+    windows = identify_windows(
+        *bits, codec, is_thorough=is_thorough, other_codec_odds=other_codec_odds
+    )
     poses = localize_windows(lattices, half, windows, codec)
-    rejected = np.full(n, "", object)
+    rejected = np.full(len(windows.confidence), "", object)
     rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
     rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
     rejected[(rejected != "") & windows.border] = SECTION_BORDER
-    rejected[~lattices.fitted] = NO_GRID
-    rejected[dots.counts < MIN_LATTICE_DOTS] = TOO_FEW_DOTS
     frames = LocalizedFrames(
         grid=poses.grid,
         section=windows.section,
@@ -197,7 +255,7 @@ def _localize_batch(
         covariance=poses.covariance,
         dots=windows.dots,
         corrected=windows.corrected,
-        confidence=np.where(lattices.fitted, windows.confidence, 0.0),
+        confidence=windows.confidence,
         rejected=rejected,
     )
     return frames, lattices, windows
@@ -266,11 +324,18 @@ def dot_correspondences(
     _, height, width = images.shape
     centre, half_diagonal = _normalization(height, width, camera)
     for image in images:
-        for level in _levels(height, width):
-            frame, lattices, windows = _localize_batch(
-                image[None], codec, camera, level, MIN_CONFIDENCE, other_codec_odds
+        for level, is_thorough in itertools.product(_levels(height, width), (False, True)):
+            points, detected = _detect_points(image[None], camera, level)
+            frame, lattices, windows = _localize_dots(
+                points,
+                detected,
+                codec,
+                camera is None,
+                MIN_CONFIDENCE,
+                other_codec_odds,
+                is_thorough=is_thorough,
             )
-            if not frame.accepted[0]:
+            if windows is None or not frame.accepted[0]:
                 continue
             dots = assign_dots(lattices, window_half_width(lattices), windows, codec)
             used = dots.used[0]

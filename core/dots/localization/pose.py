@@ -1,12 +1,22 @@
 """Pose of the camera from a decoded window.
 
 Once a window is decoded, the symbol of every dot is known and with it the dot's true position. The
-lattice is fitted once more to all dots at these positions, and the pose and its covariance follow
+lattice is fitted once more to the dots at these positions, and the pose and its covariance follow
 from the fit. (Hostettler et al. 2016, II-B.8, use one corner of the decoded window instead.)
+
+Near hands, ink and reflections some dots are displaced. Those beyond a gate, whose width follows
+from the median residual of the frame, are not used. They show that others within the gate are
+displaced as well, which no residual reveals: the covariance therefore contains them as if they were
+at the gate, in directions of their own and all together.
+
+In tilted frames the image of a disc is displaced from the image of its centre. To second order of
+its radius r, in pitches, the displacement on the paper is r^2 times the slope of the logarithm of
+the inverse depth, the same for all dots, so that the residuals do not show it either.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,11 +36,15 @@ from locatk.core.dots.detection.lattice import (
     C_U,
     C_V,
     MIN_SIGMA_PITCHES,
+    PERSPECTIVE,
     SYMBOL_GATE_PITCHES,
     DotLattices,
+    add_prior,
     prior_weights,
-    refit_lattices,
+    project_lattices,
+    second_lens_columns,
     slope_at_centre,
+    sum_equations,
 )
 from locatk.core.dots.identification.decoding import DecodedWindows
 from locatk.core.dots.identification.phase_voting import kernel_tables
@@ -38,6 +52,30 @@ from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 from locatk.core.kernels import kernels
 
 Array = NDArray[np.float64]
+
+MAX_REFIT_STEPS = 8
+"""Maximum number of Gauss-Newton steps after decoding, each with its own inliers. Sharp frames need
+three until no dot changes its side of the gate, strongly bent ones more."""
+
+SECOND_LENS_SIGMA = 0.15
+"""Prior standard deviation of the second radial coefficient at the corner of the frame, as that of
+the first."""
+
+MIN_SECOND_LENS_SIGMAS = 5.0
+"""Least first estimate of the second radial coefficient, in its standard deviations; below it, the
+first coefficient suffices."""
+
+INLIER_GATE_SIGMAS = 3.0
+"""Radius of the gate of a dot's residual, in standard deviations of an axis; 1.1 % of Gaussian
+residuals are beyond it (chi-square with two degrees of freedom)."""
+
+GATED_VARIANCE_RATIO = 1 - 0.5 * INLIER_GATE_SIGMAS**2 / math.expm1(0.5 * INLIER_GATE_SIGMAS**2)
+"""Variance of Gaussian residuals within the gate, relative to that of all."""
+
+SQUARED_DOT_RADIUS = 0.0174
+SQUARED_DOT_RADIUS_SIGMA = 0.007
+"""Mean and standard deviation of the squared radius of printed dots [squared pitches], if widths
+from 1/6 (nominal) to 0.35 pitches (with dot gain) are equally likely."""
 
 IMAGE_TO_PRINT = np.array(
     [[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]], np.int64
@@ -103,9 +141,12 @@ def localize_windows(
     kernels.poses(
         np.ascontiguousarray(lattices.points),
         np.ascontiguousarray(lattices.valid),
-        *(lattices.uv, lattices.nodes, n, m, half, lattices.lens, prior_weights(True), decoded),
+        *(n, m, half, lattices.lens, prior_weights(True), decoded),
         *kernel_tables(codec),
         *(SECTION_LENGTH, MIN_SHIFT, DOT_OFFSET_PITCHES, SYMBOL_GATE_PITCHES, MIN_SIGMA_PITCHES),
+        *(MAX_REFIT_STEPS, SECOND_LENS_SIGMA, MIN_SECOND_LENS_SIGMAS**2),
+        *(INLIER_GATE_SIGMAS, GATED_VARIANCE_RATIO),
+        *(SQUARED_DOT_RADIUS, SQUARED_DOT_RADIUS_SIGMA),
         *(lattices.parameters.copy(), pose, covariance),
     )
     return GridPoses(pose[:, :2], pose[:, 2], covariance)
@@ -115,18 +156,113 @@ def localize_windows_numpy(
     lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
 ) -> GridPoses:
     """Estimate poses as :func:`localize_windows`, without the compiled kernel."""
-    dots = assign_dots(lattices, half, windows, codec)
-    parameters, covariance = refit_lattices(lattices, dots.residual, dots.used)
+    fit = _fit_robustly(lattices, half, windows, codec)
+    parameters = fit.lattices.parameters
     rotation = IMAGE_TO_PRINT[windows.rotation]
     corner = PRINTED_CORNERS[windows.rotation] * (2 * half - 1)
-    centre = parameters[:, [C_U, C_V]] + half
     slope = slope_at_centre(parameters)
+    depth_slope = _depth_slope(slope, parameters[:, PERSPECTIVE])
+    centre = parameters[:, [C_U, C_V]] + half + SQUARED_DOT_RADIUS * depth_slope
     right = np.einsum("nij,nj->ni", rotation, slope[:, :, 0])
+    covariance = _pose_covariance(fit.covariance, slope, rotation)
+    spread = SQUARED_DOT_RADIUS_SIGMA * np.einsum("nij,nj->ni", rotation, depth_slope)
+    covariance[:, :2, :2] += spread[:, :, None] * spread[:, None]
+    origin = np.stack([windows.x, windows.y], axis=1)
     return GridPoses(
-        grid=np.einsum("nij,nj->ni", rotation, centre) + corner + dots.origin,
+        grid=np.einsum("nij,nj->ni", rotation, centre) + corner + origin,
         heading=np.arctan2(-right[:, 1], right[:, 0]),
-        covariance=_pose_covariance(covariance, slope, rotation),
+        covariance=covariance,
     )
+
+
+def _depth_slope(slope: Array, perspective: Array) -> Array:
+    """Return the slope (n, 2) of the logarithm of the inverse depth on the paper, per pitch."""
+    (uu, uv), (vu, vv) = slope.transpose(1, 2, 0)
+    first, second = perspective.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        area = uu * vv - uv * vu
+        solved = [first * vv - second * vu, second * uu - first * uv]
+        result: Array = np.stack(solved, axis=1) / area[:, None]
+    return result
+
+
+@dataclass(frozen=True)
+class _RobustFit:
+    """Lattices fitted to decoded dots, and the covariance (n, 9, 9) of their parameters."""
+
+    lattices: DotLattices
+    covariance: Array
+
+
+def _fit_robustly(
+    lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
+) -> _RobustFit:
+    """Fit lattices to the dots of decoded windows within the gate of each frame.
+
+    If the lens is unknown, a second radial coefficient is fitted to the frames that show one.
+    """
+    n = len(lattices.parameters)
+    squared_radius = (lattices.points.astype(np.float64) ** 2).sum(axis=2)
+    bend, has_second_lens = np.zeros(n), np.full(n, lattices.lens)
+    fitted, previous = lattices, np.zeros_like(lattices.valid)
+    for _ in range(MAX_REFIT_STEPS):
+        current = fitted
+        dots = assign_dots(current, half, windows, codec)
+        squared = (dots.residual * dots.residual).sum(axis=2)
+        variance = np.maximum(_median_variance(squared, dots.used), MIN_SIGMA_PITCHES**2)
+        is_inlier = dots.used & (squared < (INLIER_GATE_SIGMAS**2 * variance)[:, None])
+        normal, right = sum_equations(current, dots.residual, is_inlier)
+        add_prior(normal, right, current.parameters, np.sqrt(variance), lens=lattices.lens)
+        inverse = np.linalg.inv(normal)
+        step = np.einsum("nij,nj->ni", inverse, right)
+        if has_second_lens.any():
+            columns = second_lens_columns(current) * is_inlier[..., None]
+            _, cross = sum_equations(current, -columns, is_inlier)
+            coupling = np.einsum("nij,nj->ni", inverse, cross)
+            prior = variance * SECOND_LENS_SIGMA**-2.0
+            weight = (columns.astype(np.float64) ** 2).sum(axis=(1, 2)) + prior
+            weight -= np.einsum("ni,ni->n", cross, coupling)
+            gain = -(columns.astype(np.float64) * dots.residual).sum(axis=(1, 2)) - prior * bend
+            gain -= np.einsum("ni,ni->n", cross, step)
+            if current is lattices:
+                has_second_lens = gain * gain > MIN_SECOND_LENS_SIGMAS**2 * variance * weight
+            change = np.where(has_second_lens, gain / weight, 0)
+            bend = bend + change
+            step -= coupling * change[:, None]
+            coupling = np.where(has_second_lens[:, None], coupling, 0)
+            inverse += coupling[:, :, None] * (coupling / weight[:, None])[:, None]
+        factor = 1 + bend[:, None] * squared_radius**2
+        fitted = project_lattices(
+            lattices, current.parameters + step, lattices.points * factor[..., None]
+        )
+        if (is_inlier == previous).all():
+            break
+        previous = is_inlier
+    count = is_inlier.sum(axis=1)
+    squares = (squared * is_inlier).sum(axis=1, dtype=np.float64)
+    inlier_variance = np.maximum(
+        squares / (GATED_VARIANCE_RATIO * np.maximum(2 * count - 8, 1)), MIN_SIGMA_PITCHES**2
+    )
+    # Outliers count as if at the gate: in directions of their own, and all together.
+    is_outlier = dots.used & ~is_inlier
+    gate = INLIER_GATE_SIGMAS * np.sqrt(variance)
+    clipped = dots.residual * (gate[:, None] / np.sqrt(np.maximum(squared, 1e-12)))[..., None]
+    outlier_normal, outlier_sum = sum_equations(current, clipped.astype(np.float32), is_outlier)
+    hidden = 0.5 * (gate * gate)[:, None, None] * outlier_normal
+    hidden += outlier_sum[:, :, None] * outlier_sum[:, None]
+    covariance = inlier_variance[:, None, None] * inverse + inverse @ hidden @ inverse
+    return _RobustFit(fitted, covariance)
+
+
+def _median_variance(squared: NDArray[np.float32], used: NDArray[np.bool_]) -> Array:
+    """Return the variance (n,) of dots per axis from the median of their squared residuals."""
+    count = used.sum(axis=1)
+    ordered = np.sort(np.where(used, squared, np.float32(np.inf)), axis=1)
+    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[:, None] // 2, axis=1)[:, 0]
+    middle = np.where(count > 0, middle, 0).astype(np.float64)
+    degrees = 2 * count / np.maximum(2 * count - 8, 1)
+    result: Array = middle / (2 * math.log(2)) * degrees
+    return result
 
 
 def assign_dots(

@@ -130,6 +130,30 @@ def test_light_from_a_side_moves_no_dots() -> None:
     assert np.abs(np.array(means)).max() < 0.006
 
 
+@pytest.mark.parametrize("diameter", [2.5, 4.0])
+def test_light_that_falls_steeply_moves_no_dots(diameter: float) -> None:
+    # In both directions, to a twentieth of the brightness; the light alone would move a Gaussian
+    # dot by its variance times the relative slope, 0.03 px on average.
+    rng = np.random.default_rng(3)
+    for low, high in ((0.05, 1.0), (1.0, 0.05)):
+        at = positions(np.random.default_rng(4))
+        error, lost, _ = errors(at, draw(at, diameter, rng, light=across(low, high), noise=0.5))
+        assert lost < len(at) / 20
+        assert abs(error.mean(axis=0)).max() < 0.008
+
+
+def test_dots_in_a_halo_stay() -> None:
+    rng = np.random.default_rng(3)
+    at = positions(rng)
+    x, y = np.meshgrid(np.arange(SIZE[0]) - 94, np.arange(SIZE[1]) - 60)
+    halo = 0.3 + 0.7 * np.exp(-0.5 * (x * x + y * y) / 35.0**2)
+    error, lost, _ = errors(at, draw(at, 3.3, rng, light=halo, noise=0.5))
+    assert lost == 0
+    # Outwards, on average: 0.05 px without the light's slope at each dot.
+    outwards = (at - [94, 60]) / np.linalg.norm(at - [94, 60], axis=1)[:, None]
+    assert abs((error * outwards).sum(axis=1).mean()) < 0.012
+
+
 def test_neighbours_that_lean_to_each_other_are_two() -> None:
     # Two thirds of a pitch apart at most: 7.4 px for dots of 3.9 px.
     rng = np.random.default_rng(5)

@@ -452,7 +452,12 @@ def estimates(**changes: Any) -> decoding.WindowEstimates:
 
 @pytest.mark.parametrize(
     ("log_odds", "order_log_odds", "least", "most"),
-    [(100.0, 100.0, 0.9999999, 1), (0.0, 100.0, 0.49, 0.51), (100.0, -5.0, 0.35, 0.45)],
+    [
+        (100.0, 100.0, 0.9999999, 1),
+        (0.0, 100.0, 0.49, 0.51),
+        (100.0, -5.0, 0.93, 0.95),
+        (100.0, -10.0, 0.09, 0.11),
+    ],
 )
 def test_evidence_against_random_bits_and_against_other_codecs(
     log_odds: float, order_log_odds: float, least: float, most: float

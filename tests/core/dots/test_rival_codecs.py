@@ -52,7 +52,7 @@ def is_right(decoded: DecodedWindows, at: NDArray[np.int64]) -> NDArray[np.bool_
 @pytest.mark.parametrize("disturbance", DISTURBANCES)
 @pytest.mark.parametrize(("printed", "read"), list(itertools.permutations(CODEC_NAMES, 2)))
 def test_no_pair_of_codecs_is_confused(printed: str, read: str, disturbance: str) -> None:
-    column, row, at = windows(printed, 150, (12, 11), disturbance)
+    column, row, at = windows(printed, 80, (12, 11), disturbance)
     decoded = identify_windows(column, row, codec(read))
     accepted = decoded.confidence >= MIN_CONFIDENCE
     assert not (accepted & ~is_right(decoded, at)).any()
