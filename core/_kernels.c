@@ -1220,7 +1220,11 @@ static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid,
     const double chance = 16 * options->symbol_gate * options->symbol_gate;
     const double least =
         chance * dots + options->min_sigmas * sqrt(chance * (1 - chance > 0 ? 1 - chance : 0) * dots);
-    return count >= options->min_dots && count >= least;
+    /* Root mean square of values that are uniform within the gate, and its spread. */
+    const double random_sigma = options->symbol_gate / sqrt(3.0);
+    const double spread = sqrt(0.2 / (count > 0 ? 2 * count : 1));
+    return count >= options->min_dots && count >= least
+           && *sigma < random_sigma * (1 - options->min_sigmas * spread);
 }
 
 /* Largest numbers of dots of a frame and of dots that seed a lattice. Pairs of seeds are stored.
