@@ -1095,8 +1095,10 @@ static int spectral_seed(const float *points, const uint8_t *valid, int m, const
     double phasor[2][2] = {{0}};
     for (int row = 0; row <= half; row++)
         for (int column = 0; column <= half; column++) {
-            const float *restrict a = waves[0][0] + column * count, *restrict b = waves[0][1] + column * count;
-            const float *restrict c = waves[1][0] + row * count, *restrict d = waves[1][1] + row * count;
+            const float *restrict a = waves[0][0] + column * count;
+            const float *restrict b = waves[0][1] + column * count;
+            const float *restrict c = waves[1][0] + row * count;
+            const float *restrict d = waves[1][1] + row * count;
             float sums[4][LANES] = {{0}};
             int i = 0;
             for (; i + LANES <= count; i += LANES)
@@ -1118,7 +1120,8 @@ static int spectral_seed(const float *points, const uint8_t *valid, int m, const
             for (int side = 0; side < 2; side++) {
                 const float re = side ? total[0] + total[1] : total[0] - total[1];
                 const float im = side ? total[2] - total[3] : total[2] + total[3];
-                power[(row * (half + 1) + column) * 2 + side] = (re * re + im * im) / (float)(count * count);
+                power[(row * (half + 1) + column) * 2 + side] =
+                    (re * re + im * im) / (float)(count * count);
             }
         }
     for (int peak = 0; peak < 2; peak++) {
@@ -1130,7 +1133,8 @@ static int spectral_seed(const float *points, const uint8_t *valid, int m, const
             if (size < 0.5f / pitch || size > 1.700001f / pitch) continue;
             if (peak) {
                 const float first = hypotf(frequency[0][0], frequency[0][1]);
-                const float sine = fabsf(fx * frequency[0][1] - fy * frequency[0][0]) / (size * first);
+                const float sine =
+                    fabsf(fx * frequency[0][1] - fy * frequency[0][0]) / (size * first);
                 if (sine < 0.6f || size < 0.5f * first || size > 2 * first) continue;
             }
             best[peak] = power[k];
@@ -1140,7 +1144,8 @@ static int spectral_seed(const float *points, const uint8_t *valid, int m, const
         }
         if (index < 0 || best[peak] < options->min_seed_power) return 0;
         for (int i = 0; i < count; i++) {
-            const double phase = 6.283185307179586 * (frequency[peak][0] * x[i] + frequency[peak][1] * y[i]);
+            const double turns = frequency[peak][0] * x[i] + frequency[peak][1] * y[i];
+            const double phase = 6.283185307179586 * turns;
             phasor[peak][0] += cos(phase);
             phasor[peak][1] += sin(phase);
         }
@@ -1263,7 +1268,11 @@ static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid,
     const double chance = 16 * options->symbol_gate * options->symbol_gate;
     const double least =
         chance * dots + options->min_sigmas * sqrt(chance * (1 - chance > 0 ? 1 - chance : 0) * dots);
-    return count >= options->min_dots && count >= least;
+    /* Root mean square of values that are uniform within the gate, and its spread. */
+    const double random_sigma = options->symbol_gate / sqrt(3.0);
+    const double spread = sqrt(0.2 / (count > 0 ? 2 * count : 1));
+    return count >= options->min_dots && count >= least
+           && *sigma < random_sigma * (1 - options->min_sigmas * spread);
 }
 
 /* Largest numbers of dots of a frame and of dots that seed a lattice. Pairs of seeds are stored.
@@ -1316,7 +1325,8 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
     const size_t pairs = (size_t)(7 * seeds + seeds * (seeds + 1));
     const size_t spectrum = (size_t)(2 * seeds) + (size_t)(2 * MAX_FREQUENCIES * seeds)
                             + (size_t)(MAX_FREQUENCIES * MAX_FREQUENCIES / 2) + 3 * (size_t)seeds;
-    float *scratch = malloc(((size_t)m + 1 + (pairs > spectrum ? pairs : spectrum)) * sizeof(float));
+    const size_t items = (size_t)m + 1 + (pairs > spectrum ? pairs : spectrum);
+    float *scratch = malloc(items * sizeof(float));
     const int has_memory = has_dots && scratch;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS

@@ -101,7 +101,8 @@ CHANCE_FRACTION = 4 * (2 * SYMBOL_GATE_PITCHES) ** 2
 """Fraction of random dots that are near the offset of a symbol."""
 
 MIN_LATTICE_SIGMAS = 5.0
-"""Least number of dots near symbols of a lattice, in standard deviations above those by chance."""
+"""Least number of dots near symbols of a lattice, in standard deviations above those by chance; and
+least deviation of their scatter below that of dots at random within the gate."""
 
 A_U, C_U, A_V, C_V, PERSPECTIVE, LENS = (
     slice(0, 2), 2, slice(3, 5), 5, slice(6, 8), 8,
@@ -146,8 +147,16 @@ class DotLattices:
 
     def select(self, indices: NDArray[np.int64]) -> DotLattices:
         """Return the lattices of some of the frames."""
-        arrays = (self.parameters, self.points, self.valid, self.uv, self.nodes, self.sigma)
-        return DotLattices(*(a[indices] for a in arrays), self.fitted[indices], self.lens)
+        return DotLattices(
+            self.parameters[indices],
+            self.points[indices],
+            self.valid[indices],
+            self.uv[indices],
+            self.nodes[indices],
+            self.sigma[indices],
+            self.fitted[indices],
+            self.lens,
+        )
 
 
 def fit_lattices(
@@ -212,9 +221,8 @@ def fit_lattices_numpy(
     count = used.sum(axis=1)
     squares = (residual * residual).sum(axis=2)
     sigma = np.sqrt((squares * used).sum(axis=1) / np.maximum(2 * count - 8, 1))
-    fitted = (
-        fitted & (count >= _least_count(valid.sum(axis=1))) & np.isfinite(parameters).all(axis=1)
-    )
+    fitted = fitted & (count >= _least_count(valid.sum(axis=1)))
+    fitted &= (sigma < _largest_sigma(count)) & np.isfinite(parameters).all(axis=1)
     return DotLattices(
         parameters, points, valid, uv, np.rint(uv), sigma.astype(float), fitted, lens
     )
@@ -224,6 +232,16 @@ def _least_count(dots: NDArray[np.int64]) -> Array:
     """Return the least numbers of dots near symbols from which frames with ``dots`` have a grid."""
     spread = np.sqrt(CHANCE_FRACTION * (1 - CHANCE_FRACTION) * dots)
     return np.maximum(CHANCE_FRACTION * dots + MIN_LATTICE_SIGMAS * spread, MIN_LATTICE_DOTS)
+
+
+def _largest_sigma(count: NDArray[np.int64]) -> Array:
+    """Return the scatter below which ``count`` dots are nearer to symbols than random ones.
+
+    Of 2 n values that are uniform within a gate g, the root mean square is g / sqrt(3), with a
+    relative standard deviation of sqrt(1 / 5 / (2 n)).
+    """
+    spread = np.sqrt(0.2 / np.maximum(2 * count, 1))
+    return SYMBOL_GATE_PITCHES / math.sqrt(3) * (1 - MIN_LATTICE_SIGMAS * spread)
 
 
 def _grow_lattices(

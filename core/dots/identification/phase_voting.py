@@ -91,9 +91,15 @@ def estimate_windows(column_bits: Bits, row_bits: Bits, codec: Codec) -> WindowE
     )
     by_axis = integers[:, 1:].reshape(n, 2, 5)
     return WindowEstimates(
-        integers[:, 0],
-        *(by_axis[..., k] for k in range(5)),
-        *(reals[:, k : k + 2] for k in (0, 2, 4)),
+        rotation=integers[:, 0],
+        position=by_axis[..., 0],
+        shift=by_axis[..., 1],
+        wrong=by_axis[..., 2],
+        first=by_axis[..., 3],
+        last=by_axis[..., 4],
+        log_odds=reals[:, 0:2],
+        order_log_odds=reals[:, 2:4],
+        lead=reals[:, 4:6],
     )
 
 

@@ -97,12 +97,13 @@ def test_images_too_small_for_a_dot_have_none(shape: tuple[int, int, int]) -> No
 
 @pytest.mark.slow
 @needs_kernels
+@pytest.mark.parametrize("is_thorough", [True, False])
 @pytest.mark.parametrize("lens", [True, False])
-def test_lattices_are_the_same(lens: bool) -> None:
+def test_lattices_are_the_same(lens: bool, is_thorough: bool) -> None:
     dots = blobs.detect_dots_numpy(drawn(5))
     points = as_points(dots)
-    mine = grid.fit_lattices(points, dots.valid, lens=lens)
-    twin = grid.fit_lattices_numpy(points, dots.valid, lens=lens)
+    mine = grid.fit_lattices(points, dots.valid, lens=lens, is_thorough=is_thorough)
+    twin = grid.fit_lattices_numpy(points, dots.valid, lens=lens, is_thorough=is_thorough)
     assert mine.fitted.all()
     assert np.array_equal(mine.fitted, twin.fitted)
     np.testing.assert_allclose(mine.parameters, twin.parameters, atol=1e-4)
@@ -115,8 +116,19 @@ def test_lattices_are_the_same(lens: bool) -> None:
 def test_too_few_dots_have_no_lattice_in_either() -> None:
     points = np.random.default_rng(6).normal(size=(2, 15, 2)).astype(np.float32)
     valid = np.ones((2, 15), bool)
-    assert not grid.fit_lattices(points, valid, lens=False).fitted.any()
-    assert not grid.fit_lattices_numpy(points, valid, lens=False).fitted.any()
+    for is_thorough in (False, True):
+        for fit in (grid.fit_lattices, grid.fit_lattices_numpy):
+            assert not fit(points, valid, lens=False, is_thorough=is_thorough).fitted.any()
+
+
+@needs_kernels
+def test_random_dots_have_no_lattice_in_either() -> None:
+    points = np.random.default_rng(8).uniform(-1, 1, (20, 150, 2)).astype(np.float32)
+    valid = np.ones((20, 150), bool)
+    for is_thorough in (False, True):
+        for fit in (grid.fit_lattices, grid.fit_lattices_numpy):
+            fitted = fit(points, valid, lens=False, is_thorough=is_thorough).fitted
+            assert fitted.sum() <= 2
 
 
 @pytest.mark.slow
