@@ -29,6 +29,7 @@ from locatk.core.dots.identification.decoding import MIN_CONFIDENCE
 from locatk.core.dots.localization.frames import (
     LOW_CONFIDENCE,
     NO_CODE,
+    NO_GRID,
     DotCorrespondences,
     LocalizedFrames,
     dot_correspondences,
@@ -314,7 +315,7 @@ def may_show_seam(
 
     ``numbers`` (n,) is the sheet of each frame, -1 if it has none. A frame may show a seam if the
     end of its sheet is no farther from the middle than the corners of the frame are, or if it was
-    rejected with many dots.
+    rejected with many dots or without a lattice.
     """
     low = np.array([sheet.origin for sheet in manifest.sheets])[numbers]
     high = low + np.array([sheet.size for sheet in manifest.sheets])[numbers] - 1
@@ -323,6 +324,8 @@ def may_show_seam(
     is_near = to_end < np.sqrt(localized.dots)
     is_rejected = np.isin(localized.rejected, [NO_CODE, LOW_CONFIDENCE])
     is_rejected &= localized.dots >= 2 * MIN_SHEET_DOTS
+    # Two lattices that differ by half a pitch may leave none, and no dots on it to count.
+    is_rejected |= localized.rejected == NO_GRID
     return np.asarray(np.where(localized.accepted & (numbers >= 0), is_near, is_rejected))
 
 
