@@ -317,6 +317,30 @@ static void sort_floats(float *values, int count)
     }
 }
 
+/* Sort positive numbers in ascending order, digit by digit: their bits are in the order of their
+ * values. `scratch` has as many items. */
+static void sort_positive(float *values, float *scratch, int count)
+{
+    enum { DIGIT_BITS = 8, DIGITS = 4, BINS = 1 << DIGIT_BITS };
+    for (int digit = 0; digit < DIGITS; digit++) {
+        const int shift = digit * DIGIT_BITS;
+        int starts[BINS + 1] = {0};
+        uint32_t bits;
+        for (int k = 0; k < count; k++) {
+            memcpy(&bits, &values[k], sizeof(bits));
+            starts[(bits >> shift & (BINS - 1)) + 1]++;
+        }
+        for (int bin = 0; bin < BINS; bin++) starts[bin + 1] += starts[bin];
+        for (int k = 0; k < count; k++) {
+            memcpy(&bits, &values[k], sizeof(bits));
+            scratch[starts[bits >> shift & (BINS - 1)]++] = values[k];
+        }
+        float *swap = values;
+        values = scratch;
+        scratch = swap;
+    }
+}
+
 /* Value of rank `rank` in ascending order (Hoare's selection); reorders `values`. */
 static float nth_smallest(float *values, int count, int rank)
 {
@@ -413,8 +437,10 @@ static void moving_sum(const float *line, int count, int stride, int window, flo
     for (int k = -half; k <= half; k++) sum += line[mirror_index(k, count) * stride];
     for (int k = 0; k < count; k++) {
         out[k * stride] = sum;
-        sum += line[mirror_index(k + half + 1, count) * stride]
-               - line[mirror_index(k - half, count) * stride];
+        const int is_inside = k >= half && k + half + 1 < count;
+        const int next = is_inside ? k + half + 1 : mirror_index(k + half + 1, count);
+        const int last = is_inside ? k - half : mirror_index(k - half, count);
+        sum += line[next * stride] - line[last * stride];
     }
 }
 
@@ -445,10 +471,11 @@ static void paper_image(const uint8_t *image, int w, int rows, int columns, int 
 /* Median contrast of the dots, which are the minima above the split by Otsu's criterion. If fewer
  * than `min_dots` are above it, they are dirt, darker than any dot, and the rest is split again.
  */
-static float median_contrast(float *contrasts, int count, int min_dots, int splits)
+static float median_contrast(float *contrasts, float *scratch, int count, int min_dots,
+                             int splits)
 {
     if (count == 0) return 0;
-    sort_floats(contrasts, count);
+    sort_positive(contrasts, scratch, count);
     for (int split = 0; split < splits && count > 1; split++) {
         float total = 0, sum = 0, best = -1;
         int dots = 0;
@@ -493,8 +520,8 @@ static float paper_slope(const float *paper, int index, int count, int step, int
 
 /* Offset of a minimum along one axis [pixels]: top of the Gaussian through the ink at it and its
  * neighbours, where `slope` is that of the light, relative to it. */
-static float minimum_offset(const float *minimum, int step, float brightness, float slope, float ink,
-                            float top, float smoothing_variance)
+static float minimum_offset(const float *minimum, int step, float brightness, float slope,
+                            float ink, float top, float smoothing_variance)
 {
     const float floor = 0.05f * ink;
     const float before = 1 - minimum[-step] / (brightness * (1 - slope)),
@@ -594,7 +621,8 @@ static int detect_dots(const Detector *d, const uint8_t *image, float *xy)
     }
     memcpy(d->across, d->contrasts, (size_t)minima * sizeof(float));
     const float threshold =
-        d->contrast_fraction * median_contrast(d->across, minima, d->min_dots, d->splits);
+        d->contrast_fraction
+        * median_contrast(d->across, d->across + minima, minima, d->min_dots, d->splits);
     const int rows = d->rows, columns = d->columns;
     float smoothing_variance = 0;
     for (int k = 0; k < 2; k++) smoothing_variance += 2 * d->taps[k] * (float)((2 - k) * (2 - k));
@@ -646,8 +674,9 @@ static PyObject *find_dots(PyObject *self, PyObject *args)
     long long n, h, w, block, window, reach, min_dots, splits, max_dots;
     Detector d;
     if (!parse_arguments(args, "OLLLOLLLfffLLLOO:find_dots", &images_array, &n, &h, &w,
-                         &taps_array, &block, &window, &reach, &d.max_slope, &d.min_contrast, &d.contrast_fraction, &min_dots,
-                         &splits, &max_dots, &xy_array, &counts_array))
+                         &taps_array, &block, &window, &reach, &d.max_slope, &d.min_contrast,
+                         &d.contrast_fraction, &min_dots, &splits, &max_dots, &xy_array,
+                         &counts_array))
         return NULL;
     check_range(&call, "n", n, 0, INT_MAX);
     check_range(&call, "height", h, MIN_SIDE, MAX_SIDE);
@@ -1267,7 +1296,8 @@ static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid,
     for (int i = 0; i < m; i++) dots += valid[i] != 0;
     const double chance = 16 * options->symbol_gate * options->symbol_gate;
     const double least =
-        chance * dots + options->min_sigmas * sqrt(chance * (1 - chance > 0 ? 1 - chance : 0) * dots);
+        chance * dots
+        + options->min_sigmas * sqrt(chance * (1 - chance > 0 ? 1 - chance : 0) * dots);
     /* Root mean square of values that are uniform within the gate, and its spread. */
     const double random_sigma = options->symbol_gate / sqrt(3.0);
     const double spread = sqrt(0.2 / (count > 0 ? 2 * count : 1));
@@ -1288,8 +1318,8 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
     long long n, m, passes, seeds, min_dots;
     int lens;
     LatticeOptions options;
-    if (!parse_arguments(args, "OOLLppLOOLLddddddddddOOOOO:fit_lattices", &points_array, &valid_array,
-                         &n, &m, &lens, &options.is_thorough, &passes, &ring_array,
+    if (!parse_arguments(args, "OOLLppLOOLLddddddddddOOOOO:fit_lattices", &points_array,
+                         &valid_array, &n, &m, &lens, &options.is_thorough, &passes, &ring_array,
                          &prior_array, &seeds, &min_dots, &options.min_sigmas,
                          &options.min_neighbour, &options.max_neighbour, &options.cell_gate,
                          &options.cell_sigma, &options.symbol_gate, &options.symbol_sigma,
@@ -1648,8 +1678,8 @@ enum { MAX_SEQUENCE = 512, MAX_WINDOW_CELLS = 1024, MAX_WEIGHT = 1000 };
 #define MAX_POSITIONS (1LL << 40)
 #define MAX_COORDINATE (1LL << 60)
 
-/* Arrays of a codec as core/dots/identification/phase_voting.py passes them: lengths, weights, prefixes, crt, signs,
- * digits and masks. */
+/* Arrays of a codec as core/dots/identification/phase_voting.py passes them: lengths, weights,
+ * prefixes, crt, signs, digits and masks. */
 typedef struct {
     PyObject *lengths, *weights, *prefixes, *crt, *signs, *digits, *masks;
 } CodecArrays;
@@ -1760,8 +1790,8 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
 typedef struct {
     int half_width, lens, max_steps;
     const double *prior;
-    double offset, symbol_gate, min_sigma, second_lens_sigma, second_lens_odds, gate_sigmas, gated_variance,
-        square_radius, square_radius_sigma;
+    double offset, symbol_gate, min_sigma, second_lens_sigma, second_lens_odds, gate_sigmas,
+        gated_variance, square_radius, square_radius_sigma;
 } PoseOptions;
 
 static const int ROTATIONS[4][2][2] = {
@@ -2024,7 +2054,8 @@ static PyObject *poses(PyObject *self, PyObject *args)
                          &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
                          &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
                          &options.offset, &options.symbol_gate, &options.min_sigma, &steps,
-                         &options.second_lens_sigma, &options.second_lens_odds, &options.gate_sigmas, &options.gated_variance, &options.square_radius,
+                         &options.second_lens_sigma, &options.second_lens_odds,
+                         &options.gate_sigmas, &options.gated_variance, &options.square_radius,
                          &options.square_radius_sigma, &parameters_array, &pose_array,
                          &covariance_array))
         return NULL;
@@ -2054,7 +2085,8 @@ static PyObject *poses(PyObject *self, PyObject *args)
     Dots d;
     const int has_dots = new_dots(&d, (int)m);
     int64_t *phases = malloc(4 * (size_t)half_width * sizeof(int64_t));
-    float *scratch = has_dots ? malloc((2 * ((size_t)m + 1) + 2 * (size_t)d.count) * sizeof(float)) : NULL;
+    const size_t scratch_items = 2 * ((size_t)m + 1) + 2 * (size_t)d.count;
+    float *scratch = has_dots ? malloc(scratch_items * sizeof(float)) : NULL;
     const int has_memory = has_dots && phases && scratch;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS
@@ -2158,8 +2190,8 @@ static PyObject *ddtw(PyObject *self, PyObject *args)
 /* The first line of a docstring is the signature that Python's inspect module reads. */
 static PyMethodDef methods[] = {
     {"find_dots", find_dots, METH_VARARGS,
-     "find_dots($module, images, n, height, width, taps, block, window, slope_reach, max_slope, min_contrast,"
-     " contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
+     "find_dots($module, images, n, height, width, taps, block, window, slope_reach, max_slope,"
+     " min_contrast, contrast_fraction, min_dots, splits, max_dots, xy, counts, /)\n--\n\n"
      "Detect the dots of images; twin of locatk.core.dots.detection.blobs.detect_dots_numpy."},
     {"fit_lattices", fit_lattices, METH_VARARGS,
      "fit_lattices($module, points, valid, n, m, lens, is_thorough, passes, ring_radii, prior,"
