@@ -187,6 +187,9 @@ MAX_MAGNITUDE = 1e12
 """Largest number in an artifact, in the unit of its key: a million kilometres in millimetres. The
 squares of much larger ones overflow."""
 
+MAX_VARIANCE = MAX_MAGNITUDE**2
+"""Largest element of a covariance."""
+
 
 @dataclass(frozen=True)
 class Number:
@@ -198,6 +201,7 @@ class Number:
     is_high_excluded: bool = False
     is_nan_allowed: bool = False
     hint: str | None = None
+    max_magnitude: float = MAX_MAGNITUDE
 
     @property
     def expected(self) -> str:
@@ -228,9 +232,9 @@ class Number:
             return number
         if not math.isfinite(number):
             raise InvalidValueError(f"expected a finite number{self._range}{symbol}", "", self.hint)
-        if abs(number) > MAX_MAGNITUDE:
+        if abs(number) > self.max_magnitude:
             raise InvalidValueError(
-                f"expected a number of at most {MAX_MAGNITUDE:g} in magnitude{symbol}"
+                f"expected a number of at most {self.max_magnitude:g} in magnitude{symbol}"
             )
         is_above = number > self.low if self.is_low_excluded else number >= self.low
         is_below = number < self.high if self.is_high_excluded else number <= self.high

@@ -16,6 +16,7 @@ from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
+    MAX_VARIANCE,
     NO_UNIT,
     NOT_NEGATIVE,
     POSITIVE,
@@ -313,7 +314,7 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
             ),
             Key(
                 covariance,
-                Array((6, 6), Number(is_nan_allowed=True)),
+                Array((6, 6), Number(is_nan_allowed=True, max_magnitude=MAX_VARIANCE)),
                 "covariance of position (m) and rotation vector (rad) in the frame",
                 None,
                 "unknown",

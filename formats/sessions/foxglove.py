@@ -46,8 +46,9 @@ from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.polaris import codec
 from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets, cell_positions, vertices
 from locatk.core.trajectory import Trajectory
+from locatk.formats.sessions.mcap_file import MAX_TIME_NS
 from locatk.formats.sessions.messages import TimedMessage, timestamp
-from locatk.formats.sessions.reader import MAX_TIME_NS, Session, time_error
+from locatk.formats.sessions.reader import Session, time_error
 
 MAX_PATH_POINTS = 5000
 """Number of points of a path that is drawn as one line; longer paths are thinned evenly."""

@@ -57,6 +57,9 @@ RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence number, log time and publish time of a message."""
 
+MAX_TIME_NS = (1 << 63) - 1
+"""Latest time of a message that is read [ns since 1970]; MCAP permits twice of it."""
+
 FOOTER_BYTES = RECORD_HEAD.size + 20
 
 MAX_RUN_BYTES = 4 << 20

@@ -19,6 +19,7 @@ from locatk.core.errors import FormatError
 from locatk.formats.files import open_binary
 from locatk.formats.sessions import mcap_file
 from locatk.formats.sessions.mcap_file import (
+    MAX_TIME_NS,
     SESSION_RECORD,
     DamageError,
     Index,
@@ -27,9 +28,6 @@ from locatk.formats.sessions.mcap_file import (
     Segment,
 )
 from locatk.formats.sessions.recovery.salvage import describe_damage, salvage
-
-MAX_TIME_NS = (1 << 63) - 1
-"""Latest time of a message that is read [ns since 1970]; MCAP permits twice of it."""
 
 _MessageT = TypeVar("_MessageT", bound=Message)
 

@@ -32,6 +32,7 @@ from locatk.formats.sessions.mcap_file import (
     MAGIC,
     MAX_RECORD_BYTES,
     MAX_RUN_BYTES,
+    MAX_TIME_NS,
     MESSAGE_HEAD,
     RECORD_HEAD,
     DamageError,
@@ -351,6 +352,8 @@ class _Search:
             return None  # its length is wrong: it would contain other records
         head = self._file.read(position + RECORD_HEAD.size, MESSAGE_HEAD.size)
         channel, _, time_ns, _ = MESSAGE_HEAD.unpack(head)
+        if time_ns > MAX_TIME_NS:
+            return None  # its time is damaged: no reader accepts it
         self._run_counts[channel] += 1
         first, last = self._run_span or (time_ns, time_ns)
         self._run_span = min(first, time_ns), max(last, time_ns)

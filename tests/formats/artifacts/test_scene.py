@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from locatk.core.geometry import rotation_exp
 from locatk.core.lighthouse.calibration import MODELS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.formats.artifacts import scene as artifacts
+from locatk.formats.artifacts.kinds import MAX_VARIANCE
 from locatk.formats.artifacts.scene import dumps_scene, format_time, loads_scene, parse_time
 
 # ---- round trips
@@ -49,7 +51,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
 
 @st.composite
 def stations(draw: st.DrawFn, channel: int) -> Station:
-    values = st.floats(allow_infinity=False) | st.just(0.0)
+    values = st.floats(-MAX_VARIANCE, MAX_VARIANCE) | st.sampled_from((0.0, math.nan))
     covariance = st.lists(values, min_size=36, max_size=36).map(lambda v: np.array(v).reshape(6, 6))
     return Station(
         channel,
