@@ -614,6 +614,17 @@ def test_a_file_that_changes_during_recovery(
             assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_message_of_an_impossible_time_is_lost(tmp_path: Path) -> None:
+    path, output = tmp_path / "run.mcap", tmp_path / "out.mcap"
+    write(path, chunks=1, use_chunking=False)
+    messages, data = stock(path), bytearray(path.read_bytes())
+    log_time = (START_NS + 3 * 20_000_000).to_bytes(8, "little")
+    data[data.index(log_time) + 7] = 0xFF
+    path.write_bytes(data)
+    assert recover(path, output).messages == len(messages) - 1
+    assert len(list(Session.open(output).messages())) == len(messages) - 1
+
+
 # ---- any damage at all
 
 SMALL: list[dict[str, object]] = [
