@@ -267,11 +267,13 @@ class Reader:
         self.links = links
         self.monkeypatch = monkeypatch
         self.buckets: set[str] = set()
-        shim = folder / "bin" / "locatk"
-        shim.parent.mkdir()
-        _write(shim, f'#!/bin/sh\nexec "{sys.executable}" -m locatk.cli "$@"\n')
-        shim.chmod(0o755)
-        monkeypatch.setenv("PATH", f"{shim.parent}{os.pathsep}{os.environ['PATH']}")
+        # The environment of locatk is active: its commands and its Python come first.
+        shims = folder / "bin"
+        shims.mkdir()
+        for name, module in (("locatk", " -m locatk.cli"), ("python", "")):
+            _write(shims / name, f'#!/bin/sh\nexec "{sys.executable}"{module} "$@"\n')
+            (shims / name).chmod(0o755)
+        monkeypatch.setenv("PATH", f"{shims}{os.pathsep}{os.environ['PATH']}")
         monkeypatch.chdir(self.folder)
 
     def file(self, name: str, text: str) -> None:

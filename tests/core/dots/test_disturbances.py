@@ -68,7 +68,11 @@ def test_a_wide_strip_of_short_columns_is_decoded_by_a_second_search() -> None:
             table[hidden] = 0
         for is_thorough in found:
             windows = identify_windows(
-                bits[0][None], bits[1][None], codec("anoto"), is_thorough=is_thorough
+                bits[0][None],
+                bits[1][None],
+                codec("anoto"),
+                is_thorough=is_thorough,
+                other_codec_odds=0,
             )
             is_right = windows.x[0] == x and windows.y[0] == y
             assert is_right or windows.confidence[0] < 0.999
