@@ -16,7 +16,26 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 PATH = click.Path(path_type=Path)
 
-POSITIVE = click.FloatRange(0, min_open=True)
+
+class PositiveNumber(click.FloatRange):
+    """Number above 0, within limits that only mistakes exceed."""
+
+    def __init__(self, least: float, most: float) -> None:
+        super().__init__(0, min_open=True)
+        self.least, self.most = least, most
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the number."""
+        number: float = super().convert(value, param, ctx)
+        if not self.least <= number <= self.most:
+            self.fail(f"{number:g} is not from {self.least:g} to {self.most:g}.", param, ctx)
+        return number
+
+
+POSITIVE = PositiveNumber(1e-9, 1e9)
+"""Positive numbers; the squares and ratios of much larger or smaller ones overflow."""
 
 
 def _existing(ctx: click.Context, param: click.Parameter, value: Any) -> Any:

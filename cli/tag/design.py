@@ -12,7 +12,7 @@ from locatk.cli import console, options
 from locatk.cli.command import Command, section
 from locatk.cli.options import number
 from locatk.cli.tag.design_text import report_evaluation
-from locatk.cli.tag.options import code_options, reading_conditions, reading_options
+from locatk.cli.tag.options import LENGTH_MM, code_options, reading_conditions, reading_options
 from locatk.core.errors import OutputExistsError
 from locatk.core.units import metres
 
@@ -56,7 +56,7 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
     "Magnets",
     click.option(
         "--spacing",
-        type=options.POSITIVE,
+        type=LENGTH_MM,
         metavar="MM",
         help="Distance between neighbouring cells.  [default: the smallest that the paper's rule "
         "allows, in whole mm]",
@@ -64,14 +64,14 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
     number(
         "--diameter",
         default=2.0,
-        type=options.POSITIVE,
+        type=LENGTH_MM,
         metavar="MM",
         help="Diameter of a disc magnet.",
     ),
     number(
         "--height",
         default=0.5,
-        type=options.POSITIVE,
+        type=LENGTH_MM,
         metavar="MM",
         help="Height of a disc magnet.",
     ),
@@ -87,7 +87,7 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
     number(
         "--clearance",
         default=10.0,
-        type=options.POSITIVE,
+        type=LENGTH_MM,
         metavar="MM",
         help="Height of the sensors above the centres of the magnets.",
     ),

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from locatk.core.polaris.design.planning import ReadingConditions
     from locatk.core.polaris.tag import Tags
 
+LENGTH_MM = options.PositiveNumber(1e-3, 1e5)
+"""Lengths of tags and arrays: from a micrometre to a hundred metres."""
+
 CODECS = ("mosk", "redundant", "polaris-released")
 
 code_options = section(
@@ -64,7 +67,7 @@ reading_options = combine(
         number(
             "--sensor-spacing",
             default=20.0,
-            type=options.POSITIVE,
+            type=LENGTH_MM,
             metavar="MM",
             help="Distance between neighbouring magnetometers.",
         ),

@@ -16,7 +16,6 @@ from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, PlanarPose, Tags
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     NOT_NEGATIVE,
-    POSITIVE,
     REMANENCE,
     Integer,
     InvalidValueError,
@@ -123,6 +122,9 @@ def _tags_values(tags: Tags) -> Values:
 
 _MAX_MAGNETS = MAX_ORDER**2 - 1
 
+LENGTH_MM = Number(1e-3, 1e5)
+"""Lengths of a tag: from a micrometre to a hundred metres."""
+
 TAGS: Artifact[Tags] = Artifact(
     TAG_FILE,
     TAG_FORMAT,
@@ -132,15 +134,15 @@ TAGS: Artifact[Tags] = Artifact(
             Key("order", Integer(2, MAX_ORDER), "cells along a side, K of the paper"),
             Key("magnets", Integer(3, _MAX_MAGNETS), "M of the paper, at most K^2 - 1"),
             Key("orientations", Integer(2, MAX_ORIENTATIONS), "P of the paper"),
-            Key("spacing_mm", POSITIVE, "distance of neighbouring cells"),
-            Key("clearance_mm", POSITIVE, "height of the sensors over the middle of the magnets"),
+            Key("spacing_mm", LENGTH_MM, "distance of neighbouring cells"),
+            Key("clearance_mm", LENGTH_MM, "height of the sensors over the middle of the magnets"),
             Key("notes", ListOf(Text()), "for people", ()),
             Key(
                 "magnet",
                 Table(
                     (
-                        Key("diameter_mm", POSITIVE, "of the disc, at most `spacing_mm`"),
-                        Key("height_mm", POSITIVE, "of the disc"),
+                        Key("diameter_mm", LENGTH_MM, "of the disc, at most `spacing_mm`"),
+                        Key("height_mm", LENGTH_MM, "of the disc"),
                         Key("remanence_t", REMANENCE, "Br of the material"),
                         Key("grade", Text(), "grade under which it is sold", ""),
                     ),

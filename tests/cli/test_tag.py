@@ -38,6 +38,21 @@ def test_the_default_is_the_papers_tag(locatk, tmp_path: Path) -> None:
     assert all(len(line) <= 80 for line in result.stdout.splitlines()[1:])
 
 
+@pytest.mark.parametrize("name", ["--clearance", "--diameter", "--spacing", "--noise", "--speed"])
+@pytest.mark.parametrize("value", ["1e300", "1e-300"])
+def test_absurd_numbers_are_refused(locatk, tmp_path: Path, name: str, value: str) -> None:
+    result = design(locatk, tmp_path / "tag.toml", name, value)
+    assert result.exit_code == 2
+    assert f"{name}" in result.stderr and "is not from" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_field_that_is_too_weak_to_be_measured(locatk, tmp_path: Path) -> None:
+    result = design(locatk, tmp_path / "tag.toml", "--clearance", 1e5)
+    assert result.exit_code == 3
+    assert "the field is too weak" in result.stderr
+
+
 def test_the_default_spacing_follows_the_clearance(locatk, tmp_path: Path) -> None:
     path = tmp_path / "mini.toml"
     result = design(

@@ -22,6 +22,7 @@ from locatk.core.drawing import (
 )
 from locatk.core.drawing.pages import SMALL_TEXT_POINTS, TEXT_POINTS, PageFrame, UnnumberedPage
 from locatk.core.drawing.tiles import tile_name
+from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.landmark import draw_hole, draw_symbol, north_mark
 from locatk.core.landmarks.drawing.legend import LEGEND_HEIGHT_MM, draw_legend
 from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap
@@ -86,8 +87,20 @@ def draw_plan(
     """Draw the plan on one page with its legend, or on an overview and one page for each block.
 
     The orientation of the paper is the one with the fewest pages, then the largest scale.
+
+    Raises
+    ------
+    InputError
+        The paper is too small.
     """
-    layouts = [_lay_out_plan(floor, title, size, margin_mm) for size in (paper_mm, paper_mm[::-1])]
+    possible = (_lay_out_plan(floor, title, size, margin_mm) for size in (paper_mm, paper_mm[::-1]))
+    layouts = [layout for layout in possible if layout is not None]
+    if not layouts:
+        width, height = paper_mm
+        raise InputError(
+            f"a page of {width:g} x {height:g} mm is too small for the plan of the floor",
+            hint="Use a larger paper",
+        )
     layout = min(layouts, key=lambda item: (len(item.blocks), item.scale))
     frame = layout.frame
     cell_mm = 1e3 * floor.pitch_m / layout.scale
@@ -118,7 +131,10 @@ def round_scale(min_scale: float) -> float:
     return round(next(scale for scale in scales if scale >= min_scale * (1 - 1e-9)), 6)
 
 
-def _lay_out_plan(floor: FloorMap, title: str, size_mm: Point, margin_mm: float) -> _PlanLayout:
+def _lay_out_plan(
+    floor: FloorMap, title: str, size_mm: Point, margin_mm: float
+) -> _PlanLayout | None:
+    """Divide the plan over pages; return None if they have no space for legend and cells."""
     rows, columns = floor.shape
     notes = (
         f"{_count(rows, 'row')} x {_count(columns, 'column')}, "
@@ -130,6 +146,8 @@ def _lay_out_plan(floor: FloorMap, title: str, size_mm: Point, margin_mm: float)
     left, bottom, right, top = frame.content_box
     label_width, label_height = _label_space(floor)
     width, height = right - left - label_width, top - bottom - label_height
+    if min(width, height - LEGEND_HEIGHT_MM) < MIN_CELL_MM:
+        return None
     cell_mm = min(width / columns, (height - LEGEND_HEIGHT_MM) / rows, MAX_CELL_MM)
     across = down = 1
     if cell_mm < MIN_CELL_MM:

@@ -279,7 +279,10 @@ def _information_lost_to_steps(
     # The position at path 0 is not an unknown, because it defines the frame.
     is_unknown = path_m != 0
     block, mixed = block[np.ix_(is_unknown, is_unknown)], mixed[:, is_unknown]
-    return np.asarray(mixed @ np.linalg.solve(block, mixed.T))
+    try:
+        return np.asarray(mixed @ np.linalg.solve(block, mixed.T))
+    except np.linalg.LinAlgError:
+        raise InputError("the samples do not determine the magnets") from None
 
 
 def _inverse(information: Array) -> Array:
@@ -296,6 +299,6 @@ def _inverse(information: Array) -> Array:
     scaled = information / np.outer(scale, scale)
     try:
         np.linalg.cholesky(scaled)
+        return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
     except np.linalg.LinAlgError:
         raise InputError("the samples do not determine the magnets") from None
-    return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))

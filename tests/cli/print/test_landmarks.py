@@ -29,6 +29,16 @@ def words(path: Path, page: int) -> str:
     return " ".join(text.split())
 
 
+@pytest.mark.parametrize("size", ["60x60mm", "45x45mm"])
+def test_a_paper_too_small_for_the_plan_is_refused(
+    locatk, map_file: Path, tmp_path: Path, size: str
+) -> None:
+    result = locatk("print", "landmarks", map_file, "-o", tmp_path / "pack.pdf", "--size", size)
+    assert result.exit_code == 1
+    assert "is too small for the plan of the floor" in result.stderr
+    assert not (tmp_path / "pack.pdf").exists()
+
+
 def test_a_pack(locatk, map_file: Path, tmp_path: Path) -> None:
     out, parts = tmp_path / "pack.pdf", tmp_path / "parts.csv"
     result = locatk(
