@@ -146,7 +146,7 @@ def _lay_out_plan(
     left, bottom, right, top = frame.content_box
     label_width, label_height = _label_space(floor)
     width, height = right - left - label_width, top - bottom - label_height
-    if min(width, height - LEGEND_HEIGHT_MM) < MIN_CELL_MM:
+    if min(width, height - LEGEND_HEIGHT_MM) <= 0:
         return None
     cell_mm = min(width / columns, (height - LEGEND_HEIGHT_MM) / rows, MAX_CELL_MM)
     across = down = 1

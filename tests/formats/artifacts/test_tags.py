@@ -26,6 +26,7 @@ from locatk.formats.artifacts.tags import (
 # ---- round trips
 
 above = st.floats(1e-9, 1e3)
+length = st.floats(2e-4, 99)
 finite = st.floats(-1e6, 1e6)
 
 
@@ -47,7 +48,7 @@ def tag_sets(draw: st.DrawFn) -> Tags:
     }[codec]
     order, magnets, orientations = draw(design)
     magnets = min(magnets, order * order - 1)
-    spacing = draw(above)
+    spacing = draw(length)
     tags = Tags(order, magnets, orientations, spacing, codec)
     last = capacity(tags) - 1
     ids = draw(st.none() | st.lists(st.integers(0, last), min_size=1, max_size=5, unique=True))
@@ -66,11 +67,11 @@ def tag_sets(draw: st.DrawFn) -> Tags:
         codec,
         Magnet(
             spacing * draw(st.floats(0.01, 1)),
-            draw(above),
+            draw(length),
             draw(st.floats(1e-3, 2)),
             draw(st.sampled_from(["", "N52", 'odd "grade"'])),
         ),
-        draw(above),
+        draw(length),
         None if ids is None else tuple(ids),
         draw(st.integers(1, 9)),
         dict(sorted(draw(st.dictionaries(some, built, max_size=2)).items())),
@@ -183,7 +184,11 @@ def test_tags_by_hand() -> None:
         (TAG.replace("magnets = 5", "magnets = 9") + MAGNET, "magnets", "at most 8"),
         (TAG.replace("magnets = 5", "magnets = 2") + MAGNET, "magnets", "from 3 to"),
         (TAG.replace("ations = 8", "ations = 1") + MAGNET, "orientations", "from 2"),
-        (TAG.replace("spacing_mm = 40", "spacing_mm = 0") + MAGNET, "spacing_mm", "above 0"),
+        (
+            TAG.replace("spacing_mm = 40", "spacing_mm = 0") + MAGNET,
+            "spacing_mm",
+            "0.001 to 100000 in mm",
+        ),
         (TAG.replace("clearance_mm", "clearance") + MAGNET, None, "missing key 'clearance_mm'"),
         (TAG, None, "missing key 'magnet'"),
         (TAG + MAGNET.replace("= 2", "= 41"), "magnet.diameter_mm", "no more than spacing_mm"),
