@@ -6,7 +6,9 @@ All writers of locatk (sessions, artifacts, tables, pictures) use :func:`atomic_
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from importlib import metadata
@@ -78,16 +80,17 @@ def atomic_write(
     remove_stale_parts(target)
     part = target.with_name(f"{_part_prefix(target)}{secrets.token_hex(4)}{PART_SUFFIX}")
     text: dict[str, Any] = {"encoding": "utf-8", "newline": ""} if mode == "w" else {}
+    move = os.replace if overwrite else _move_to_free_name
     try:
         with _errors_of_locatk(target, part):
             with _open_part(part, mode, text) as stream:
                 yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
-            if overwrite:
-                os.replace(part, target)
-            else:
-                _move_to_free_name(part, target)
+                if os.name != "nt":  # While the lock is held: unlocked, it looks stale.
+                    move(part, target)
+            if os.name == "nt":  # An open file cannot be moved.
+                move(part, target)
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink()
@@ -98,9 +101,17 @@ PART_SUFFIX = ".part"
 """End of the name of an unfinished output."""
 
 
+MAX_PART_NAME_BYTES = 200
+"""Longer names of outputs are abbreviated in the name of a part; file systems allow 255."""
+
+
 def _part_prefix(target: Path) -> str:
-    """Return the beginning of the names of unfinished outputs for ``target``."""
-    return f".{target.name[:50]}."
+    """Return the beginning of the names of unfinished outputs for ``target`` and no other."""
+    name = target.name
+    encoded = os.fsencode(name)
+    if len(encoded) > MAX_PART_NAME_BYTES:
+        name = f"{name[:40]}-{hashlib.sha256(encoded).hexdigest()[:16]}"
+    return f".{name}."
 
 
 def _open_part(part: Path, mode: str, text: dict[str, Any]) -> IO[Any]:
@@ -121,10 +132,10 @@ def remove_stale_parts(target: Path) -> None:
 
     Those of running processes are locked; on Windows, open files cannot be removed anyway.
     """
-    prefix = _part_prefix(target)
+    pattern = re.compile(re.escape(_part_prefix(target)) + r"[0-9a-f]{8}" + re.escape(PART_SUFFIX))
     with contextlib.suppress(OSError), os.scandir(target.parent) as entries:
         for entry in entries:
-            if not (entry.name.startswith(prefix) and entry.name.endswith(PART_SUFFIX)):
+            if not (pattern.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)):
                 continue
             with contextlib.suppress(OSError), open(entry.path, "rb") as stream:
                 if _lock(stream.fileno()):

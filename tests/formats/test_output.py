@@ -185,6 +185,27 @@ def test_the_output_of_a_running_process_is_kept(tmp_path: Path) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["x.bin"]
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="open files cannot be moved on Windows")
+@pytest.mark.parametrize("overwrite", [True, False])
+def test_an_output_is_locked_until_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overwrite: bool
+) -> None:
+    """Another writer of the same output, or one with as long a name, must not remove it."""
+    path = tmp_path / ("x" * 240)
+    name = "replace" if overwrite else "link"
+    move = getattr(os, name)
+
+    def move_late(source: Path, target: Path) -> None:
+        remove_stale_parts(path)
+        move(source, target)
+
+    monkeypatch.setattr(output.os, name, move_late)
+    with atomic_write(path, overwrite=overwrite) as stream:
+        stream.write(b"whole")
+    assert path.read_bytes() == b"whole"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_an_output_that_was_taken_for_stale_is_created_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

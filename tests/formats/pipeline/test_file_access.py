@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -19,11 +20,14 @@ def test_a_local_file_is_itself(tmp_path: Path) -> None:
 
 def test_partial_files_of_one_output_are_removed(tmp_path: Path) -> None:
     name = "x" * 60 + ".mcap"
-    other = tmp_path / ".x.mcap.0123abcd.part"
-    other.touch()
-    (tmp_path / f".{'x' * 50}.89abcdef.part").touch()  # of a process that was killed
+    (tmp_path / f".{name}.89abcdef.part").touch()  # of a process that was killed
+    others = {".x.mcap.0123abcd.part", f".{name}.part", f".{name}.backup.part", f".{name}.cut.part"}
+    for other in others:
+        (tmp_path / other).touch()
+    os.mkfifo(tmp_path / f".{name}.01234567.part")  # Opening it would wait for a writer.
     file_access.remove_partial_files(str(tmp_path / name))
-    assert list(tmp_path.iterdir()) == [other]
+    others.add(f".{name}.01234567.part")
+    assert {path.name for path in tmp_path.iterdir()} == others
     file_access.remove_partial_files(str(tmp_path / "absent" / name))
     file_access.remove_partial_files(f"s3://bucket/{name}")
 
