@@ -70,7 +70,7 @@ sessions = input_argument("sessions", many=True)
 
 
 def check_ending(path: Path, endings: Sequence[str]) -> None:
-    """Refuse the name of an output that ends like a file of another format.
+    """Refuse the name of an output with another ending than those of its format.
 
     A name without ending is accepted.
 
@@ -80,7 +80,7 @@ def check_ending(path: Path, endings: Sequence[str]) -> None:
     """
     if path.suffix and path.suffix.lower() not in endings:
         raise click.UsageError(
-            f"{path.name!r} ends like a file of another format; end it in {' or '.join(endings)}."
+            f"{path.name!r} ends in {path.suffix!r}; end it in {' or '.join(endings)}."
         )
 
 

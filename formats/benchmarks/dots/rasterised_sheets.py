@@ -160,7 +160,7 @@ def rasteriser_figures() -> list[Figure]:
                 try:
                     pages = list(rasteriser.rasterise(path, sheets.manifest.dpi, own_folder))
                 except (LocatkError, OSError) as error:
-                    reasons[name] = f"{sheets.name}: {error}"
+                    percents[name][f"{sheets.name}, {error}"] = 0.0
                     continue
                 if sheets.name == TIMED_SHEET:
                     seconds[name] = time.perf_counter() - begin

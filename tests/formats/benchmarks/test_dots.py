@@ -273,7 +273,9 @@ def test_a_wrong_pixel_is_one_wrong_dot() -> None:
     assert rasterised_sheets.exact_percent(sheets.manifest, [expected], []) == 0
 
 
-def test_an_absent_rasteriser_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_absent_rasteriser_is_not_measured_and_a_failing_one_has_no_dots(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def fail(*args: Any) -> Any:
         raise LocatkError("spoilt")
 
@@ -281,7 +283,7 @@ def test_an_absent_rasteriser_is_not_measured(monkeypatch: pytest.MonkeyPatch) -
     failing = Rasteriser("failing", lambda: None, fail)
     monkeypatch.setattr(rasterised_sheets, "RASTERISERS", (absent, failing))
     figures = rasterised_sheets.rasteriser_figures()
-    assert [figure.value for figure in figures] == [None] * 4
+    assert [figure.value for figure in figures] == [None, None, 0.0, None]
     assert "absent is not installed" in figures[0].how
     assert "spoilt" in figures[2].how
 
