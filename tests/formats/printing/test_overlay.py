@@ -307,6 +307,29 @@ def test_what_stays_black_is_told(tmp_path: Path) -> None:
     assert overlay(document, stamp(), strip_black=False).left_black == {}
 
 
+@pytest.mark.parametrize("box", [None, [0, 0, 99], [0, 0, "a", 99], [0, 0, 0, 99]])
+def test_pages_without_a_size_are_refused(tmp_path: Path, box: list[Any] | None) -> None:
+    """Programs assume different sizes for them; a sheet has only one."""
+    make = Maker()
+    make.pdf.add_blank_page(page_size=(WIDTH, HEIGHT))
+    del make.pdf.pages[1].obj.MediaBox
+    if box is not None:
+        make.pdf.pages[1].obj.MediaBox = Array(box)
+    document = make.save(tmp_path / "in.pdf", b"")
+    for read in (page_sizes, lambda path: overlay(path, stamp(), strip_black=False)):
+        with pytest.raises(FormatError, match="no valid size") as info:
+            read(document)
+        assert info.value.where == "page 2"
+        assert info.value.hint
+
+
+def test_sizes_are_inherited(tmp_path: Path) -> None:
+    make = Maker()
+    del make.page.MediaBox
+    make.pdf.Root.Pages.MediaBox = Array([0, 0, 72, 144])
+    assert page_sizes(make.save(tmp_path / "in.pdf", b"")) == [pytest.approx((25.4, 50.8))]
+
+
 GREYS = st.sampled_from(["0", "0.25", "0.5", "1"])
 COLOURS = st.one_of(
     st.tuples(GREYS, st.sampled_from("gG")).map(" ".join),
