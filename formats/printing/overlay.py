@@ -172,9 +172,9 @@ def overlay(
             raise InputError(
                 f"{len(stamps.pages)} pages cannot be drawn over {len(pdf.pages)}", file=document
             )
-        dropped = _flatten(pdf)
-        remover = BlackRemover(pdf) if strip_black else None
         finder = BlackFinder(pdf)
+        dropped = _flatten(pdf, finder)
+        remover = BlackRemover(pdf) if strip_black else None
         black_pages = 0
         for number, page in enumerate(pdf.pages, 1):
             try:
@@ -258,13 +258,19 @@ def _as_form(pdf: Pdf, page: pikepdf.Object) -> Stream:
     return pdf.make_indirect(form)
 
 
-def _flatten(pdf: Pdf) -> int:
-    """Draw annotations into the pages; return the number of those that cannot be drawn."""
+def _flatten(pdf: Pdf, layers: BlackFinder) -> int:
+    """Draw annotations into the pages; return the number of those that cannot be drawn.
+
+    Those of hidden layers are left out.
+    """
     if "/AcroForm" in pdf.Root and pdf.Root.AcroForm.get("/NeedAppearances", False):
         pdf.generate_appearance_streams()
     dropped = 0
     for page in pdf.pages:
-        for annotation in page.obj.get("/Annots", ()):
+        annotations = [
+            item for item in page.obj.get("/Annots", ()) if not layers.is_hidden(item.get("/OC"))
+        ]
+        for annotation in annotations:
             flags = int(annotation.get("/F", 0))
             is_drawn = "/AP" in annotation or str(annotation.get("/Subtype")) in (
                 "/Link",
@@ -273,6 +279,7 @@ def _flatten(pdf: Pdf) -> int:
             )
             dropped += bool(flags & PRINT_FLAG) and not flags & HIDDEN_FLAG and not is_drawn
         if "/Annots" in page.obj:
+            page.obj.Annots = Array(annotations)
             # The page becomes a form, so that its graphics state does not displace annotations.
             below = _as_form(pdf, page.obj)
             if "/Group" in below:

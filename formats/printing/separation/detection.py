@@ -240,6 +240,9 @@ class _Walk:
 
     def _paints_black(self, operator: str, operands: Any) -> bool:
         """Follow the graphics state; return True if the operator paints in black."""
+        if operator in PATH_OPERATORS:
+            self._extend_path(operator, operands)
+            return False
         state, is_line = self._state, operator.isupper()
         if operator == "q":
             self._stack.append(copy.copy(state))
@@ -271,8 +274,6 @@ class _Walk:
             state.text_mode = int(operands[0])
         elif operator in TEXT_POSITIONS:
             self._move_text(operator, operands)
-        elif operator in PATH_OPERATORS:
-            self._extend_path(operator, operands)
         is_black = not any(self._sequences) and self._paints(operator, operands)
         if operator in PATH_ENDS:
             self._path.clear()
@@ -337,7 +338,7 @@ class _Walk:
     # ---- position
 
     def _extend_path(self, operator: str, operands: Any) -> None:
-        if self._area is None:
+        if self._area is None or not any(self._state.black):
             return
         values = [float(value) for value in operands]
         if operator == "re":

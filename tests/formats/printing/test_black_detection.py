@@ -8,6 +8,7 @@ import zlib
 from pathlib import Path
 
 import pikepdf
+import pypdfium2
 import pytest
 from pikepdf import Array, Dictionary, Name, Pdf
 
@@ -264,6 +265,23 @@ def test_layers_for_the_screen_are_printed(tmp_path: Path) -> None:
     )
     (tmp_path / "changed.pdf").write_bytes(bytes_of(pdf))
     assert overlay(tmp_path / "changed.pdf", stamp(2), strip_black=False).black_pages == 2
+
+
+def test_comments_on_hidden_layers_are_left_out(tmp_path: Path) -> None:
+    """Their layer is lost when they become part of the page."""
+    pdf = Pdf.open(document(tmp_path / "in.pdf", ["", ""]))
+    for page, layer in zip(pdf.pages, pdf.Root.OCProperties.OCGs, strict=True):
+        drawn = pdf.make_stream(b"0 g 0 0 50 50 re f")
+        drawn.Type, drawn.Subtype, drawn.BBox = Name.XObject, Name.Form, Array([0, 0, 50, 50])
+        comment = Dictionary(Type=Name.Annot, Subtype=Name.Stamp, Rect=[0, 0, 50, 50], F=4,
+                             AP=Dictionary(N=pdf.make_indirect(drawn)), OC=layer)  # fmt: skip
+        page.obj.Annots = Array([comment])
+    (tmp_path / "comments.pdf").write_bytes(bytes_of(pdf))
+    result = overlay(tmp_path / "comments.pdf", stamp(2), strip_black=False)
+    assert (result.black_pages, result.dropped) == (1, 0)
+    on, off = pypdfium2.PdfDocument(result.data)
+    assert on.render(grayscale=True).to_numpy().min() < 100
+    assert off.render(grayscale=True).to_numpy().min() == 255
 
 
 def test_only_the_visible_part_of_a_page_counts(tmp_path: Path) -> None:
