@@ -236,7 +236,14 @@ class _Walk:
             # Content that ends early is drawn up to there.
             warnings.simplefilter("ignore", UserWarning)
             instructions: Any = pikepdf.parse_content_stream(stream)
-        return any(self._paints_black(str(item.operator), item.operands) for item in instructions)
+        return any(self._follow(str(item.operator), item.operands) for item in instructions)
+
+    def _follow(self, operator: str, operands: Any) -> bool:
+        """Return True if the operator paints in black; viewers ignore those that are damaged."""
+        try:
+            return self._paints_black(operator, operands)
+        except DAMAGE_ERRORS:
+            return False
 
     def _paints_black(self, operator: str, operands: Any) -> bool:
         """Follow the graphics state; return True if the operator paints in black."""

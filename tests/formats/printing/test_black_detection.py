@@ -315,9 +315,15 @@ def test_pages_are_counted(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("error")
 def test_damaged_content_is_no_error(tmp_path: Path) -> None:
     """Viewers draw what comes before the damage, and so does the search."""
-    contents = ["0 0 9 9 re f (((", "1 0 0 rg 0 0 9 9 re f (((", "cs scn /None Do /F Tf BT"]
+    contents = [
+        "0 0 9 9 re f (((",
+        "1 0 0 rg 0 0 9 9 re f (((",
+        "cs scn /None Do /F Tf BT",
+        "() w 1 cm re /Half gs 0 0 9 9 re f",
+        "(a) rg /Gold cs (b) sc /None gs BDC 1 0 0 rg 0 0 9 9 re f",
+    ]
     source = document(tmp_path / "in.pdf", contents)
-    assert overlay(source, stamp(3), strip_black=False).black_pages == 1
+    assert overlay(source, stamp(5), strip_black=False).black_pages == 2
 
 
 def test_nested_and_recursive_forms_end(tmp_path: Path) -> None:
