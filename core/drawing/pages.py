@@ -153,7 +153,10 @@ def check_margin(paper_mm: Point, margin_mm: float, min_content_mm: float = MIN_
         The margin is negative or too large.
     """
     if not 0 <= margin_mm < (min(paper_mm) - min_content_mm) / 2:
-        raise InputError(f"a margin of {margin_mm:g} mm on {size_text(paper_mm)}")
+        raise InputError(
+            f"a margin of {margin_mm:g} mm leaves too little of a paper of {size_text(paper_mm)}",
+            hint="Use a smaller margin or a larger paper",
+        )
 
 
 def size_text(size_mm: Point, decimals: int | None = None) -> str:

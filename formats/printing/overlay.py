@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pikepdf
-from pikepdf import Array, Dictionary, Name, Pdf, Stream
+from pikepdf import Array, Dictionary, Name, Pdf, Rectangle, Stream
 
 from locatk.core.drawing import MM_PER_POINT
 from locatk.core.errors import FormatError, InputError
@@ -93,6 +93,11 @@ class _PageFrame:
             width, height = height, width
         return width * self.unit * MM_PER_POINT, height * self.unit * MM_PER_POINT
 
+    @property
+    def area(self) -> Rectangle:
+        """Visible part in the units of the page's content."""
+        return Rectangle(self.left, self.bottom, self.right, self.top)
+
     def onto(self, stamp: _PageFrame) -> str:
         """Return the matrix (for ``cm``) that moves the upright visible part over ``stamp``."""
         x, y = {
@@ -167,9 +172,9 @@ def overlay(
             raise InputError(
                 f"{len(stamps.pages)} pages cannot be drawn over {len(pdf.pages)}", file=document
             )
-        dropped = _flatten(pdf)
+        finder = BlackFinder(pdf)
+        dropped = _flatten(pdf, finder)
         remover = BlackRemover(pdf) if strip_black else None
-        finder = BlackFinder()
         black_pages = 0
         for number, page in enumerate(pdf.pages, 1):
             try:
@@ -216,7 +221,7 @@ def _draw_over(
     below = _as_form(pdf, page.obj)
     is_black = False
     if isinstance(black, BlackFinder):
-        is_black = black.is_black(below)
+        is_black = black.is_black(below, frame.area)
     else:
         below = black.form(below, starts=True)
     above = pdf.copy_foreign(_as_form(stamps, stamp.obj))
@@ -253,13 +258,19 @@ def _as_form(pdf: Pdf, page: pikepdf.Object) -> Stream:
     return pdf.make_indirect(form)
 
 
-def _flatten(pdf: Pdf) -> int:
-    """Draw annotations into the pages; return the number of those that cannot be drawn."""
+def _flatten(pdf: Pdf, layers: BlackFinder) -> int:
+    """Draw annotations into the pages; return the number of those that cannot be drawn.
+
+    Those of hidden layers are left out.
+    """
     if "/AcroForm" in pdf.Root and pdf.Root.AcroForm.get("/NeedAppearances", False):
         pdf.generate_appearance_streams()
     dropped = 0
     for page in pdf.pages:
-        for annotation in page.obj.get("/Annots", ()):
+        annotations = [
+            item for item in page.obj.get("/Annots", ()) if not layers.is_hidden(item.get("/OC"))
+        ]
+        for annotation in annotations:
             flags = int(annotation.get("/F", 0))
             is_drawn = "/AP" in annotation or str(annotation.get("/Subtype")) in (
                 "/Link",
@@ -268,6 +279,7 @@ def _flatten(pdf: Pdf) -> int:
             )
             dropped += bool(flags & PRINT_FLAG) and not flags & HIDDEN_FLAG and not is_drawn
         if "/Annots" in page.obj:
+            page.obj.Annots = Array(annotations)
             # The page becomes a form, so that its graphics state does not displace annotations.
             below = _as_form(pdf, page.obj)
             if "/Group" in below:
@@ -297,6 +309,7 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
         raise FormatError("not a PDF", file=path, hint="Save the document as PDF")
     _limit_streams()
     try:
+        _check_boxes(path)
         # A repair may lose pages without a message.
         with Pdf.open(os.fspath(path), attempt_recovery=False) as pdf:
             if pdf.is_encrypted:
@@ -314,6 +327,46 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[Pdf]:
             file=path,
             hint="Print it into a new PDF from a viewer, check that it is complete, and use that",
         ) from error
+
+
+def _check_boxes(path: str | os.PathLike[str]) -> None:
+    """Check that each page has a size.
+
+    If attributes are inherited or pages are counted, an invalid media box has already been replaced
+    by that of US Letter.
+    """
+    with Pdf.open(os.fspath(path), attempt_recovery=False, inherit_page_attributes=False) as pdf:
+        for number, box in enumerate(_media_boxes(pdf), 1):
+            try:
+                left, bottom, right, top = _box(box)
+                is_valid = right > left and top > bottom
+            except DAMAGE_ERRORS:
+                is_valid = False
+            if not is_valid:
+                raise FormatError(
+                    "the page has no valid size (MediaBox)",
+                    file=path,
+                    where=f"page {number}",
+                    hint="Print the document into a new PDF from a viewer, and use that",
+                )
+
+
+def _media_boxes(pdf: Pdf) -> Iterator[Any]:
+    """Yield the media boxes of the pages, as written."""
+    nodes: list[tuple[Any, Any]] = [(pdf.Root.Pages, None)]
+    folders = set()
+    while nodes:
+        node, inherited = nodes.pop()
+        if not isinstance(node, Dictionary):
+            continue  # ignored by viewers
+        box = node.get("/MediaBox", inherited)
+        if "/Kids" not in node:
+            yield box
+        elif node.objgen in folders:
+            raise ValueError("a loop in the tree of pages")
+        else:
+            folders.add(node.objgen)
+            nodes += [(kid, box) for kid in reversed(list(node.Kids))]
 
 
 def _limit_streams() -> None:

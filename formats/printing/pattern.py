@@ -119,19 +119,10 @@ def _draw_ink(
     corner_px: tuple[int, int],
     bands: Iterable[NDArray[np.uint8]],
 ) -> None:
-    """Draw black pixels of the printer on the current page, as an image mask for each band.
+    """Draw black pixels of the printer, as an image mask for each band of them.
 
-    Parameters
-    ----------
-    canvas : reportlab Canvas
-    name : str
-        Unique name of the drawing in this document.
-    dpi : int
-        Resolution of the printer.
-    page_px, corner_px : (x, y)
-        Size of the page, and the upper left pixel from that of the page.
-    bands : iterable of (height, width) uint8 ndarray
-        Pixels from the top down, 1 for ink.
+    ``corner_px`` is the upper left pixel on a page of ``page_px`` (x, y). The ``bands`` of (height,
+    width) follow each other from the top down, with 1 for ink; the rest is as in :func:`draw_dots`.
     """
     document, masks = canvas._doc, {}
     lines = ["/Overprint gs /Ink cs 1 scn"]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 
 from locatk.core.drawing import (
     Circle,
@@ -17,6 +18,8 @@ from locatk.core.drawing import (
     line_height,
     paragraph,
     rectangle,
+    text_width,
+    wrap,
 )
 from locatk.core.drawing.pages import TEXT_POINTS
 from locatk.core.landmarks.drawing.landmark import draw_symbol, north_mark
@@ -24,8 +27,17 @@ from locatk.core.landmarks.landmark import PATTERNS, code_of, name
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.map.windows import WINDOW_PATHS
 
-LEGEND_HEIGHT_MM = 44.0
-"""Height of the strip with the legend."""
+DRAWING_HEIGHT_MM = 28.0
+"""Height of the drawings of the legend, which are above its texts."""
+
+MIN_COLUMN_MM = 24.0
+"""Width of the drawings."""
+
+COLUMN_GAP_MM = 3.0
+"""Distance between the three columns of the legend."""
+
+EDGE_MM = 4.0
+"""Space above the columns, with a line that separates them from the plan."""
 
 LEGEND_POINTS = 6.0
 """Font size of the explanations."""
@@ -33,41 +45,69 @@ LEGEND_POINTS = 6.0
 MAX_SCALE_BAR_MM = 42.0
 """Largest length of the scale bar."""
 
+LANDMARK_NOTE = (
+    "Bars are numbered and read counter-clockwise, from bar 0 at +x. "
+    "N: magnetised counter-clockwise, too."
+)
+WINDOW_NOTE = (
+    "A robot that reads these cells in order, from any side, knows its position "
+    "(locatk map check proves it)."
+)
+PATTERNS_NOTE = "Patterns: " + ", ".join(
+    f"{n}\u00a0{letters}" for n, letters in enumerate(PATTERNS, 1)
+)
+"""Texts of the columns; a number stays on the line of its pattern."""
+
 SAMPLE_CODE = code_of("NNNS")
 """Code of the landmark that the legend explains."""
 
 
+def legend_height(width: float) -> float:
+    """Return the height in mm of a legend of a width; infinite if the page is too narrow."""
+    column = _column_width(width)
+    if column < MIN_COLUMN_MM:
+        return math.inf
+    notes = (LANDMARK_NOTE, WINDOW_NOTE, PATTERNS_NOTE)
+    lines = max(len(wrap(note, LEGEND_POINTS, column)) for note in notes)
+    texts = line_height(TEXT_POINTS) + (lines + 0.5) * line_height(LEGEND_POINTS)
+    return EDGE_MM + DRAWING_HEIGHT_MM + texts
+
+
 def draw_legend(floor: FloorMap, scale: float, corner: Point, width: float) -> list[Mark]:
-    """Draw the legend in a strip of this width and :data:`LEGEND_HEIGHT_MM`.
+    """Draw the legend in a strip of this width and its :func:`legend_height`.
 
     ``corner`` is the lower left corner of the strip.
     """
     left, bottom = corner
-    top = bottom + LEGEND_HEIGHT_MM - 4.0
-    return [
-        Line((left, top + 1.5), (left + width, top + 1.5), 0.2),
-        *_explain_landmark((left, top)),
-        *_explain_window(floor.window, (left + 0.36 * width, top)),
-        *_explain_scale(scale, (left + 0.66 * width, top)),
-    ]
+    column = _column_width(width)
+    top = bottom + legend_height(width) - EDGE_MM
+    drawings_top = top - line_height(TEXT_POINTS)
+    marks: list[Mark] = [Line((left, top + 1.5), (left + width, top + 1.5), 0.2)]
+    columns: tuple[tuple[str, Callable[[Point], list[Mark]], str], ...] = (
+        (f"A landmark: {name(SAMPLE_CODE)}", _draw_landmark, LANDMARK_NOTE),
+        (f"Window {floor.window}", partial(_draw_window, floor.window), WINDOW_NOTE),
+        (f"Scale 1 : {scale:g}", partial(_draw_scale, scale, column), PATTERNS_NOTE),
+    )
+    for number, (title, draw, note) in enumerate(columns):
+        x = left + number * (column + COLUMN_GAP_MM)
+        lines = [line.replace("\u00a0", " ") for line in wrap(note, LEGEND_POINTS, column)]
+        marks += [
+            *paragraph([title], (x, top), TEXT_POINTS, bold=True),
+            *draw((x, drawings_top)),
+            *paragraph(lines, (x, drawings_top - DRAWING_HEIGHT_MM), LEGEND_POINTS),
+        ]
+    return marks
 
 
-def _heading(text: str, corner: Point) -> list[Text]:
-    return paragraph([text], corner, TEXT_POINTS, bold=True)
+def _column_width(width: float) -> float:
+    return (width - 2 * COLUMN_GAP_MM) / 3
 
 
-def _notes(lines: Sequence[str], corner: Point) -> list[Text]:
-    return paragraph(lines, corner, LEGEND_POINTS)
-
-
-def _explain_landmark(corner: Point) -> list[Mark]:
+def _draw_landmark(corner: Point) -> list[Mark]:
     """Draw a landmark with the numbers of its bars and their order."""
-    side = 26.0
-    x, y = corner[0] + 18.0, corner[1] - line_height(TEXT_POINTS) - 18.5
-    marks: list[Mark] = [
-        *_heading(f"A landmark: {name(SAMPLE_CODE)}", corner),
-        *draw_symbol(SAMPLE_CODE, (x, y), side),
-    ]
+    side = 20.0
+    x, y = corner[0] + MIN_COLUMN_MM / 2, corner[1] - DRAWING_HEIGHT_MM / 2
+    marks: list[Mark] = [*draw_symbol(SAMPLE_CODE, (x, y), side)]
     distance, capital = 0.43 * side, capital_height(LEGEND_POINTS)
     for bar, letter in enumerate(name(SAMPLE_CODE)):
         u, v = (round(f(math.radians(90 * bar))) for f in (math.cos, math.sin))
@@ -79,25 +119,18 @@ def _explain_landmark(corner: Point) -> list[Mark]:
     points = [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
     marks += [Line(a, b, 0.25) for a, b in itertools.pairwise(points[:-1])]
     marks += arrow(points[-2], points[-1], 2.0, 0.25)
-    lines = (
-        "Bars are numbered and read",
-        "counter-clockwise, from bar 0",
-        "at +x. N: magnetised",
-        "counter-clockwise, too.",
-    )
-    below_heading = corner[1] - line_height(LEGEND_POINTS) - 2
-    return [*marks, *_notes(lines, (corner[0] + 34.0, below_heading))]
+    return marks
 
 
-def _explain_window(window: str, corner: Point) -> list[Mark]:
+def _draw_window(window: str, corner: Point) -> list[Mark]:
     """Draw the cells of a window as a robot visits them that drives along +x."""
     cells = [(row, column) for column, row in WINDOW_PATHS[window]]
     rows = 1 + max(row for row, _ in cells)
-    side = min(9.0, 27.0 / rows)
+    side = min(9.0, MIN_COLUMN_MM / rows)
     half = side / 2
-    left, bottom = corner[0], corner[1] - line_height(TEXT_POINTS) - 3.0 - rows * side
+    left, bottom = corner[0], corner[1] - (DRAWING_HEIGHT_MM + rows * side) / 2
     centres = [(left + (c + 0.5) * side, bottom + (r + 0.5) * side) for r, c in cells]
-    marks: list[Mark] = [*_heading(f"Window {window}", corner)]
+    marks: list[Mark] = []
     for number, (x, y) in enumerate(centres, 1):
         marks.append(rectangle((x - half, y - half, x + half, y + half)))
         position = (x - half + 0.8, y + half - 0.8 - capital_height(TEXT_POINTS))
@@ -105,38 +138,35 @@ def _explain_window(window: str, corner: Point) -> list[Mark]:
     for start, end in itertools.pairwise(centres):
         marks += arrow(start, end, 1.8, 0.3)
     marks.append(Circle(centres[0], 0.7, 0.3))
-    lines = (
-        "A robot that reads these cells",
-        "in order, from any side, knows its",
-        "position (locatk map check proves it).",
-    )
-    return [*marks, *_notes(lines, (corner[0], bottom - 0.8))]
+    return marks
 
 
-def _explain_scale(scale: float, corner: Point) -> list[Mark]:
-    """Draw the north mark, a scale bar and the numbers of the patterns."""
+def _draw_scale(scale: float, width: float, corner: Point) -> list[Mark]:
+    """Draw the north mark and a scale bar."""
     x, y = corner
-    marks: list[Mark] = [
-        *_heading(f"Scale 1 : {scale:g}", corner),
-        *north_mark((x + 2.0, y - line_height(TEXT_POINTS) - 14.0), 11.0),
-    ]
-    length_m = _scale_bar_length(scale)
-    length, bar_y = 1e3 * length_m / scale, y - line_height(TEXT_POINTS) - 20.0
-    marks += [
+    marks: list[Mark] = [*north_mark((x + 2.0, y - 14.0), 11.0)]
+    length_m = _scale_bar_length(scale, width)
+    length, bar_y = 1e3 * length_m / scale, y - 20.0
+    return [
+        *marks,
         Line((x, bar_y), (x + length, bar_y), 0.3),
         Line((x, bar_y - 1), (x, bar_y + 1), 0.3),
         Line((x + length, bar_y - 1), (x + length, bar_y + 1), 0.3),
-        Text(f"{length_m:g} m", (x + length + 1.2, bar_y - 0.8), TEXT_POINTS),
+        Text(_bar_text(length_m), (x + length + 1.2, bar_y - 0.8), TEXT_POINTS),
     ]
-    patterns = ", ".join(f"{n} {letters}" for n, letters in enumerate(PATTERNS, 1))
-    lines = ("Patterns:", patterns[:23], patterns[24:])
-    return [*marks, *_notes(lines, (x, bar_y - 4.5 + line_height(LEGEND_POINTS)))]
 
 
-def _scale_bar_length(scale: float) -> float:
-    """Return the longest of 1, 2 or 5 times a power of ten in metres that fits on the page."""
-    power_m = 10.0 ** math.floor(math.log10(40.0 * scale / 1e3) + 1e-9)
-    for factor in (5, 2):
-        if 1e3 * power_m * factor / scale <= MAX_SCALE_BAR_MM:
-            return power_m * factor
-    return power_m
+def _bar_text(length_m: float) -> str:
+    return f"{length_m:g} m"
+
+
+def _scale_bar_length(scale: float, width: float) -> float:
+    """Return the longest of 1, 2 or 5 times a power of ten in metres that fits with its text."""
+    for power in itertools.count(math.ceil(math.log10(MAX_SCALE_BAR_MM * scale / 1e3)), -1):
+        for factor in (5, 2, 1):
+            length_m = factor * 10.0**power
+            length = 1e3 * length_m / scale
+            text = text_width(_bar_text(length_m), TEXT_POINTS)
+            if length <= MAX_SCALE_BAR_MM and length + 1.2 + text <= width:
+                return length_m
+    raise AssertionError("a bar of any length fits")

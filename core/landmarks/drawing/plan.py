@@ -24,7 +24,7 @@ from locatk.core.drawing.pages import SMALL_TEXT_POINTS, TEXT_POINTS, PageFrame,
 from locatk.core.drawing.tiles import tile_name
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.landmark import draw_hole, draw_symbol, north_mark
-from locatk.core.landmarks.drawing.legend import LEGEND_HEIGHT_MM, draw_legend
+from locatk.core.landmarks.drawing.legend import draw_legend, legend_height
 from locatk.core.landmarks.map.floor import HOLE_CODE, Cell, FloorMap
 from locatk.core.units import mm_text
 
@@ -106,7 +106,7 @@ def draw_plan(
     cell_mm = 1e3 * floor.pitch_m / layout.scale
     left, bottom, right, top = frame.content_box
     legend = Group("legend", tuple(draw_legend(floor, layout.scale, (left, bottom), right - left)))
-    above_legend = (left, bottom + LEGEND_HEIGHT_MM, right, top)
+    above_legend = (left, bottom + legend_height(right - left), right, top)
     if len(layout.blocks) == 1:
         plan = _BlockDrawing.in_box(floor, cell_mm, layout.blocks[0], above_legend)
         return [UnnumberedPage(frame, (legend, Group("plan", tuple(plan.marks()))))]
@@ -146,9 +146,10 @@ def _lay_out_plan(
     left, bottom, right, top = frame.content_box
     label_width, label_height = _label_space(floor)
     width, height = right - left - label_width, top - bottom - label_height
-    if min(width, height - LEGEND_HEIGHT_MM) <= 0:
+    height_above_legend = height - legend_height(right - left)
+    if min(width, height_above_legend) <= 0:
         return None
-    cell_mm = min(width / columns, (height - LEGEND_HEIGHT_MM) / rows, MAX_CELL_MM)
+    cell_mm = min(width / columns, height_above_legend / rows, MAX_CELL_MM)
     across = down = 1
     if cell_mm < MIN_CELL_MM:
         # The legend is on the page of the overview, so the blocks have the whole height.

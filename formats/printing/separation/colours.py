@@ -47,7 +47,7 @@ class ColourSpace:
 
     Attributes
     ----------
-    kind : {"grey", "rgb", "cmyk", "indexed", "tint", "inks"}
+    kind : {"grey", "rgb", "cmyk", "lab", "indexed", "tint", "inks"}
     components : int
     initial : tuple of float
         Colour that is set together with the space.
@@ -58,6 +58,10 @@ class ColourSpace:
         Maps (n, components) numbers to the (n,) amount of black ink of a printer, from 0 to 1.
     high : int
         Largest index of an indexed space.
+    ranges : tuple of (float, float)
+        Smallest and largest value of each component if they are not 0 and 1.
+    is_convertible : bool
+        False if ``cmy`` does not give the appearance, so that the colours have to remain.
     """
 
     kind: str
@@ -66,6 +70,8 @@ class ColourSpace:
     cmy: Callable[[Floats], Floats]
     black: Callable[[Floats], Floats]
     high: int = 0
+    ranges: tuple[tuple[float, float], ...] = ()
+    is_convertible: bool = True
 
 
 def from_grey(values: Floats) -> Floats:
@@ -109,16 +115,41 @@ def black_of_cmyk(values: Floats) -> Floats:
     return np.clip(values[:, 3], 0, 1)
 
 
+def rgb_of_lab(values: Floats) -> Floats:
+    """Convert CIE L*a*b* (n, 3) to sRGB (n, 3), the white point of both being the paper.
+
+    See ISO 32000-1, 8.6.5.4, and IEC 61966-2-1.
+    """
+    middle = (values[:, 0] + 16) / 116
+    roots = np.stack([middle + values[:, 1] / 500, middle, middle - values[:, 2] / 200], axis=1)
+    xyz = np.where(roots >= 6 / 29, roots**3, 108 / 841 * (roots - 4 / 29))
+    linear = np.clip(xyz @ SRGB_OF_XYZ.T, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+SRGB_OF_XYZ = np.array(
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+) * (0.9505, 1.0, 1.0890)
+"""Linear sRGB of X, Y and Z relative to the white point (IEC 61966-2-1, D65)."""
+
 GREY = ColourSpace("grey", 1, (0.0,), from_grey, black_of_grey)
 RGB = ColourSpace("rgb", 3, (0.0, 0.0, 0.0), from_rgb, black_of_rgb)
 CMYK = ColourSpace("cmyk", 4, (0.0, 0.0, 0.0, 1.0), from_cmyk, black_of_cmyk)
 BY_COMPONENTS = {1: GREY, 3: RGB, 4: CMYK}
 
 
+def read_convertible_space(
+    definition: pikepdf.Object | None, named: pikepdf.Object | None = None
+) -> ColourSpace | None:
+    """Read a colour space; return None if it cannot be converted to inks without black."""
+    space = read_colour_space(definition, named)
+    return space if space is not None and space.is_convertible else None
+
+
 def read_colour_space(
     definition: pikepdf.Object | None, named: pikepdf.Object | None = None
 ) -> ColourSpace | None:
-    """Read a colour space; return None if it cannot be converted to inks without black.
+    """Read a colour space; return None if its black ink is unknown.
 
     Parameters
     ----------
@@ -137,6 +168,8 @@ def read_colour_space(
     family = str(definition[0])
     if family in COMPONENTS_BY_NAME:
         return BY_COMPONENTS[COMPONENTS_BY_NAME[family]]
+    if family == "/Lab":
+        return _lab(definition)
     if family == "/ICCBased":
         return _profile(definition)
     if family in ("/Indexed", "/I"):
@@ -152,8 +185,23 @@ def _profile(definition: pikepdf.Array) -> ColourSpace | None:
     stream = definition[1]
     alternate = stream.get("/Alternate")
     if isinstance(alternate, pikepdf.Array) and str(alternate[0]) == "/Lab":
-        return None
+        return _lab(alternate)
     return BY_COMPONENTS.get(int(stream.get("/N", 0)))
+
+
+def _lab(definition: pikepdf.Array) -> ColourSpace:
+    given = definition[1].get("/Range")
+    ends = np.array([-100.0, 100.0] * 2) if given is None else numbers(given)
+    (low_a, high_a), (low_b, high_b) = ends[:4].reshape(2, 2).tolist()
+    return ColourSpace(
+        "lab",
+        3,
+        (0.0, min(max(0.0, low_a), high_a), min(max(0.0, low_b), high_b)),
+        lambda v: from_rgb(rgb_of_lab(v)),
+        lambda v: black_of_rgb(rgb_of_lab(v)),
+        ranges=((0.0, 100.0), (low_a, high_a), (low_b, high_b)),
+        is_convertible=False,
+    )
 
 
 def _indexed(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
@@ -165,18 +213,28 @@ def _indexed(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourS
     data = table.read_bytes() if isinstance(table, pikepdf.Stream) else bytes(table)
     wanted = (high + 1) * base.components
     entries = np.frombuffer(data[:wanted].ljust(wanted, b"\0"), np.uint8) / 255.0
-    colours = entries.reshape(high + 1, base.components)
+    low, top = np.array(base.ranges or ((0.0, 1.0),) * base.components).T
+    colours = low + entries.reshape(high + 1, base.components) * (top - low)
 
     def look_up(values: Floats, palette: Floats) -> Floats:
         return palette[np.clip(values[:, 0].astype(int), 0, high)]
 
     cmy, black = (partial(look_up, palette=of(colours)) for of in (base.cmy, base.black))
-    return ColourSpace("indexed", 1, (0.0,), cmy, black, high)
+    return ColourSpace("indexed", 1, (0.0,), cmy, black, high, is_convertible=base.is_convertible)
 
 
 def _tint(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpace | None:
     """Read a single ink: black itself, or a spot colour by its alternate space."""
     name = str(definition[1])
+    if name == "/None":  # paints nothing, whereas no ink would paint white
+        return ColourSpace(
+            "tint",
+            1,
+            (1.0,),
+            lambda v: np.zeros((len(v), 3)),
+            lambda v: np.zeros(len(v)),
+            is_convertible=False,
+        )
     if name in ("/Black", "/All"):  # /All is printed with all inks, including black
         return ColourSpace(
             "tint",
@@ -200,14 +258,13 @@ def _tint(definition: pikepdf.Array, named: pikepdf.Object | None) -> ColourSpac
         (1.0,),
         lambda v: alternate.cmy(transform(np.clip(v[:, 0], 0, 1))),
         lambda v: alternate.black(transform(np.clip(v[:, 0], 0, 1))),
+        is_convertible=alternate.is_convertible,
     )
 
 
 def _inks(definition: pikepdf.Array) -> ColourSpace | None:
-    """Read several inks if all of them are process inks."""
+    """Read several inks; only process inks are convertible."""
     names = [str(name) for name in definition[1]]
-    if not set(names) <= {*INKS, "/None"}:
-        return None
     to_cmyk = np.array([[float(ink == name) for ink in INKS] for name in names])
     return ColourSpace(
         "inks",
@@ -215,6 +272,7 @@ def _inks(definition: pikepdf.Array) -> ColourSpace | None:
         (1.0,) * len(names),
         lambda v: from_cmyk(v @ to_cmyk),
         lambda v: black_of_cmyk(v @ to_cmyk),
+        is_convertible=set(names) <= {*INKS, "/None"},
     )
 
 

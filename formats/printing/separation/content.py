@@ -360,7 +360,7 @@ class BlackRemover:
 
     def _space(self, original: pikepdf.Object, spaces: pikepdf.Object | None) -> ColourSpace | None:
         try:
-            return colours.read_colour_space(original, spaces)
+            return colours.read_convertible_space(original, spaces)
         except DAMAGE_ERRORS:
             return None
 

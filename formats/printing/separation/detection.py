@@ -2,18 +2,21 @@
 
 Cameras for dots work in the infrared, in which black ink is as dark as the dots (see
 :mod:`~locatk.formats.printing.separation.content`). :class:`BlackFinder` finds painted colours that
-a printer prints with black ink; it does not find out if something else covers them.
+a printer prints with black ink. Hidden layers, almost transparent paint, and drawings outside of
+the page do not count. Drawings that something else clips or covers do.
 """
 
 from __future__ import annotations
 
+import copy
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pikepdf
-from pikepdf import Array, Dictionary, Name, Pdf, PdfImage, Stream
+from pikepdf import Array, Dictionary, Matrix, Name, Pdf, PdfImage, Rectangle, Stream
 
 from locatk.formats.printing.separation import colours
 from locatk.formats.printing.separation.colours import ColourSpace, numbers
@@ -22,15 +25,28 @@ from locatk.formats.printing.separation.content import (
     DAMAGE_ERRORS,
     DEVICE_OPERATORS,
 )
-from locatk.formats.printing.separation.images import BLOCK_PIXELS, inline_stream
+from locatk.formats.printing.separation.images import BLOCK_PIXELS, inline_stream, read_values
 
 MIN_BLACK = 1 / 36
 """Amount of black ink that covers as much paper as dots of 1/6 pitch do: (1/6)^2.
 
-As a halftone, it gives as many dark spots as the pattern has."""
+As a halftone, it gives as many dark spots as the pattern has. Paint of this opacity or less has no
+more ink than that in any colour, and counts as not black."""
+
+MITER_FACTOR = 5.0
+"""Largest distance of an outline from its path, in line widths: half of the miter limit of 10."""
+
+TEXT_HEIGHT_EM = 2.0
+"""Largest distance of a glyph from the line on which it is, in font sizes."""
+
+ENDLESS = 1e9
+"""Length of a line of text, whose ends are not known without the font."""
 
 FILLING = {"f", "F", "f*", "B", "B*", "b", "b*"}
 STROKING = {"S", "s", "B", "B*", "b", "b*"}
+PATH_OPERATORS = {"m", "l", "c", "v", "y", "re"}
+PATH_ENDS = {*FILLING, *STROKING, "n"}
+TEXT_POSITIONS = {"BT", "Tm", "Td", "TD", "T*", "'", '"'}
 SHOWING = {"Tj", "TJ", "'", '"'}
 
 FILLED_TEXT, STROKED_TEXT = {0, 2, 4, 6}, {1, 2, 5, 6}
@@ -43,19 +59,64 @@ SHADING_STEPS = 64
 """Colours of a shading that are examined."""
 
 
+@dataclass
+class _State:
+    """Graphics state; pairs are of fill and stroke.
+
+    Attributes
+    ----------
+    black : (bool, bool)
+        True if the colour is black.
+    visible : (bool, bool)
+        False if almost transparent.
+    spaces : (ColourSpace or None, ColourSpace or None)
+    font : Dictionary or None
+    text_mode : int
+    text_height : float
+        Font size.
+    line_width : float
+    matrix : Matrix
+        From the units of drawings to those of the page.
+    """
+
+    black: tuple[bool, bool] = (True, True)
+    visible: tuple[bool, bool] = (True, True)
+    spaces: tuple[ColourSpace | None, ColourSpace | None] = (colours.GREY, colours.GREY)
+    font: Any = None
+    text_mode: int = 0
+    text_height: float = 0.0
+    line_width: float = 1.0
+    matrix: Matrix = field(default_factory=Matrix)
+
+    def inherited(self) -> _State:
+        """Return the state in which a form or a glyph begins."""
+        return _State(self.black, self.visible)
+
+    def paints(self, *, fill: bool = False, stroke: bool = False) -> bool:
+        """Return True if filling, or stroking, gives black."""
+        is_black = [
+            black and visible for black, visible in zip(self.black, self.visible, strict=True)
+        ]
+        return (fill and is_black[0]) or (stroke and is_black[1])
+
+
 class BlackFinder:
     """Finds out if content of one document is printed with black ink.
 
-    Damaged objects, spot colours of an unknown composition and Lab colours count as not black.
-    Images and shadings that cannot be decoded count as black.
+    Damaged objects and spot colours of an unknown composition count as not black. Images and
+    shadings that cannot be decoded count as black.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pdf: Pdf) -> None:
         self._found: dict[tuple[Any, ...], bool] = {}
+        try:
+            self._hidden_layers = frozenset(_hidden_layers(pdf))
+        except DAMAGE_ERRORS:
+            self._hidden_layers = frozenset()
 
-    def is_black(self, form: Stream) -> bool:
-        """Return True if a page, given as a form, is printed with black ink."""
-        return self._content(form, form.get("/Resources", Dictionary()), (True, True))
+    def is_black(self, form: Stream, area: Rectangle) -> bool:
+        """Return True if a page, given as a form, is printed with black ink within an area."""
+        return self._content(form, form.get("/Resources", Dictionary()), _State(), area)
 
     def _once(self, key: tuple[Any, ...], item: Any, find: Callable[[], bool]) -> bool:
         """Return the result of ``find`` for an object, which is called only once."""
@@ -71,21 +132,57 @@ class BlackFinder:
             self._found[*key, item.objgen] = is_black
         return is_black
 
-    def _content(self, stream: Stream, resources: Any, initial: tuple[bool, bool]) -> bool:
+    def _content(
+        self, stream: Stream, resources: Any, initial: _State, area: Rectangle | None = None
+    ) -> bool:
         """Return True if a content stream is black.
 
-        ``initial`` tells if fill and stroke are black when it begins.
+        ``area`` is the page in the units of the stream; without it, everything is on the page.
         """
-        find = lambda: _Walk(self, resources, initial).is_black(stream)  # noqa: E731
-        return self._once(("content", *initial), stream, find)
+        find = lambda: _Walk(self, resources, initial, area).is_black(stream)  # noqa: E731
+        key = ("content", *initial.black, *initial.visible, area and area.to_bbox())
+        return self._once(key, stream, find)
 
-    def xobject(self, item: Any, resources: Any, current: tuple[bool, bool]) -> bool:
+    def is_hidden(self, layer: Any) -> bool:
+        """Return True if a layer (optional content group or membership) is not printed."""
+        if layer is None or layer.get("/Type") != "/OCMD":
+            return layer is not None and layer.objgen in self._hidden_layers
+        groups = layer.get("/OCGs", Array())
+        groups = [group for group in (groups if isinstance(groups, Array) else [groups]) if group]
+        if "/VE" in layer or not groups:
+            return False
+        hidden = [group.objgen in self._hidden_layers for group in groups]
+        policy = str(layer.get("/P", "/AnyOn"))
+        return {
+            "/AllOn": any(hidden),
+            "/AnyOff": not any(hidden),
+            "/AllOff": not all(hidden),
+        }.get(policy, all(hidden))
+
+    def xobject(self, item: Any, resources: Any, state: _State, area: Rectangle | None) -> bool:
         """Return True if a form or an image is black."""
-        if item.get("/Subtype") == "/Form":
-            return self._content(item, item.get("/Resources", resources), current)
-        if item.get("/ImageMask", False):
-            return current[0]
-        return self._once(("image",), item, lambda: _is_black_image(item))
+        if self.is_hidden(item.get("/OC")):
+            return False
+        if item.get("/Subtype") != "/Form":
+            if not state.visible[0] or _is_outside(UNIT_SQUARE, state.matrix, area):
+                return False
+            if item.get("/ImageMask", False):
+                return state.black[0]
+            spaces = resources.get("/ColorSpace")
+            return self._once(("image",), item, lambda: _is_black_image(item, spaces))
+        inner = state.inherited()
+        if "/Group" in item:  # the opacity is that of the group
+            if not state.visible[0]:
+                return False
+            inner.visible = (True, True)
+        matrix = Matrix(*item.Matrix) @ state.matrix if "/Matrix" in item else state.matrix
+        if _is_outside(Rectangle(item.BBox), matrix, area):
+            return False
+        # Only content that is not moved, such as that of a page with comments, knows the page: the
+        # search in a form must not depend on where it is drawn.
+        return self._content(
+            item, item.get("/Resources", resources), inner, area if matrix == Matrix() else None
+        )
 
     def pattern(self, item: Any, resources: Any, is_uncoloured_black: bool) -> bool:
         """Return True if a pattern is black."""
@@ -93,32 +190,45 @@ class BlackFinder:
             return self.shading(item.Shading, resources)
         if int(item.get("/PaintType", 1)) == 2:
             return is_uncoloured_black
-        return self._content(item, item.get("/Resources", resources), (True, True))
+        return self._content(item, item.get("/Resources", resources), _State())
 
     def shading(self, item: Any, resources: Any) -> bool:
         """Return True if a shading is black."""
         spaces = resources.get("/ColorSpace")
         return self._once(("shading",), item, lambda: _is_black_shading(item, spaces))
 
-    def font(self, item: Any, resources: Any, current: tuple[bool, bool]) -> bool:
-        """Return True if text of a font is black."""
-        if item is None or item.get("/Subtype") != "/Type3":
-            return any(current)
-        inner = item.get("/Resources", resources)
-        return any(self._content(glyph, inner, current) for _, glyph in item.CharProcs.items())
+    def text(self, state: _State, resources: Any) -> bool:
+        """Return True if text is black."""
+        font = state.font
+        fill, stroke = (state.text_mode in modes for modes in (FILLED_TEXT, STROKED_TEXT))
+        if font is None or font.get("/Subtype") != "/Type3":
+            return state.paints(fill=fill, stroke=stroke)
+        inner = state.inherited()
+        # Glyphs of this kind are drawings, which the mode only hides as a whole.
+        inner.visible = (inner.visible[0] and fill, inner.visible[1] and fill)
+        glyphs = [glyph for _, glyph in font.CharProcs.items()]
+        resources = font.get("/Resources", resources)
+        return any(self._content(glyph, resources, inner) for glyph in glyphs)
+
+
+UNIT_SQUARE = Rectangle(0, 0, 1, 1)
+"""Square that each image fills, in its own units."""
 
 
 class _Walk:
     """Walk through the operators of one content stream."""
 
-    def __init__(self, finder: BlackFinder, resources: Any, initial: tuple[bool, bool]) -> None:
-        self._finder, self._resources = finder, resources
-        # Fill and stroke: black or not, and the colour space.
-        self._black = list(initial)
-        self._spaces: list[ColourSpace | None] = [colours.GREY, colours.GREY]
-        self._font: Any = None
-        self._text_mode = 0
-        self._stack: list[tuple[Any, ...]] = []
+    def __init__(
+        self, finder: BlackFinder, resources: Any, initial: _State, area: Rectangle | None
+    ) -> None:
+        self._finder, self._resources, self._area = finder, resources, area
+        self._state = copy.copy(initial)
+        self._stack: list[_State] = []
+        # For each open sequence of marked content, True if it is of a hidden layer.
+        self._sequences: list[bool] = []
+        self._path: list[tuple[float, float]] = []
+        # Start of the current line of text; None if it is unknown.
+        self._line: Matrix | None = None
 
     def is_black(self, stream: Stream) -> bool:
         """Return True at the first black operator."""
@@ -126,50 +236,152 @@ class _Walk:
             # Content that ends early is drawn up to there.
             warnings.simplefilter("ignore", UserWarning)
             instructions: Any = pikepdf.parse_content_stream(stream)
-        return any(self._paints_black(str(item.operator), item.operands) for item in instructions)
+        return any(self._follow(str(item.operator), item.operands) for item in instructions)
+
+    def _follow(self, operator: str, operands: Any) -> bool:
+        """Return True if the operator paints in black; viewers ignore those that are damaged."""
+        try:
+            return self._paints_black(operator, operands)
+        except DAMAGE_ERRORS:
+            return False
 
     def _paints_black(self, operator: str, operands: Any) -> bool:
         """Follow the graphics state; return True if the operator paints in black."""
-        is_line = operator.isupper()
+        if operator in PATH_OPERATORS:
+            self._extend_path(operator, operands)
+            return False
+        state, is_line = self._state, operator.isupper()
         if operator == "q":
-            state = (list(self._black), list(self._spaces), self._font, self._text_mode)
-            self._stack.append(state)
+            self._stack.append(copy.copy(state))
         elif operator == "Q" and self._stack:
-            self._black, self._spaces, self._font, self._text_mode = self._stack.pop()
+            self._state = self._stack.pop()
+        elif operator == "cm":
+            state.matrix = _matrix(operands) @ state.matrix
+        elif operator == "w":
+            state.line_width = float(operands[0])
+        elif operator == "gs":
+            self._set_parameters(self._resource("/ExtGState", operands[0]))
         elif operator.lower() in DEVICE_OPERATORS:
-            self._spaces[is_line] = DEVICE_OPERATORS[operator.lower()]
-            self._black[is_line] = self._is_black_colour(self._spaces[is_line], operands)
+            self._set_space(is_line, DEVICE_OPERATORS[operator.lower()])
+            self._set_black(is_line, self._is_black_colour(is_line, operands))
         elif operator in ("cs", "CS"):
             space = self._read_space(operands[0])
-            self._spaces[is_line] = space
-            self._black[is_line] = space is not None and _is_black(space, [space.initial])
+            self._set_space(is_line, space)
+            self._set_black(is_line, space is not None and _is_black(space, [space.initial]))
         elif operator in COLOUR_OPERATORS:
-            self._black[is_line] = self._is_black_colour(self._spaces[is_line], operands)
+            self._set_black(is_line, self._is_black_colour(is_line, operands))
+        elif operator in ("BMC", "BDC"):
+            self._sequences.append(operator == "BDC" and self._is_hidden(*operands))
+        elif operator == "EMC":
+            del self._sequences[-1:]
         elif operator == "Tf":
-            self._font = self._resource("/Font", operands[0])
+            state.font = self._resource("/Font", operands[0])
+            state.text_height = float(operands[1])
         elif operator == "Tr":
-            self._text_mode = int(operands[0])
-        elif operator in SHOWING:
-            return self._shows_black()
-        elif operator == "Do":
+            state.text_mode = int(operands[0])
+        elif operator in TEXT_POSITIONS:
+            self._move_text(operator, operands)
+        is_black = not any(self._sequences) and self._paints(operator, operands)
+        if operator in PATH_ENDS:
+            self._path.clear()
+        return is_black
+
+    def _paints(self, operator: str, operands: Any) -> bool:
+        """Return True if an operator that is not hidden paints in black."""
+        state = self._state
+        if operator in SHOWING:
+            return self._finder.text(state, self._resources) and not self._is_text_outside()
+        if operator == "Do":
             item = self._resource("/XObject", operands[0])
-            current = (self._black[0], self._black[1])
-            return item is not None and self._finder.xobject(item, self._resources, current)
-        elif operator == "sh":
+            return item is not None and self._finder.xobject(
+                item, self._resources, state, self._area
+            )
+        if operator == "sh":
             item = self._resource("/Shading", operands[0])
-            return item is not None and self._finder.shading(item, self._resources)
-        elif operator == "INLINE IMAGE":
+            return (
+                item is not None
+                and state.visible[0]
+                and self._finder.shading(item, self._resources)
+            )
+        if operator == "INLINE IMAGE":
+            if not state.visible[0] or _is_outside(UNIT_SQUARE, state.matrix, self._area):
+                return False
             image = operands[0]
             if image.image_mask:
-                return self._black[0]
+                return state.black[0]
             with Pdf.new() as pdf:
-                return _is_black_image(inline_stream(pdf, image))
-        return (operator in FILLING and self._black[0]) or (operator in STROKING and self._black[1])
+                stream = inline_stream(pdf, image)
+                return _is_black_image(stream, self._resources.get("/ColorSpace"))
+        fill = state.paints(fill=operator in FILLING)
+        stroke = state.paints(stroke=operator in STROKING)
+        return (fill or stroke) and not self._is_path_outside(stroke)
 
-    def _shows_black(self) -> bool:
-        fill = self._black[0] and self._text_mode in FILLED_TEXT
-        stroke = self._black[1] and self._text_mode in STROKED_TEXT
-        return self._finder.font(self._font, self._resources, (fill, stroke))
+    # ---- state
+
+    def _set_space(self, is_line: bool, space: ColourSpace | None) -> None:
+        self._state.spaces = _with(self._state.spaces, is_line, space)
+
+    def _set_black(self, is_line: bool, is_black: bool) -> None:
+        self._state.black = _with(self._state.black, is_line, is_black)
+
+    def _set_parameters(self, parameters: Any) -> None:
+        for is_line, key in enumerate(("/ca", "/CA")):
+            if parameters is not None and key in parameters:
+                is_visible = float(parameters[key]) > MIN_BLACK
+                self._state.visible = _with(self._state.visible, is_line, is_visible)
+        if parameters is not None and "/LW" in parameters:
+            self._state.line_width = float(parameters.LW)
+        if parameters is not None and "/Font" in parameters:
+            self._state.font, self._state.text_height = (
+                parameters.Font[0],
+                float(parameters.Font[1]),
+            )
+
+    def _is_hidden(self, tag: Any, properties: Any) -> bool:
+        if str(tag) != "/OC":
+            return False
+        return self._finder.is_hidden(self._resource("/Properties", properties))
+
+    # ---- position
+
+    def _extend_path(self, operator: str, operands: Any) -> None:
+        if self._area is None or not any(self._state.black):
+            return
+        values = [float(value) for value in operands]
+        if operator == "re":
+            values[2:] = values[0] + values[2], values[1] + values[3]
+        self._path += zip(values[::2], values[1::2], strict=True)
+
+    def _is_path_outside(self, is_stroked: bool) -> bool:
+        if self._area is None or not self._path:
+            return False
+        x, y = zip(*self._path, strict=True)
+        extent = MITER_FACTOR * abs(self._state.line_width) if is_stroked else 0.0
+        box = Rectangle(min(x) - extent, min(y) - extent, max(x) + extent, max(y) + extent)
+        return _is_outside(box, self._state.matrix, self._area)
+
+    def _move_text(self, operator: str, operands: Any) -> None:
+        if operator == "BT":
+            self._line = Matrix()
+        elif operator == "Tm":
+            self._line = _matrix(operands)
+        elif operator in ("Td", "TD") and self._line is not None:
+            self._line = Matrix().translated(float(operands[0]), float(operands[1])) @ self._line
+        else:  # to the next line, at a distance that is not followed
+            self._line = None
+
+    def _is_text_outside(self) -> bool:
+        font = self._state.font
+        if self._line is None or font is None or font.get("/Subtype") == "/Type3":
+            return False
+        encoding = font.get("/Encoding")
+        if str(encoding).endswith("V") or isinstance(encoding, Stream):
+            return False  # possibly vertical
+        height = TEXT_HEIGHT_EM * abs(self._state.text_height)
+        line = Rectangle(-ENDLESS, -height, ENDLESS, height)
+        return _is_outside(line, self._line @ self._state.matrix, self._area)
+
+    # ---- resources
 
     def _resource(self, kind: str, name: Any) -> Any:
         return self._resources.get(kind, Dictionary()).get(str(name))
@@ -182,7 +394,8 @@ class _Walk:
             return colours.read_colour_space(definition[1], spaces)
         return colours.read_colour_space(name, spaces)
 
-    def _is_black_colour(self, space: ColourSpace | None, operands: Any) -> bool:
+    def _is_black_colour(self, is_line: bool, operands: Any) -> bool:
+        space = self._state.spaces[is_line]
         values = [float(value) for value in operands if not isinstance(value, Name)]
         is_black = (
             space is not None and len(values) == space.components and _is_black(space, [values])
@@ -197,19 +410,61 @@ def _is_black(space: ColourSpace, values: Any) -> bool:
     return bool((space.black(np.asarray(values, float)) > MIN_BLACK).any())
 
 
-def _is_black_image(image: Stream) -> bool:
+def _with(pair: tuple[Any, Any], index: int, value: Any) -> tuple[Any, Any]:
+    """Return a pair with another value at an index."""
+    return (pair[0], value) if index else (value, pair[1])
+
+
+def _matrix(operands: Any) -> Matrix:
+    return Matrix(*(float(value) for value in operands))
+
+
+def _is_outside(box: Rectangle, matrix: Matrix, area: Rectangle | None) -> bool:
+    """Return True if a box, in the units before the matrix, does not touch an area."""
+    if area is None:
+        return False
+    drawn = matrix.transform(box)
+    return (
+        drawn.urx < area.llx or drawn.llx > area.urx or drawn.ury < area.lly or drawn.lly > area.ury
+    )
+
+
+def _hidden_layers(pdf: Pdf) -> Iterator[tuple[int, int]]:
+    """Yield the object numbers of the layers that are not printed."""
+    properties = pdf.Root.get("/OCProperties")
+    if properties is None:
+        return
+    default = properties.D
+    is_off = str(default.get("/BaseState", "/ON")) == "/OFF"
+    hidden = {group.objgen for group in (properties.OCGs if is_off else ())}
+    hidden -= {group.objgen for group in default.get("/ON", ())} if is_off else set()
+    hidden |= {group.objgen for group in default.get("/OFF", ())}
+    for usage in default.get("/AS", ()):
+        if str(usage.get("/Event")) == "/Print":  # the state of these differs for printing
+            hidden -= {group.objgen for group in usage.get("/OCGs", ())}
+    yield from hidden
+
+
+def _is_black_image(image: Stream, named: Any) -> bool:
     """Return True if a pixel of an image is black; also if the image cannot be decoded."""
     if int(image.Width) * int(image.Height) > MAX_IMAGE_PIXELS:
         return True
     try:
-        picture = PdfImage(image).as_pil_image()
+        space = colours.read_colour_space(image.get("/ColorSpace"), named)
+        if space is not None and (space.kind in ("tint", "inks") or not space.is_convertible):
+            # PdfImage does not read these.
+            return any(_is_black(space, values) for values in read_values(image, space))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # loss of bits
+            picture = PdfImage(image).as_pil_image()
         is_cmyk = picture.mode == "CMYK"
         pixels = np.asarray(picture if is_cmyk else picture.convert("RGBA"))
     except Exception:  # decoders raise their own kinds
         return True
     space = colours.CMYK if is_cmyk else colours.RGB
-    # Without the pixels that are wholly transparent, which are black in many images.
-    samples = pixels.reshape(-1, 4) if is_cmyk else pixels[pixels[..., 3] > 0][:, :3]
+    # Without the pixels that are almost transparent, which are black in many images.
+    is_visible = pixels[..., 3] > 255 * MIN_BLACK
+    samples = pixels.reshape(-1, 4) if is_cmyk else pixels[is_visible][:, :3]
     return any(
         _is_black(space, samples[start : start + BLOCK_PIXELS] / 255.0)
         for start in range(0, len(samples), BLOCK_PIXELS)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import zlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ def convert_image(
     filters = _filters(image)
     if "/JPXDecode" in filters:
         return _jpeg_2000(pdf, image, named, inks)
-    space = colours.read_colour_space(image.get("/ColorSpace"), named)
+    space = colours.read_convertible_space(image.get("/ColorSpace"), named)
     if space is None:
         raise NotConvertible("images in a spot or Lab colour space")
     bits = int(image.get("/BitsPerComponent", 8))
@@ -91,9 +92,7 @@ def convert_image(
         if isinstance(image.get("/Mask"), Array):
             raise NotConvertible("images with a transparent colour")
         _no_matte(image)
-        converted = _with_samples(
-            pdf, image, _remaining_light(image, space, decode, bits), is_jpeg, inks
-        )
+        converted = _with_samples(pdf, image, _remaining_light(image, space), is_jpeg, inks)
     if "/Alternates" in converted:
         del converted.Alternates
     return converted
@@ -127,7 +126,7 @@ def _decode(image: Stream, space: ColourSpace, bits: int) -> Floats:
         if given.size >= 2 * space.components:
             return given[: 2 * space.components].reshape(-1, 2)
     top = float((1 << bits) - 1) if space.kind == "indexed" else 1.0
-    return np.tile([0.0, top], (space.components, 1))
+    return np.array(space.ranges or [(0.0, top)] * space.components)
 
 
 def _palette(space: ColourSpace, decode: Floats, bits: int) -> Array:
@@ -138,23 +137,42 @@ def _palette(space: ColourSpace, decode: Floats, bits: int) -> Array:
     return Array([Name.Indexed, Name.DeviceCMYK, top, pikepdf.String(table.tobytes())])
 
 
-def _remaining_light(image: Stream, space: ColourSpace, decode: Floats, bits: int) -> Bytes:
-    """Return the light (height, width, 3) that the inks do not absorb, 255 without ink."""
+def read_values(image: Stream, space: ColourSpace) -> Iterator[Floats]:
+    """Return the colours of an image, row by row, in blocks of (pixels, components).
+
+    Raises
+    ------
+    NotConvertible
+        There are too few samples, or samples of another size.
+    """
     width, height = int(image.Width), int(image.Height)
-    if bits not in (8, 16):
-        raise NotConvertible("images of few bits in CMYK")
+    bits = int(image.get("/BitsPerComponent", 8))
+    if bits not in (1, 2, 4, 8, 16):
+        raise NotConvertible("images that are damaged")
+    decode = _decode(image, space, bits)
+    low, step = decode[:, 0], (decode[:, 1] - decode[:, 0]) / ((1 << min(bits, 8)) - 1)
     data = np.frombuffer(image.read_bytes(decode_level=StreamDecodeLevel.all), np.uint8)
-    step = bits // 8
-    wanted = width * height * space.components * step
-    if width < 1 or height < 1 or data.size < wanted:
+    row_samples = width * space.components
+    row_bytes = (row_samples * bits + 7) // 8
+    if width < 1 or height < 1 or data.size < height * row_bytes:
         raise NotConvertible("images that are cut short")
-    samples = data[:wanted:step].reshape(-1, space.components)
-    lights = np.empty((len(samples), 3), np.uint8)
-    for start in range(0, len(samples), BLOCK_PIXELS):
-        block = slice(start, start + BLOCK_PIXELS)
-        values = decode[:, 0] + samples[block] / 255.0 * (decode[:, 1] - decode[:, 0])
-        lights[block] = np.round(255 * (1 - space.cmy(values)))
-    return lights.reshape(height, width, 3)
+    rows = data[: height * row_bytes].reshape(height, row_bytes)
+    block_rows = max(1, BLOCK_PIXELS // width)
+    for start in range(0, height, block_rows):
+        samples = rows[start : start + block_rows, :: max(1, bits // 8)]
+        if bits < 8:
+            flags = np.unpackbits(samples, axis=1)[:, : row_samples * bits].reshape(-1, bits)
+            samples = np.packbits(flags, axis=1) >> np.uint8(8 - bits)
+        yield low + samples.reshape(-1, space.components) * step
+
+
+def _remaining_light(image: Stream, space: ColourSpace) -> Bytes:
+    """Return the light (height, width, 3) that the inks do not absorb, 255 without ink."""
+    lights = [
+        np.round(255 * (1 - space.cmy(values))).astype(np.uint8)
+        for values in read_values(image, space)
+    ]
+    return np.concatenate(lights).reshape(int(image.Height), int(image.Width), 3)
 
 
 def _with_samples(
@@ -193,7 +211,7 @@ def _jpeg_2000(
     import cv2  # slow to import
 
     given = image.get("/ColorSpace")
-    space = None if given is None else colours.read_colour_space(given, named)
+    space = None if given is None else colours.read_convertible_space(given, named)
     plain = given is None or (space is not None and space.kind in ("grey", "rgb"))
     if not plain or int(image.get("/SMaskInData", 0)) or "/Decode" in image:
         raise NotConvertible("JPEG 2000 images")
@@ -237,7 +255,7 @@ def convert_shading(
         The object has to remain as it is.
     """
     kind = int(shaded.ShadingType)
-    space = colours.read_colour_space(shaded.get("/ColorSpace"), named)
+    space = colours.read_convertible_space(shaded.get("/ColorSpace"), named)
     if space is None or kind == 1:
         raise NotConvertible("shadings by a formula, or in a spot or Lab colour space")
     converted = copy.copy(shaded)

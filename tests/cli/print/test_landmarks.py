@@ -127,7 +127,7 @@ def test_same_map_same_bytes(locatk, map_file: Path, tmp_path: Path) -> None:
         (["--paper", "A17"], 1, "A17"),
         (["--size", "A5"], 0, "148 x 210"),
         (["--paper", "105x105mm"], 1, "105 x 105 mm is too small"),
-        (["--paper", "115x115mm"], 1, "which paper 115x115"),
+        (["--paper", "115x140mm"], 1, "which paper 115x140"),
         (["--floor", "--margin", 2], 1, "joining marks"),
         (["--spares", -1], 2, "--spares"),
         (["--bom", "parts.txt"], 2, "end it in .csv"),

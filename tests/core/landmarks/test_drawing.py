@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reportlab.pdfbase.pdfmetrics import stringWidth
 
 from locatk.core.drawing import Circle, Line, Mark, Polygon, Text
 from locatk.core.errors import InputError
@@ -18,6 +19,7 @@ from locatk.core.landmarks.drawing.landmark import (
     draw_symbol,
     drawing_half_side,
 )
+from locatk.core.landmarks.drawing.legend import draw_legend, legend_height
 from locatk.core.landmarks.drawing.plan import round_scale
 from locatk.core.landmarks.drawing.templates import cells_by_code, cells_text
 from locatk.core.landmarks.field import landmark_field
@@ -140,3 +142,41 @@ def test_scales_are_round_and_enough(least: float) -> None:
     scale = round_scale(least)
     assert least <= scale <= 1.3 * least
     assert len(f"{scale:g}".replace(".", "").strip("0")) <= 3
+
+
+def text_box(text: Text) -> np.ndarray:
+    """Left, bottom, right and top in the font of the PDF, from its own metrics."""
+    font = "Helvetica-Bold" if text.bold else "Helvetica"
+    width = stringWidth(text.text, font, text.points) * 25.4 / 72
+    left = text.position[0] - {"start": 0, "middle": 0.5, "end": 1}[text.anchor] * width
+    height = 0.72 * text.points * 25.4 / 72
+    return np.array([left, text.position[1], left + width, text.position[1] + height])
+
+
+@pytest.mark.parametrize("width", [79.0, 111.0, 122.0, 184.0, 270.0, 900.0])
+@pytest.mark.parametrize("window", ["L", "3x3"])
+def test_nothing_overlaps_in_a_legend(width: float, window: str) -> None:
+    """On paper from A6 on; the smallest one was drawn for A4, and overlapped on A5."""
+    scale = 12.5
+    marks = draw_legend(floor([[1, 2], [3, 5]], window=window), scale, (7.0, 9.0), width)
+    texts = [mark for mark in marks if isinstance(mark, Text)]
+    boxes = np.array([text_box(mark) for mark in texts])
+    assert boxes.min(axis=0)[:2] == pytest.approx([7, 10], abs=1.5)
+    assert boxes[:, 2].max() <= 7 + width
+    assert boxes[:, 3].max() <= 9 + legend_height(width)
+    for mark, box in zip(texts, boxes, strict=True):
+        touched = (boxes[:, :2] < box[2:]).all(axis=1) & (boxes[:, 2:] > box[:2]).all(axis=1)
+        assert [texts[n] for n in np.flatnonzero(touched)] == [mark]
+    # No drawing reaches into the explanations, which are the lines that are not bold.
+    for text, box in zip(texts, boxes, strict=True):
+        if text.bold or len(text.text) < 6:
+            continue
+        for mark in marks:
+            if not isinstance(mark, Text):
+                corners = np.array(positions(mark))
+                is_apart = (corners.max(axis=0) < box[:2]) | (corners.min(axis=0) > box[2:])
+                assert is_apart.any(), (text, mark)
+
+
+def test_no_legend_fits_on_a_strip() -> None:
+    assert legend_height(70.0) == math.inf

@@ -52,6 +52,11 @@ def stamp(*sizes: tuple[float, float]) -> bytes:
     return stream.getvalue()
 
 
+def blank() -> bytes:
+    """An empty page."""
+    return Maker().written(b"")
+
+
 def shown(source: Any, page: int = 0, scale: float = SCALE) -> NDArray[np.uint8]:
     """The page as a viewer shows it, RGB."""
     bitmap = pypdfium2.PdfDocument(source)[page].render(scale=scale, rev_byteorder=True)
@@ -288,23 +293,73 @@ def test_what_stays_black_is_told(tmp_path: Path) -> None:
     )
     spot = make.stream(b"{0 0 3 -1 roll 0 exch}", FunctionType=4,
                        Domain=Array([0, 1]), Range=Array([0, 1] * 4))  # fmt: skip
-    make.add("ColorSpace", L=lab, S=Array([Name.Separation, Name.Gold, Name.DeviceCMYK, spot]))
+    night = Dictionary(FunctionType=2, Domain=[0, 1], C0=[100, 0, 0], C1=[0, 0, 0], N=1)
+    make.add(
+        "ColorSpace",
+        L=lab,
+        S=Array([Name.Separation, Name.Gold, Name.DeviceCMYK, spot]),
+        N=Array([Name.Separation, Name.Night, lab, night]),
+    )
     make.add("Shading", F=Dictionary(ShadingType=1, ColorSpace=Name.DeviceRGB, Function=formula))
     make.add(
         "XObject", I=make.image(b"\x20" * 3 * 64 * 64, lab), J=make.image(b"short", Name.DeviceCMYK)
     )
     document = make.save(
         tmp_path / "in.pdf",
-        b"/L cs 20 0 0 scn 9 9 9 9 re f /S cs 1 scn 30 9 9 9 re f /F sh /I Do /J Do",
+        b"/L cs 20 0 0 scn 9 9 9 9 re f /S cs 1 scn 30 9 9 9 re f /N cs 1 scn 9 30 9 9 re f "
+        b"/F sh /I Do /J Do",
     )
     left = overlay(document, stamp(), strip_black=True).left_black
     assert left == {
-        "colours in a spot or Lab colour space": 2,
+        "colours in a spot or Lab colour space": 3,
         "images in a spot or Lab colour space": 1,
         "images that are cut short": 1,
         "shadings by a formula, or in a spot or Lab colour space": 1,
     }
     assert overlay(document, stamp(), strip_black=False).left_black == {}
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
+def test_images_of_any_depth_keep_their_colours(tmp_path: Path, bits: int) -> None:
+    make = Maker()
+    plates = np.random.default_rng(bits).integers(0, 1 << min(bits, 8), (64, 63, 4))
+    plates[..., 3] = 0
+    if bits == 16:
+        plates *= 257  # others are rounded to 8 bits
+    flags = plates[..., None] >> np.arange(bits)[::-1] & 1
+    data = np.packbits(flags.astype(np.uint8).reshape(64, -1), axis=1).tobytes()
+    image = make.image(data, Name.DeviceCMYK, bits)
+    image.Width = 63
+    make.add("XObject", I=image)
+    document = make.save(tmp_path / "in.pdf", b"q 126 0 0 128 20 20 cm /I Do Q")
+    result = overlay(document, blank(), strip_black=True)
+    assert result.left_black == {}
+    before, after = shown(document.read_bytes()), shown(result.data)
+    assert before.min() < 60
+    assert np.abs(before.astype(int) - after).max() <= 2
+
+
+@pytest.mark.parametrize("box", [None, [0, 0, 99], [0, 0, "a", 99], [0, 0, 0, 99]])
+def test_pages_without_a_size_are_refused(tmp_path: Path, box: list[Any] | None) -> None:
+    """Programs assume different sizes for them; a sheet has only one."""
+    make = Maker()
+    make.pdf.add_blank_page(page_size=(WIDTH, HEIGHT))
+    del make.pdf.pages[1].obj.MediaBox
+    if box is not None:
+        make.pdf.pages[1].obj.MediaBox = Array(box)
+    document = make.save(tmp_path / "in.pdf", b"")
+    for read in (page_sizes, lambda path: overlay(path, stamp(), strip_black=False)):
+        with pytest.raises(FormatError, match="no valid size") as info:
+            read(document)
+        assert info.value.where == "page 2"
+        assert info.value.hint
+
+
+def test_sizes_are_inherited(tmp_path: Path) -> None:
+    make = Maker()
+    del make.page.MediaBox
+    make.pdf.Root.Pages.MediaBox = Array([0, 0, 72, 144])
+    assert page_sizes(make.save(tmp_path / "in.pdf", b"")) == [pytest.approx((25.4, 50.8))]
 
 
 GREYS = st.sampled_from(["0", "0.25", "0.5", "1"])
