@@ -29,6 +29,7 @@ from locatk.core.landmarks.landmark import CODE_COUNT, code_of
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
 from locatk.core.units import metres
+from locatk.formats.tables.numbers import parse_number
 
 HEADER = ("No", "Code", "X mm", "Y mm", "Attr1", "Attr2", "Attr3", "Attr4")
 
@@ -116,7 +117,7 @@ class _Line:
         text = self._cells[index].replace(",", ".") if index < len(self._cells) else ""
         if not text and name.startswith("Attr"):
             return 0.0
-        value = float(text) if _is_number(text) else math.nan
+        value = parse_number(text) if _is_number(text) else math.nan
         if name == "Attr4":
             return value
         if not abs(value) <= max_abs:
@@ -170,6 +171,6 @@ def _header(cells: list[str], file: str | os.PathLike[str], line: int) -> dict[s
 
 def _is_number(text: str) -> bool:
     try:
-        return math.isfinite(float(text.replace(",", ".")))
+        return math.isfinite(parse_number(text.replace(",", ".")))
     except ValueError:
         return False
