@@ -208,8 +208,7 @@ def _run_jobs(
 def _submit(executor: Executor, function: Callable[[Job], Any], job: Job) -> Future[Any]:
     """Submit a job, which may start a worker; raise _BrokenPool if that fails."""
     try:
-        with _deferred_interrupts():
-            return executor.submit(function, job)
+        return executor.submit(function, job)
     except (EOFError, OSError) as error:  # The fork server died, or processes are limited.
         raise _BrokenPool(short_reason(error)) from error
 
@@ -309,6 +308,14 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+class _ProcessExecutor(ProcessPoolExecutor):
+    """Executor whose start of a worker is not interrupted."""
+
+    def submit(self, function: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        with _deferred_interrupts():
+            return super().submit(function, *args, **kwargs)
+
+
 @contextlib.contextmanager
 def _open_processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
     # A plain fork would copy locks that threads of libraries hold.
@@ -326,7 +333,7 @@ def _open_processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
     with _changed_environment({**SINGLE_THREAD_ENVIRONMENT, "PYTHONWARNINGS": warning_filters}):
         if has_forkserver:
             _start_forkserver()
-        executor = ProcessPoolExecutor(
+        executor = _ProcessExecutor(
             width,
             mp_context=context,
             initializer=_initialize_worker,

@@ -8,7 +8,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from multiprocessing import forkserver
 from pathlib import Path
 from types import ModuleType
@@ -198,23 +198,36 @@ def test_files_of_workers_that_end_slowly_are_removed(module: ModuleType, tmp_pa
     assert list(tmp_path.glob(".output.*")) == []
 
 
-class _InterruptedExecutor(_FailingExecutor):
-    """Executor during whose first submission Ctrl-C is pressed."""
-
-    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        signal.raise_signal(signal.SIGINT)
-        return super().submit(function, *args, **kwargs)
+def interrupt(job: int) -> None:
+    signal.raise_signal(signal.SIGINT)
 
 
-def test_a_submission_is_not_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_FailingExecutor, "failures", 0)
-    done: list[int] = []
+def test_a_job_in_this_process_is_interrupted() -> None:
     cleaned: list[int] = []
-    pool = Pool(lambda width: _InterruptedExecutor(), 2)
+    done: list[int] = []
+
+    def work(job: int) -> None:
+        interrupt(job)
+        done.append(job)
+
     with pytest.raises(KeyboardInterrupt):
-        list(run_jobs(done.append, [7, 8], pool, clean=cleaned.append))
-    assert done == [7]
-    assert cleaned == [7]
+        list(run_jobs(work, [7, 8], this_process(), clean=cleaned.append))
+    assert (done, cleaned) == ([], [7])
+
+
+def test_the_start_of_a_worker_is_not_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[int] = []
+
+    def start(executor: Any) -> None:
+        interrupt(0)
+        started.append(0)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "_start_executor_manager_thread", start)
+    monkeypatch.setattr(ProcessPoolExecutor, "_adjust_process_count", lambda executor: None)
+    cleaned: list[int] = []
+    with pytest.raises(KeyboardInterrupt):
+        list(run_jobs(abs, [7, 8], processes(2), clean=cleaned.append))
+    assert (started, cleaned) == ([0], [7])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
