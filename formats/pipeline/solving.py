@@ -26,6 +26,7 @@ from locatk.formats.pipeline.outcome import (
     summarize,
 )
 from locatk.formats.pipeline.systems import SolveRequest, solve_session
+from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import write_solution
 
 
@@ -204,6 +205,7 @@ def _run_steps(
     path = stack.enter_context(file_access.local(job.source, scratch))
     user_names[str(path)] = job.session
     request = _unpack_files(job, scratch, stack, user_names)
+    Session.open(path)  # A damaged file is refused before all of its bytes are read.
     facts = {**provenance.source_facts(path), "options_sha256": job.options_sha256}
 
     def existing_solution() -> tuple[Solution | None, bool]:
