@@ -322,6 +322,14 @@ def test_results_are_written_without_standard_streams(
     assert len(output.read_text().splitlines()) == 20
 
 
+@pytest.mark.parametrize("number", ["nan", "inf", "1e999"])
+def test_options_are_finite(locatk: Run, tmp_path: Path, number: str) -> None:
+    (tmp_path / "frame.png").write_bytes(b"")
+    result = locatk("import", "images", tmp_path, "--rate", number, "-o", tmp_path / "run.mcap")
+    assert result.exit_code == 2
+    assert "Invalid value for '--rate'" in result.stderr
+
+
 @pytest.mark.parametrize("end", ["\n", "\r", "\u2028"])
 def test_names_with_line_ends_are_refused(
     locatk: Run, session: Path, tmp_path: Path, end: str
