@@ -33,7 +33,7 @@ is one line with a hint. A misspelled command or option gets a suggestion.
 | exit status | meaning |
 |---|---|
 | 0 | done |
-| 1 | failed |
+| 1 | failed, or a result could not be printed (files are complete then) |
 | 2 | usage error |
 | 3 | finished with losses or unsolved parts, which are listed |
 

@@ -65,6 +65,9 @@ class App(LazyGroup):
             status = super().main(args, prog_name, complete_var, False, **extra)
         except Exception as error:
             status = failures.report(error)
+        lost = console.lost_results()
+        if lost is not None:
+            status = failures.report_lost_results(lost)
         sys.exit(status if isinstance(status, int) else 0)
 
 

@@ -18,6 +18,7 @@ rich-click (the least of 15 runs each); help shall open within 200 ms on slower 
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -59,6 +60,21 @@ def section(title: str, *decorators: Callable[[Any], Any]) -> Callable[[Any], An
 
 class Command(click.Command):
     """Command whose help lists its options in the sections given by :func:`section`."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; numbers that are not finite are in no range, although click lets them.
+
+        Raises
+        ------
+        click.BadParameter
+            An option is ``nan`` or ``inf``.
+        """
+        for parameter in self.get_params(ctx):
+            value = ctx.params.get(parameter.name or "")
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    raise click.BadParameter(f"{number} is not a number.", ctx, parameter)
+        return super().invoke(ctx)
 
     def section_of(self, parameter: click.Parameter) -> str:
         """Return the title under which the help lists a parameter."""

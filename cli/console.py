@@ -2,7 +2,8 @@
 
 Characters that act upon a terminal or are invisible are printed as escapes such as ``\\x1b``,
 because names and texts may come from the files of others. A message that cannot be written (a
-closed or full stderr) is dropped and changes nothing; a result that cannot be written is an error.
+closed or full stderr) is dropped and changes nothing. A result that cannot be written is dropped
+too, so that the command still writes its files; it then fails (:func:`lost_results`).
 
 Messages obey ``-q`` and ``-v``. Colour appears only on a terminal (click removes it otherwise), and
 not if ``NO_COLOR`` is set. Results fit :data:`TEXT_COLUMNS`; messages are one line each, so that
@@ -25,7 +26,6 @@ from typing import Any, Protocol, TypeVar
 
 import click
 
-from locatk.core.errors import LocatkError
 from locatk.core.printable import escape_controls
 
 T = TypeVar("T")
@@ -40,10 +40,11 @@ MIN_TEXT_COLUMNS = 16
 
 @dataclass
 class _State:
-    """Verbosity of the command that runs."""
+    """Verbosity of the command that runs, and the first failure to write its results."""
 
     verbosity: int = 0
     json: bool = False
+    stdout_error: OSError | None = None
 
 
 _state = _State()
@@ -53,6 +54,7 @@ def reset() -> None:
     """Reset the effect of ``-q``, ``-v`` and ``--json`` of an earlier run in this process."""
     _state.verbosity = 0
     _state.json = False
+    _state.stdout_error = None
 
 
 def set_verbosity(level: int) -> None:
@@ -116,13 +118,7 @@ def on_one_line(text: str) -> str:
 
 
 def result(text: str) -> None:
-    """Print a result as text on stdout, unless ``--json`` was given.
-
-    Raises
-    ------
-    LocatkError
-        See :func:`write_result`.
-    """
+    """Print a result as text on stdout, unless ``--json`` was given."""
     if not _state.json:
         write_result(escape_controls(text, keep="\n") + "\n")
 
@@ -144,24 +140,21 @@ def emit_file(data: bytes) -> None:
 
 
 def write_result(text: str | bytes) -> None:
-    """Write to stdout.
-
-    Raises
-    ------
-    LocatkError
-        It cannot be written, as on a full disk.
-    BrokenPipeError
-        Its reader has ended; click ends the program.
-    """
+    """Write to stdout; after a failure, this and all further results are dropped."""
     try:
         click.echo(text, nl=False)
-    except BrokenPipeError:
-        raise
     except OSError as error:
-        raise LocatkError(
-            f"the standard output cannot be written ({error.strerror or error})",
-            hint="Free some space, or print into another file",
-        ) from None
+        _state.stdout_error = _state.stdout_error or error
+        with contextlib.suppress(OSError):  # no descriptor
+            # Python also flushes the text that is still buffered, when it ends.
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, sys.stdout.fileno())
+            os.close(null)
+
+
+def lost_results() -> OSError | None:
+    """Return the reason why results are missing on stdout; None if they are complete."""
+    return _state.stdout_error
 
 
 def plain(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 == ==================================================
 0  done
-1  failed
+1  failed, or results could not be printed
 2  usage error
 3  finished with losses or unsolved parts
 == ==================================================
@@ -87,6 +87,19 @@ def report(error: BaseException) -> int:
         f"internal error, {type(error).__name__}: {error}",
         REPORT_HINT,
     )
+    return 1
+
+
+def report_lost_results(error: OSError) -> int:
+    """Report that stdout cannot be written, and return the exit status.
+
+    A reader that ended, as in ``| head -1``, wants no more results and no message about them.
+    """
+    if not isinstance(error, BrokenPipeError):
+        _print_error(
+            f"the standard output cannot be written ({error.strerror or error})",
+            "Free some space, or print into another file",
+        )
     return 1
 
 

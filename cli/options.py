@@ -11,10 +11,23 @@ import click
 
 from locatk.cli import console
 from locatk.core.errors import MissingDataError, OutputExistsError
+from locatk.core.printable import is_one_line
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-PATH = click.Path(path_type=Path)
+
+class _OneLinePath(click.Path):
+    """Path without line ends: results name files, and a program reads them by line."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path; fail if it has a line end."""
+        path = super().convert(value, param, ctx)
+        if not is_one_line(str(path)):
+            self.fail(f"{str(path)!r} has a line end in its name: rename the file.", param, ctx)
+        return path
+
+
+PATH = _OneLinePath(path_type=Path)
 
 
 class PositiveNumber(click.FloatRange):

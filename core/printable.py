@@ -33,6 +33,11 @@ def escape_controls(text: str, *, keep: str = "") -> str:
     return "".join(_escape(c) if _is_hidden(c) and c not in keep else c for c in text)
 
 
+def is_one_line(text: str) -> bool:
+    """Return whether a text has no line end, also none that only Unicode defines."""
+    return text.splitlines() in ([], [text])
+
+
 def _is_hidden(character: str) -> bool:
     return unicodedata.category(character) in _HIDDEN_CATEGORIES
 

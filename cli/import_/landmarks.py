@@ -167,6 +167,7 @@ def import_samples(
         "devices": [samples.device],
         "odometry_poses": len(imported.odometry),
         "left_out": imported.left_out,
+        "left_out_poses": imported.left_out_poses,
         "warnings": imported.warnings,
     }
     return results, imported.lost

@@ -97,11 +97,17 @@ def command(
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
     text = read_text(source)
     pitch = None if pitch_mm is None else metres(pitch_mm)
+    tolerance, warnings = metres(tolerance_mm), list[str]()
     if format_name == "csv":
-        from locatk.formats.importers.map_csv import loads_csv as loads
+        from locatk.formats.importers.map_csv import loads_csv
+
+        floor = loads_csv(
+            text, file=source, pitch_m=pitch, tolerance_m=tolerance, warnings=warnings
+        )
     else:
-        from locatk.formats.importers.map_lif import loads_lif as loads
-    floor = loads(text, file=source, pitch_m=pitch, tolerance_m=metres(tolerance_mm))
+        from locatk.formats.importers.map_lif import loads_lif
+
+        floor = loads_lif(text, file=source, pitch_m=pitch, tolerance_m=tolerance)
     if like is not None:
         design = read_map(like)
         floor = replace(
@@ -115,6 +121,8 @@ def command(
     loads_map(dumps_map(floor), file=source)  # the checks of maps that people write
     write_map(output, floor, overwrite=overwrite)
 
+    for warning in warnings:
+        console.warn(warning)
     rows, columns = floor.shape
     count = len(floor.cells())
     offsets_m = [max(abs(built.x_m), abs(built.y_m)) for built in floor.built.values()]
@@ -142,5 +150,6 @@ def command(
                 "walls": len(floor.walls),
                 "as_built": len(offsets_m),
                 "largest_offset_m": max_offset_m,
+                "warnings": warnings,
             }
         )

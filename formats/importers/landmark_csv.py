@@ -65,6 +65,16 @@ MIN_MEAN_ALIGNMENT = 0.5
 MAX_SPEED_M_S = 10.0
 """Largest plausible mean speed of a robot."""
 
+MAX_FIELD_T = 10.0
+"""Larger fields are in another unit: permanent magnets reach their remanence, at most 1.5 T."""
+
+MAX_GAP_S = 60.0
+"""Largest time between two rows without a warning.
+
+A robot logs several times a second. After a minute without a row, the clock has jumped, or the
+robot may have been carried elsewhere.
+"""
+
 
 @dataclass(frozen=True)
 class Volts:
@@ -97,6 +107,8 @@ class ImportedHalls:
         Losses and doubts, one line each.
     left_out : int
         Readings that are missing or unusable.
+    left_out_poses : int
+        Poses of odometry that are incomplete.
     """
 
     samples: HallSamples
@@ -104,13 +116,17 @@ class ImportedHalls:
     facts: dict[str, str]
     warnings: list[str] = field(default_factory=list)
     left_out: int = 0
+    left_out_poses: int = 0
 
     @property
     def lost(self) -> str | None:
         """Summary of the losses; None without any."""
-        if not self.left_out:
-            return None
-        return f"{self.left_out} of {self.samples.field_t.size} readings are excluded"
+        losses = []
+        if self.left_out:
+            losses.append(f"{self.left_out} of {self.samples.field_t.size} readings are excluded")
+        if self.left_out_poses:
+            losses.append(f"{self.left_out_poses} poses of odometry are excluded")
+        return ", ".join(losses) or None
 
 
 def read_landmarks(
@@ -167,7 +183,7 @@ def read_landmarks(
     }
     by_key = find_columns(table, quantities, columns or {}, given_units)
     time_ns, clock = _times(by_key[TIME_KEY], start_ns)
-    odometry, repeated_poses, odometry_losses = _odometry(table, by_key, time_ns)
+    odometry, repeated_poses, partial_poses = _odometry(table, by_key, time_ns)
     readings = [by_key[name] for name in sensors.names]
     field_t = _fields(readings, volts)
     # Rows with a pose and no reading are not samples.
@@ -203,8 +219,13 @@ def read_landmarks(
     )
     if excluded == field_t.size:
         raise InputError("no usable reading", file=path, hint=warnings[0].split(": ", 1)[1])
-    warnings += odometry_losses + _odometry_warnings(odometry)
-    return ImportedHalls(samples, odometry, facts, warnings, excluded)
+    if partial_poses:
+        warnings.append(
+            f"{table.file}:{table.lines[partial_poses[0]]}: odometry is incomplete in "
+            f"{len(partial_poses)} row{'s' * (len(partial_poses) > 1)}; excluded"
+        )
+    warnings += _time_warnings(table, time_ns) + _odometry_warnings(odometry)
+    return ImportedHalls(samples, odometry, facts, warnings, excluded, len(partial_poses))
 
 
 def _times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str]:
@@ -268,16 +289,26 @@ def _fields(columns: Sequence[Column], volts: Volts | None) -> Array:
             hint="Give --units v, or remove --volts-per-tesla and --zero-volts",
         )
     values = np.column_stack([column.in_si() for column in columns])
-    if volts is None:
-        return values
-    gains = _per_sensor("volts per tesla", volts.per_tesla, len(columns))
+    if volts is not None:
+        values = _fields_of_volts(values, volts)
+    is_absurd = (np.abs(values) > MAX_FIELD_T).any(axis=1)
+    if is_absurd.any():
+        problem = f"a field beyond {MAX_FIELD_T:g} T"
+        table.fail(int(np.argmax(is_absurd)), problem, "Check the number and the unit")
+    return values
+
+
+def _fields_of_volts(values: Array, volts: Volts) -> Array:
+    """Convert voltages (n, N) to fields."""
+    sensors = values.shape[1]
+    gains = _per_sensor("volts per tesla", volts.per_tesla, sensors)
     if not gains.all():
         raise InputError("0 volts per tesla", hint="Give it from the sensor's data sheet")
     if volts.zero is not None:
-        zero = _per_sensor("zero volts", volts.zero, len(columns))
+        zero = _per_sensor("zero volts", volts.zero, sensors)
     else:
         has_readings = ~np.isnan(values).all(axis=0)
-        zero = np.zeros(len(columns))
+        zero = np.zeros(sensors)
         zero[has_readings] = np.nanmedian(values[:, has_readings], axis=0)
     return (values - zero) / gains
 
@@ -294,29 +325,22 @@ def _per_sensor(name: str, values: tuple[float, ...], sensors: int) -> Array:
 
 def _odometry(
     table: Table, columns: Mapping[str, Column], time_ns: NDArray[np.int64]
-) -> tuple[Trajectory, int, list[str]]:
+) -> tuple[Trajectory, int, list[int]]:
     """Return the poses of odometry, which may be slower than the sensors.
 
     Returns
     -------
-    (Trajectory, int, list of str)
-        The poses, the number of rows that repeat the pose of an earlier row, and warnings.
+    (Trajectory, int, list of int)
+        The poses, the number of rows that repeat the pose of an earlier row, and the rows whose
+        pose is incomplete.
     """
     values = np.column_stack([columns[key].in_si() for key in POSE_KEYS])
     is_empty = np.isnan(values)
-    is_partial = is_empty.any(axis=1) & ~is_empty.all(axis=1)
-    warnings = []
-    if is_partial.any():
-        row = int(np.argmax(is_partial))
-        key = POSE_KEYS[int(np.argmax(is_empty[row]))]
-        warnings.append(
-            f"{int(is_partial.sum())} poses of odometry are incomplete and left out, the first in "
-            f"line {table.lines[row]} without {key} ({columns[key].name!r})"
-        )
+    partial = np.flatnonzero(is_empty.any(axis=1) & ~is_empty.all(axis=1)).tolist()
     rows = np.flatnonzero(~is_empty.any(axis=1))
     if len(rows) < 2:
         raise InputError(
-            "no odometry: the columns x, y and heading are empty",
+            f"no odometry: {len(rows)} of {len(table)} rows have x, y and heading, not two",
             file=table.file,
             hint="Record the wheels too: four sensors alone do not determine the path",
         )
@@ -334,7 +358,7 @@ def _odometry(
         quaternion_from_heading(heading),
         np.full((len(x), 6, 6), np.nan),
     )
-    return odometry, len(rows) - len(updates), warnings
+    return odometry, len(rows) - len(updates), partial
 
 
 def _find_updates(poses: Array) -> NDArray[np.int64]:
@@ -351,6 +375,20 @@ def _find_updates(poses: Array) -> NDArray[np.int64]:
         return np.arange(n)
     standstill_ends = last[last - first + 1 > 2 * rows_per_update]
     return np.unique(np.concatenate([first, standstill_ends, [n - 1]]))
+
+
+def _time_warnings(table: Table, time_ns: NDArray[np.int64]) -> list[str]:
+    """Warn of gaps in which the clock jumped, or the robot was switched off."""
+    steps_s = np.diff(time_ns) * 1e-9
+    gaps = np.flatnonzero(steps_s > MAX_GAP_S)
+    if not len(gaps):
+        return []
+    first = int(gaps[0])
+    more = f", and {len(gaps) - 1} more such gaps" if len(gaps) > 1 else ""
+    return [
+        f"{table.file}:{table.lines[first + 1]}: {steps_s[first]:.6g} s after the previous row"
+        f"{more}: check the clock; the path in between is unknown"
+    ]
 
 
 def _odometry_warnings(odometry: Trajectory) -> list[str]:

@@ -29,6 +29,7 @@ from locatk.core.landmarks.landmark import CODE_COUNT, code_of
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
 from locatk.core.units import metres
+from locatk.formats.tables.numbers import parse_number
 
 HEADER = ("No", "Code", "X mm", "Y mm", "Attr1", "Attr2", "Attr3", "Attr4")
 
@@ -46,6 +47,7 @@ def loads_csv(
     file: str | os.PathLike[str],
     pitch_m: float | None = None,
     tolerance_m: float = MAX_OFFSET_M,
+    warnings: list[str] | None = None,
 ) -> FloorMap:
     """Parse a table; pitch and cells are estimated from the positions.
 
@@ -59,11 +61,14 @@ def loads_csv(
         Name in errors.
     pitch_m, tolerance_m
         See :func:`locatk.core.landmarks.map.grid_fit.fit_grid`.
+    warnings : list of str, optional
+        A warning about landmarks without a heading is appended.
 
     Raises
     ------
     FormatError
-        It is not such a table; the error names the line and the column.
+        It is not such a table, a number of ``No`` repeats, or a row is shorter than the first; the
+        error names the line and the column.
     InputError
         The positions are not on a grid; the error names the line of a deviating one.
     """
@@ -71,6 +76,7 @@ def loads_csv(
     poses: list[tuple[float, float, float]] = []
     names: list[str] = []
     columns = {name: index for index, name in enumerate(HEADER)}
+    width, line_of_number, without_heading = 0, dict[str, int](), list[int]()
     rows = csv.reader(io.StringIO(text.removeprefix("\ufeff")), delimiter=";")
     try:
         for row in rows:
@@ -78,10 +84,19 @@ def loads_csv(
             if not any(cells):
                 continue
             if not codes and not _is_number(cells[0]):
-                columns = _header(cells, file, rows.line_num)
+                columns, width = _header(cells, file, rows.line_num), len(cells)
                 continue
             line = _Line(cells, columns, file, rows.line_num)
+            width = width or len(cells)
+            if len(cells) < width:
+                raise line.error(f"{len(cells)} cells in a row of {width}")
+            number = line.text("No")
+            first_line = line_of_number.setdefault(number, rows.line_num)
+            if number and first_line != rows.line_num:
+                raise line.error(f"No {number} is also in line {first_line}")
             codes.append(line.code())
+            if not line.text("Attr1"):
+                without_heading.append(rows.line_num)
             # The heading of a start transponder is that of the vehicles.
             is_start = line.number("Attr4", 0) == 1
             heading = 0.0 if is_start else line.number("Attr1", MAX_HEADING_CENTIDEGREES)
@@ -93,6 +108,11 @@ def loads_csv(
     if not codes:
         raise FormatError(
             "no landmarks", file=file, hint=f"Give lines as in {';'.join(HEADER[:4])}"
+        )
+    if without_heading and warnings is not None:
+        warnings.append(
+            f"{file}:{without_heading[0]}: {len(without_heading)} of {len(codes)} landmarks have "
+            "no heading (Attr1): imported as designed"
         )
     with error_context(file):
         return floor_from_poses(codes, poses, names, pitch_m=pitch_m, tolerance_m=tolerance_m)
@@ -110,51 +130,58 @@ class _Line:
     ) -> None:
         self._cells, self._columns, self._file, self._number = cells, columns, file, number
 
+    def text(self, name: str) -> str:
+        """Return a cell; empty if its column is missing."""
+        index = self._columns.get(name, len(self._cells))
+        return self._cells[index] if index < len(self._cells) else ""
+
     def number(self, name: str, max_abs: float) -> float:
         """Return a number of at most ``max_abs`` in size; 0 for a missing attribute."""
-        index = self._columns.get(name, len(self._cells))
-        text = self._cells[index].replace(",", ".") if index < len(self._cells) else ""
+        text = self.text(name).replace(",", ".")
         if not text and name.startswith("Attr"):
             return 0.0
-        value = float(text) if _is_number(text) else math.nan
+        value = parse_number(text) if _is_number(text) else math.nan
         if name == "Attr4":
             return value
         if not abs(value) <= max_abs:
-            raise self._error(f"{text!r} under {name!r}, expected a number up to {max_abs:g}")
+            raise self.error(f"{text!r} under {name!r}, expected a number up to {max_abs:g}")
         return value
 
     def code(self) -> int:
         """Return the code of the landmark, by its letters if they have a column."""
         name = LETTERS_COLUMN if LETTERS_COLUMN in self._columns else "Code"
-        index = self._columns[name]
-        text = self._cells[index] if index < len(self._cells) else ""
+        text = self.text(name)
         if name == LETTERS_COLUMN:
             try:
                 return code_of(text)
             except ValueError:
                 expected = "the letters of the bars of a landmark, as in NNSN"
-                raise self._error(f"{text!r} under {name!r}, expected {expected}") from None
+                raise self.error(f"{text!r} under {name!r}, expected {expected}") from None
         is_whole = text.isascii() and text.isdigit() and len(text) < 10
         if not (is_whole and int(text) < CODE_COUNT):
-            raise self._error(
+            raise self.error(
                 f"{text!r} under {name!r}, expected a whole number from 0 to {CODE_COUNT - 1}, the "
                 f"code of a landmark, or a column {LETTERS_COLUMN!r}"
             )
         return int(text)
 
-    def _error(self, message: str) -> FormatError:
+    def error(self, message: str) -> FormatError:
         return FormatError(message, file=self._file, where=self._number)
 
 
 def _header(cells: list[str], file: str | os.PathLike[str], line: int) -> dict[str, int]:
     """Return the columns by name; case and unit are ignored."""
     bare = [cell.lower().translate(str.maketrans("", "", "[]()")) for cell in cells]
-    plain = {cell.removesuffix("mm").strip(): number for number, cell in enumerate(bare)}
+    keys = [cell.removesuffix("mm").strip() for cell in bare]
+    plain = {key: number for number, key in enumerate(keys)}
     columns = {
         name: plain[key]
         for name in (*HEADER, LETTERS_COLUMN)
         if (key := name.lower().removesuffix("mm").strip()) in plain
     }
+    repeated = [name for name, number in columns.items() if keys.count(keys[number]) > 1]
+    if repeated:
+        raise FormatError(f"column {repeated[0]!r} occurs twice", file=file, where=line)
     missing = [name for name in ("Code", "X mm", "Y mm") if name not in columns]
     if LETTERS_COLUMN in columns and "Code" in missing:
         missing.remove("Code")
@@ -170,6 +197,6 @@ def _header(cells: list[str], file: str | os.PathLike[str], line: int) -> dict[s
 
 def _is_number(text: str) -> bool:
     try:
-        return math.isfinite(float(text.replace(",", ".")))
+        return math.isfinite(parse_number(text.replace(",", ".")))
     except ValueError:
         return False

@@ -49,6 +49,12 @@ PUBLISHED_TAGS = Tags(
 MAX_RATE_DIFFERENCE_FRACTION = 0.05
 """Largest relative difference of the rate by the stamps from the stated one without a warning."""
 
+MAX_GAP_STEPS = 10.0
+"""Smallest difference of two stamps, in usual steps, that shows missing rows.
+
+Rows are written late by a busy computer, but not by ten periods (0.25 s at 40 Hz).
+"""
+
 MAX_STAMP_S = 2**62 * 1e-9
 """Largest start of a recording; differences of two times in nanoseconds fit into int64."""
 
@@ -156,7 +162,16 @@ def _sensor_settings(rate_hz: float, warnings: list[str]) -> mlx90393.Settings:
 
 def _sensor_columns(table: Table) -> list[str]:
     """Return the names of the columns of sensor 1, 2, ..."""
-    columns = {int(m[1]): name for name in table.columns if (m := _SENSOR_NAME.fullmatch(name))}
+    columns: dict[int, str] = {}
+    for name in table.columns:
+        match = _SENSOR_NAME.fullmatch(name)
+        if match and columns.setdefault(int(match[1]), name) != name:
+            raise FormatError(
+                f"columns {columns[int(match[1])]!r} and {name!r} are of one sensor",
+                file=table.file,
+                where=1,
+                hint="Rename or delete one",
+            )
     if not columns:
         raise FormatError(
             "columns of sensors are missing",
@@ -232,6 +247,14 @@ def _times(table: Table, rate_hz: float, warnings: list[str]) -> NDArray[np.int6
         if (steps < 0).any():
             row = int(np.argmax(steps < 0)) + 1
             table.fail(row, "the time stamp goes backwards", "Sort the rows by time")
+        usual = np.median(steps[steps > 0]) if (steps > 0).any() else math.inf
+        gaps = np.flatnonzero(steps > MAX_GAP_STEPS * usual)
+        if len(gaps):
+            warnings.append(
+                f"{table.file}:{table.lines[gaps[0] + 1]}: the time stamp is {MAX_GAP_STEPS:g} or "
+                f"more usual steps after the previous one, in {len(gaps)} row"
+                f"{'s' * (len(gaps) > 1)}: samples are missing, and all later times are too early"
+            )
     return start_ns + np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
 
 

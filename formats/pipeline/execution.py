@@ -139,6 +139,26 @@ def run_jobs(
         Index of the job, each once, and its result: :class:`LostJob` if its worker died
         repeatedly, if the cluster gave it up, or if ``function`` raised.
     """
+    unfinished: set[int] = set()
+    try:
+        with contextlib.closing(_run_jobs(function, jobs, pool, clean, unfinished)) as results:
+            for index, result in results:
+                unfinished.discard(index)
+                yield index, result
+    except BaseException:
+        for index in unfinished:
+            clean(jobs[index])
+        raise
+
+
+def _run_jobs(
+    function: Callable[[Job], Any],
+    jobs: Sequence[Job],
+    pool: Pool,
+    clean: Callable[[Job], None],
+    submitted: set[int],
+) -> Generator[tuple[int, Any], None, None]:
+    """Run jobs as :func:`run_jobs`, and add the index of each to ``submitted`` before it runs."""
     queue = deque(range(len(jobs)))
     suspects: deque[int] = deque()
     deaths: Counter[int] = Counter()
@@ -151,6 +171,7 @@ def run_jobs(
             with pool.open(width) as executor:
                 while source or running:
                     while source and len(running) < width:
+                        submitted.add(source[0])
                         running[_submit(executor, function, jobs[source[0]])] = source[0]
                         source.popleft()
                     done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -182,10 +203,6 @@ def run_jobs(
                     yield index, LostJob(f"its process died {MAX_DEATHS} times")
                     continue
             suspects.extendleft(reversed(interrupted))
-        except BaseException:
-            for index in running.values():
-                clean(jobs[index])
-            raise
 
 
 def _submit(executor: Executor, function: Callable[[Job], Any], job: Job) -> Future[Any]:
@@ -194,6 +211,30 @@ def _submit(executor: Executor, function: Callable[[Job], Any], job: Job) -> Fut
         return executor.submit(function, job)
     except (EOFError, OSError) as error:  # The fork server died, or processes are limited.
         raise _BrokenPool(short_reason(error)) from error
+
+
+@contextlib.contextmanager
+def _deferred_interrupts() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM take effect at the end of the block.
+
+    A start of a worker that an exception interrupts leaves a process that the executor does not
+    know, so that nothing ends it before it writes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received: list[int] = []
+    previous = {
+        number: signal.signal(number, lambda number, frame: received.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+        if received:
+            signal.raise_signal(received[0])
 
 
 def in_order(results: Iterator[tuple[int, Any]]) -> Iterator[tuple[int, list[Any]]]:
@@ -267,6 +308,14 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+class _ProcessExecutor(ProcessPoolExecutor):
+    """Executor whose start of a worker is not interrupted."""
+
+    def submit(self, function: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        with _deferred_interrupts():
+            return super().submit(function, *args, **kwargs)
+
+
 @contextlib.contextmanager
 def _open_processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
     # A plain fork would copy locks that threads of libraries hold.
@@ -284,7 +333,7 @@ def _open_processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
     with _changed_environment({**SINGLE_THREAD_ENVIRONMENT, "PYTHONWARNINGS": warning_filters}):
         if has_forkserver:
             _start_forkserver()
-        executor = ProcessPoolExecutor(
+        executor = _ProcessExecutor(
             width,
             mp_context=context,
             initializer=_initialize_worker,
@@ -292,13 +341,12 @@ def _open_processes(width: int, preload: tuple[str, ...]) -> Iterator[Executor]:
         )
         try:
             yield executor
-        except BaseException as error:
+        except BaseException:
             for worker in list((executor._processes or {}).values()):
                 worker.kill()
-            if has_forkserver and not isinstance(error, Exception):
-                _kill_forkserver()
             raise
         finally:
+            # Until its workers have ended, which the fork server reports, their outputs are locked.
             executor.shutdown(cancel_futures=True)
 
 
@@ -314,14 +362,6 @@ def _start_forkserver() -> None:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous)
-
-
-def _kill_forkserver() -> None:
-    """Kill the fork server: workers that it still starts would not find shared resources."""
-    pid = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
-    if pid is not None:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
 
 
 def _initialize_worker(environment: Mapping[str, str]) -> None:

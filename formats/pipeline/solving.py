@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.errors import InputError, LocatkError, OutputExistsError
+from locatk.core.printable import is_one_line
 from locatk.core.solution import Solution
 from locatk.formats.artifacts import scene as scene_files
 from locatk.formats.pipeline import execution, file_access, file_names, provenance
@@ -26,6 +27,7 @@ from locatk.formats.pipeline.outcome import (
     summarize,
 )
 from locatk.formats.pipeline.systems import SolveRequest, solve_session
+from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import write_solution
 
 
@@ -200,10 +202,13 @@ def _run_steps(
     for location in (job.session, job.output):
         if not file_names.is_utf8(location):
             raise InputError("the file name is not UTF-8", file=location, hint="Rename the file")
+        if not is_one_line(location):
+            raise InputError("a line end in the file name", file=location, hint="Rename the file")
     scratch = job.scratch or execution.worker_folder()
     path = stack.enter_context(file_access.local(job.source, scratch))
     user_names[str(path)] = job.session
     request = _unpack_files(job, scratch, stack, user_names)
+    Session.open(path)  # A damaged file is refused before all of its bytes are read.
     facts = {**provenance.source_facts(path), "options_sha256": job.options_sha256}
 
     def existing_solution() -> tuple[Solution | None, bool]:

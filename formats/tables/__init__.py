@@ -2,6 +2,7 @@
 
 =================  ===============================================================================
 ``delimited``      text to cells and numbers; errors name file, line and column
+``numbers``        plain decimal numbers
 ``quantities``     names of columns to quantities and SI units: ``x_mm``, ``heading [deg]``
 ``timestamps``     epoch seconds and ISO 8601 times to nanoseconds, exactly
 =================  ===============================================================================

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
 from locatk.formats.files import MAX_FILE_BYTES, read_text
+from locatk.formats.tables.numbers import parse_number
 from locatk.formats.tables.timestamps import (
     parse_decimal_time,
     parse_decimal_times,
@@ -134,9 +135,9 @@ class Table:
                 missing = np.array([cell.strip().lower() in ("", "nan") for cell in cells], bool)
                 cells = ["nan" if gone else cell for gone, cell in zip(missing, cells, strict=True)]
             try:
-                values = np.fromiter(map(float, cells), np.float64, len(cells))
+                values = np.fromiter(map(parse_number, cells), np.float64, len(cells))
             except ValueError:
-                row = _first_failing(float, cells)
+                row = _first_failing(parse_number, cells)
                 cell = cells[row]
                 problem = f"{_quoted(cell)} instead of a number" if cell.strip() else "empty cell"
                 self.fail(row, f"{problem} in column {name!r}", CORRECT_ROW_HINT)

@@ -12,6 +12,8 @@ from decimal import Decimal, InvalidOperation
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.formats.tables.numbers import plain_number
+
 Times = NDArray[np.int64]
 
 NANOSECONDS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -60,11 +62,11 @@ def parse_decimal_time(text: str, unit: str = "s") -> int:
         time_ns = -time_ns if match[1] else time_ns
     else:
         try:
-            number = Decimal(text.strip())
+            number = Decimal(plain_number(text).strip())
             if not number.is_finite() or number.adjusted() > MAX_DIGITS:
                 raise ValueError(f"{text!r} is not a time")
             time_ns = int((number * NANOSECONDS[unit]).to_integral_value())
-        except InvalidOperation:
+        except (InvalidOperation, ValueError):
             raise ValueError(f"{text!r} is not a time") from None
     if not -(2**63) <= time_ns < 2**63:
         raise ValueError(f"{text!r} is outside of the range of time stamps")
@@ -82,8 +84,8 @@ def parse_decimal_times(cells: Sequence[str]) -> Times:
     times = None
     try:
         texts = np.array(cells, "S")
-    except UnicodeEncodeError:  # decimal digits of another script, which Python reads as well
-        texts = None
+    except UnicodeEncodeError:
+        texts = None  # parse_decimal_time refuses it
     if "\0" in "".join(cells):  # numpy drops zeros at the end of a text
         texts = None
     if texts is not None and texts.size and 0 < texts.itemsize <= MAX_DIGITS + 2:

@@ -322,6 +322,33 @@ def test_results_are_written_without_standard_streams(
     assert len(output.read_text().splitlines()) == 20
 
 
+@pytest.mark.parametrize("number", ["nan", "inf", "1e999"])
+def test_options_are_finite(locatk: Run, tmp_path: Path, number: str) -> None:
+    (tmp_path / "frame.png").write_bytes(b"")
+    result = locatk("import", "images", tmp_path, "--rate", number, "-o", tmp_path / "run.mcap")
+    assert result.exit_code == 2
+    assert "Invalid value for '--rate'" in result.stderr
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\u2028"])
+def test_names_with_line_ends_are_refused(
+    locatk: Run, session: Path, tmp_path: Path, end: str
+) -> None:
+    odd = tmp_path / f"a{end}b.mcap"
+    odd.write_bytes(session.read_bytes())
+    output = tmp_path / f"c{end}d.tum"
+    for args, status, words in (
+        (("info", odd), 2, "has a line end in its name"),
+        (("export", session, "--format", "tum", "-o", output), 2, "has a line end in its name"),
+        (("solve", odd, "-o", tmp_path / "out.mcap"), 1, "a line end in the file name"),
+    ):
+        result = locatk(*args)
+        assert result.exit_code == status
+        assert words in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+    assert sorted(tmp_path.glob("*.tum")) == []
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
 def test_a_result_that_cannot_be_printed_is_an_error(session: Path) -> None:

@@ -56,6 +56,9 @@ ASSUMED_CHANNEL = 1
 MAX_LINE_BYTES = 16384
 """Longer lines are not records: one with 16 windows has about 1,500 bytes."""
 
+MAX_SKIPPED_LINE_BYTES = 64 << 20
+"""Longest line that is skipped; a power cut leaves shorter ones, of zeros."""
+
 MAX_NAME_CHARACTERS = 64
 
 MAX_WINDOWS_PER_RECORD = 16
@@ -237,8 +240,16 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
         while line := stream.readline(MAX_LINE_BYTES):
             number += 1
             if len(line) == MAX_LINE_BYTES and not line.endswith(b"\n"):
+                start = stream.tell()
                 while line and not line.endswith(b"\n"):
                     line = stream.readline(MAX_LINE_BYTES)
+                    if stream.tell() - start > MAX_SKIPPED_LINE_BYTES:
+                        raise FormatError(
+                            f"a line of more than {MAX_SKIPPED_LINE_BYTES >> 20} MiB",
+                            file=path,
+                            where=number,
+                            hint=LOG_HINT,
+                        )
                 line = b"\n"
             yield number, line
 

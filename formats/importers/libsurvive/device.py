@@ -28,6 +28,7 @@ from locatk.core.geometry import matrix_from_quaternion, rigid_inverse, se3, tra
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.formats.files import read_bytes
+from locatk.formats.tables.numbers import parse_number
 
 Array = NDArray[np.float64]
 
@@ -214,7 +215,7 @@ def read_stored_calibrations(path: Path) -> dict[int, Calibration]:
 
 def _pair(text: str) -> tuple[float, float]:
     """Return the values of both planes."""
-    values = [float(part.strip().strip('"')) for part in text.split(",")]
+    values = [parse_number(part.strip().strip('"')) for part in text.split(",")]
     if len(values) != 2 or not np.all(np.isfinite(values)):
         raise ValueError(text)
     return values[0], values[1]

@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError
 from locatk.formats.files import open_binary
+from locatk.formats.tables.numbers import parse_number
 
 MAX_BYTES = 1 << 29
 MAX_LINES = 1 << 24
@@ -347,7 +348,8 @@ class ColumnCollector:
             name, kind, rest = b"", name, kind + rest
         if kind in _POSES:
             try:
-                values = tuple(map(float, (time, *rest.split()[:7])))
+                words = (time + b" " + rest).decode("latin-1").split()[:8]
+                values = tuple(map(parse_number, words))
             except ValueError:
                 values = ()
             if (

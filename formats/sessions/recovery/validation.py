@@ -10,6 +10,7 @@ Specification: https://mcap.dev/spec
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 import zlib
@@ -242,10 +243,33 @@ class DamagedFile:
 
     def is_zero(self, start: int, end: int) -> bool:
         """Return whether all bytes from ``start`` to ``end`` are zero."""
-        return not any(
-            self.read(offset, min(BLOCK_BYTES, end - offset)).strip(b"\0")
-            for offset in range(start, end, BLOCK_BYTES)
-        )
+        offset = self._skip_hole(start)
+        while offset < end:
+            if self.read(offset, min(BLOCK_BYTES, end - offset)).strip(b"\0"):
+                return False
+            offset = self._skip_hole(offset + BLOCK_BYTES)
+        return True
+
+    def _skip_hole(self, offset: int) -> int:
+        """Return the first position from ``offset`` on that is not in a hole of the file.
+
+        A hole is a range that was never written, of zeros. It takes no space on the disk, so that
+        it may be larger than what can be read (lseek(2), SEEK_DATA).
+        """
+        try:
+            descriptor = self._stream.fileno()
+            position = os.lseek(descriptor, 0, os.SEEK_CUR)
+        except OSError:  # bytes in memory
+            return offset
+        try:
+            return os.lseek(descriptor, offset, os.SEEK_DATA)
+        except AttributeError:  # not on Windows
+            return offset
+        except OSError as error:
+            return self.size if error.errno == errno.ENXIO else offset
+        finally:
+            # The buffer of the stream continues where it ended.
+            os.lseek(descriptor, position, os.SEEK_SET)
 
     # ---- search for the next record after damage
 
@@ -254,14 +278,14 @@ class DamagedFile:
 
         Returns ``limit`` if there is none before it.
         """
-        offset, length = start, FIRST_BLOCK_BYTES
+        offset, length = self._skip_hole(start), FIRST_BLOCK_BYTES
         while offset < limit:
             length = min(length, limit - offset)
             block = self.read(offset, length + RECORD_HEAD.size - 1)
             for position in self._candidates(block, offset, kinds):
                 if self._is_acceptable(position, kinds):
                     return position
-            offset, length = offset + length, BLOCK_BYTES
+            offset, length = self._skip_hole(offset + length), BLOCK_BYTES
         return limit
 
     def _candidates(self, block: bytes, offset: int, kinds: Collection[Opcode]) -> Iterator[int]:

@@ -158,6 +158,9 @@ def test_json_of_an_import(locatk, tmp_path: Path) -> None:
     assert answer["pitch_m"] == 0.15
     assert (answer["rows"], answer["columns"], answer["landmarks"]) == (2, 2, 4)
     assert answer["largest_offset_m"] == pytest.approx(1e-3)
+    (warning,) = answer["warnings"]
+    assert f"{table}:1: 4 of 4 landmarks have no heading" in warning
+    assert warning in result.stderr
     assert read_map(out).window == "2x2"
 
 

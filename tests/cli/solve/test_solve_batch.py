@@ -130,6 +130,31 @@ def temporary(folder: Path) -> list[Path]:
     return sorted(folder.glob("locatk-*"))
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+@pytest.mark.parametrize("is_pipe", [True, False], ids=["pipe without reader", "full disk"])
+def test_a_batch_is_solved_without_a_reader_of_its_results(
+    day: Callable[..., list[Path]], tmp_path: Path, is_pipe: bool
+) -> None:
+    sessions = day("a", "b", "c")
+    with open("/dev/full", "wb") as full:
+        process = subprocess.Popen(
+            command("solve", *sessions, "-o", tmp_path / "out"),
+            stdout=subprocess.PIPE if is_pipe else full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    if is_pipe:
+        assert process.stdout is not None
+        process.stdout.close()
+    _, messages = process.communicate()
+    assert process.returncode == 1
+    assert sorted(contents(tmp_path / "out")) == ["a.mcap", "b.mcap", "c.mcap"]
+    problem = "Error: the standard output cannot be written (No space left on device). Hint: "
+    errors = [line for line in messages.splitlines() if not line.startswith(("a", "b", "c"))]
+    assert [line[: len(problem)] for line in errors] == ([] if is_pipe else [problem])
+
+
 def test_folders_patterns_and_files(
     locatk: Run, day: Callable[..., list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

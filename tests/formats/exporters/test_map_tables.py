@@ -171,7 +171,7 @@ def test_tables_of_other_programs() -> None:
         ("x,y\n1,2\n", 1, "no column 'Code'"),
         ("0;16;0;0\n", 1, "'16' under 'Code', expected a whole number from 0 to 15"),
         ("0;1;0;0\n1;;200;0\n", 2, "'' under 'Code'"),
-        ("No;Code;X;Y;Landmark\n0;1;0;0;NNNS\n1;2;200;0\n", 3, "'' under 'Landmark'"),
+        ("No;Code;X;Y;Landmark\n0;1;0;0;NNNS\n1;2;200;0;\n", 3, "'' under 'Landmark'"),
         ("No;Code;X;Y;Landmark\n0;1;0;0;NNNX\n", 2, "'NNNX' under 'Landmark', expected the let"),
         ("0;1.0;0;0\n", 1, "'1.0' under 'Code'"),
         ("0;1;0;0\n1;1;2 m;0\n", 2, "'2 m' under 'X mm', expected a number"),
@@ -182,6 +182,10 @@ def test_tables_of_other_programs() -> None:
         ("0;1;0;0\n", None, "one position does not give a pitch"),
         ("0;1;0;0\n1;1;200;0\n2;1;400.1;1\n3;1;402;1\n", None, "line 3 and line 4 are in one cell"),
         ("0;1;0;0\n1;1;200;0\n2;1;311;0\n", None, "on no grid"),
+        ("0;1;0;0\n1;1;200;0\n0;1;400;0\n", 3, "No 0 is also in line 1"),
+        ("0;1;0;0;0\n1;1;200;0\n", 2, "4 cells in a row of 5"),
+        ("No;Code;X;Y;X mm\n0;1;0;0;0\n", 1, "column 'X mm' occurs twice"),
+        ("0;1;0;0\n1;1;2_00;0\n", 2, "'2_00' under 'X mm', expected a number"),
     ],
 )
 def test_errors_of_a_table_name_the_line(text: str, where: int | None, words: str) -> None:
@@ -189,6 +193,17 @@ def test_errors_of_a_table_name_the_line(text: str, where: int | None, words: st
         loads_csv(text, file="map.csv")
     assert words in caught.value.message
     assert (caught.value.file, caught.value.where) == ("map.csv", where)
+
+
+def test_landmarks_without_a_heading_are_warned_of() -> None:
+    for text, expected in (
+        ("0;1;0;0;0\n1;1;200;0;5\n", []),
+        ("0;1;0;0\n1;1;200;0\n", ["map.csv:1: 2 of 2 landmarks have no heading (Attr1)"]),
+        ("0;1;0;0;0\n1;1;200;0;\n", ["map.csv:2: 1 of 2 landmarks have no heading (Attr1)"]),
+    ):
+        warnings: list[str] = []
+        loads_csv(text, file="map.csv", warnings=warnings)
+        assert [warning.partition(": imported")[0] for warning in warnings] == (expected)
 
 
 def is_map_or_error(load: Callable[[], object]) -> bool:

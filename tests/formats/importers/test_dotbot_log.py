@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, LocatkError, MissingDataError
 from locatk.core.lighthouse import lfsr
+from locatk.formats.importers.dotbot import log
 from locatk.formats.importers.dotbot.log import read_dotbot_log
 from locatk.formats.importers.imported_session import ImportedSession
 
@@ -285,6 +286,16 @@ WHOLE = (
     + CONSOLE
     + JSON
 ).encode()
+
+
+def test_a_line_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log, "MAX_SKIPPED_LINE_BYTES", 1 << 20)
+    path = tmp_path / "zeros.log"
+    path.write_bytes(WHOLE + bytes(1 << 19) + b"\n" + WHOLE)
+    assert len(read_dotbot_log([path]).sweeps)
+    path.write_bytes(WHOLE + bytes(1 << 21))
+    with pytest.raises(FormatError, match="a line of more than 1 MiB"):
+        read_dotbot_log([path])
 
 
 @pytest.mark.slow

@@ -195,8 +195,9 @@ def test_odometry_may_be_slower_than_the_sensors(tmp_path: Path) -> None:
     gone[(12, 1)] = "NaN"
     found = read(write(tmp_path / "run.csv", rows, cells=gone))
     (warning,) = found.warnings
-    assert "2 poses of odometry are incomplete" in warning
-    assert "line 7 without x ('x_mm')" in warning
+    assert "run.csv:7: odometry is incomplete in 2 rows" in warning
+    assert found.left_out_poses == 2
+    assert found.lost == "2 poses of odometry are excluded"
     assert len(found.odometry) == 9
     assert np.isfinite(found.odometry.position).all()
 
@@ -291,13 +292,40 @@ def test_what_could_mean_two_things_is_refused(
         ({(3, 0): "1e300"}, r"run\.csv:5: 1e300 in column 't_s' should be"),
         ({(3, 1): "far"}, r"run\.csv:5: 'far' instead of a number in column 'x_mm'"),
         ({(3, 5): "inf"}, r"run\.csv:5: inf in column 'left_mt' should be a finite"),
-        ({(n, c): "" for n in range(60) for c in (1, 2, 3)}, "no odometry"),
+        ({(3, 1): "1_000"}, r"run\.csv:5: '1_000' instead of a number in column 'x_mm'"),
+        ({(3, 0): "\u0663"}, r"run\.csv:5: .* instead of a number in column 't_s'"),
+        ({(3, 5): "1e30"}, r"run\.csv:5: a field beyond 10 T"),
+        ({(3, 5): "1e300"}, r"run\.csv:5: a field beyond 10 T"),
+        ({(n, c): "" for n in range(60) for c in (1, 2, 3)}, "no odometry: 0 of 60 rows"),
+        ({(n, c): "" for n in range(1, 60) for c in (1, 2, 3)}, "no odometry: 1 of 60 rows"),
     ],
 )
 def test_bad_cells_are_named(tmp_path: Path, cells: dict[tuple[int, int], str], words: str) -> None:
     path = write(tmp_path / "run.csv", cells=cells)
     with pytest.raises(InputError, match=words):
         read(path)
+
+
+def test_a_single_row_of_zeros_is_too_short_a_path(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="1 of 1 rows have x, y and heading, not two"):
+        read(write(tmp_path / "run.csv", np.zeros((1, 8))))
+
+
+def test_a_jump_of_the_clock_is_warned_of(tmp_path: Path) -> None:
+    rows = drive(60)
+    rows[:, 0] *= 100  # 1 s between rows is no jump
+    assert read(write(tmp_path / "run.csv", rows)).warnings == []
+    rows[59, 0] = 1e9
+    (warning,) = read(write(tmp_path / "run.csv", rows)).warnings
+    assert "run.csv:61: 1e+09 s after the previous row" in warning
+
+
+def test_volts_beyond_any_field_are_refused(tmp_path: Path) -> None:
+    rows = drive()
+    rows[:, 4:] = 2.5 + rows[:, 4:]
+    path = write(tmp_path / "run.csv", rows, (*HEADER[:4], *NAMES), cells={(3, 5): "2.5e9"})
+    with pytest.raises(InputError, match=r"run\.csv:5: a field beyond 10 T"):
+        read(path, units=("mv",), volts=Volts((13.0,), (2.5,)))
 
 
 def test_files_that_are_no_table(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from locatk.formats.importers.polaris_csv import (
 )
 
 NOISE = np.random.default_rng(5)
+COLUMNS_OF_TWO = ("Sensor 1", "Sensor 2", "Sensor2")
 
 
 def write(
@@ -50,6 +51,21 @@ def noise(n: int = 40, sensors: int = 3) -> np.ndarray:
 
 def read(path: Path, rate: float = 40.0) -> ImportedSamples:
     return read_polaris(path, rate_hz=rate, spacing_m=0.02)
+
+
+def test_two_columns_of_one_sensor_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "raw.csv", noise(), header=["", "Time Stamp", *COLUMNS_OF_TWO])
+    with pytest.raises(FormatError, match="columns 'sensor 2' and 'sensor2' are of one sensor"):
+        read(path)
+
+
+def test_gaps_of_the_stamps_are_warned_of(tmp_path: Path) -> None:
+    values = noise(40)
+    for jump, expected in ((9, 0), (11, 1)):
+        stamps = [str(row / 100 + (row >= 30) * jump / 100) for row in range(40)]
+        warnings = read(write(tmp_path / "raw.csv", values, stamps=stamps)).warnings
+        assert len(warnings) == expected
+    assert "raw.csv:32: the time stamp is 10 or more usual steps" in warnings[0]
 
 
 @pytest.mark.slow

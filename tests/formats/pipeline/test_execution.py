@@ -6,8 +6,9 @@ import importlib
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from multiprocessing import forkserver
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from locatk.formats.output import remove_stale_parts
 from locatk.formats.pipeline import execution
 from locatk.formats.pipeline.execution import (
     MAX_FAILED_STARTS,
@@ -42,6 +44,13 @@ def work(job):
         raise ValueError("no good")
     if how == "late":
         time.sleep(0.3)
+    if how == "write":
+        from locatk.formats.output import atomic_write
+
+        # The system frees the memory of a killed process before it releases its locks.
+        memory = b"x" * (256 << 20)
+        with atomic_write(folder / "output"):
+            time.sleep(60)
     return number * number
 
 def environment(name):
@@ -171,3 +180,74 @@ def test_a_killed_fork_server_loses_no_job(module: ModuleType, tmp_path: Path) -
     found = [next(results)]
     os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)  # type: ignore[attr-defined]
     assert dict([*found, *results]) == {n: n * n for n in range(4)}
+
+
+@pytest.mark.slow
+def test_files_of_workers_that_end_slowly_are_removed(module: ModuleType, tmp_path: Path) -> None:
+    def clean(job: Any) -> None:
+        remove_stale_parts(tmp_path / "output")
+
+    jobs = [(tmp_path, 0, ""), (tmp_path, 1, "write")]
+    results = run_jobs(module.work, jobs, processes(2), clean=clean)
+    assert next(results) == (0, 0)
+    deadline = time.monotonic() + 20
+    while not list(tmp_path.glob(".output.*")):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    results.close()
+    assert list(tmp_path.glob(".output.*")) == []
+
+
+def interrupt(job: int) -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def test_a_job_in_this_process_is_interrupted() -> None:
+    cleaned: list[int] = []
+    done: list[int] = []
+
+    def work(job: int) -> None:
+        interrupt(job)
+        done.append(job)
+
+    with pytest.raises(KeyboardInterrupt):
+        list(run_jobs(work, [7, 8], this_process(), clean=cleaned.append))
+    assert (done, cleaned) == ([], [7])
+
+
+def test_the_start_of_a_worker_is_not_interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[int] = []
+
+    def start(executor: Any) -> None:
+        interrupt(0)
+        started.append(0)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "_start_executor_manager_thread", start)
+    monkeypatch.setattr(ProcessPoolExecutor, "_adjust_process_count", lambda executor: None)
+    cleaned: list[int] = []
+    with pytest.raises(KeyboardInterrupt):
+        list(run_jobs(abs, [7, 8], processes(2), clean=cleaned.append))
+    assert (started, cleaned) == ([0], [7])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+class _DyingExecutor(Executor):
+    """Executor whose worker dies with each job."""
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_exception(BrokenExecutor())
+        return future
+
+
+def test_an_interrupt_after_the_death_of_a_worker_leaves_no_files() -> None:
+    cleaned: list[int] = []
+
+    def clean(job: int) -> None:
+        cleaned.append(job)
+        if len(cleaned) == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(run_jobs(abs, [7, 8], Pool(lambda width: _DyingExecutor(), 2), clean=clean))
+    assert sorted(cleaned[1:]) == [7, 8]

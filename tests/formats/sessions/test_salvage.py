@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -50,6 +51,34 @@ def file(
 
 def attach(name: str, data: bytes) -> Write:
     return lambda writer, number: writer.add_attachment(number, number, name, "text/plain", data)
+
+
+@pytest.mark.skipif(not hasattr(os, "SEEK_DATA"), reason="holes of Linux and macOS")
+def test_holes_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hole has no blocks on the disk, and may be larger than what can be read."""
+    sparse, content, size = tmp_path / "sparse.mcap", file(), 1 << 36
+    with open(sparse, "wb") as stream:
+        stream.write(content)
+        stream.seek(size)
+        stream.write(content)
+    if sparse.stat().st_blocks * 512 > size // 2:
+        pytest.skip("a file system without holes")
+    count, read = 0, validation.DamagedFile.read
+
+    def counted(source: validation.DamagedFile, offset: int, length: int) -> bytes:
+        nonlocal count
+        data = read(source, offset, length)
+        count += len(data)
+        assert count < 1 << 26
+        return data
+
+    monkeypatch.setattr(validation.DamagedFile, "read", counted)
+    with open(sparse, "rb") as stream:
+        found = salvage(stream)
+    (loss,) = found.losses + found.index_losses
+    assert loss.start == len(content)
+    assert size <= loss.end < size + 100
+    assert found.copies == len(salvage(BytesIO(content)).index.segments)
 
 
 def spans(data: bytes, kind: Opcode) -> list[tuple[int, int]]:

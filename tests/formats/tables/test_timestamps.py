@@ -33,7 +33,21 @@ def test_decimal_times(text: str, unit: str, time_ns: int) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "now", "nan", "inf", "1e400", "1e10", "9223372037", "1,5", "0x10", "1.2.3", "1e999999"],
+    [
+        "",
+        "now",
+        "nan",
+        "inf",
+        "1e400",
+        "1e10",
+        "9223372037",
+        "1,5",
+        "0x10",
+        "1.2.3",
+        "1e999999",
+        "1_0",
+        "\u0661",
+    ],
 )
 def test_text_that_is_not_a_time(text: str) -> None:
     with pytest.raises(ValueError, match="time"):
