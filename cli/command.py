@@ -18,6 +18,7 @@ rich-click (the least of 15 runs each); help shall open within 200 ms on slower 
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -59,6 +60,23 @@ def section(title: str, *decorators: Callable[[Any], Any]) -> Callable[[Any], An
 
 class Command(click.Command):
     """Command whose help lists its options in the sections given by :func:`section`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; fail if a number is infinite or nan, which no range excludes.
+
+        Raises
+        ------
+        click.BadParameter
+            A number is not finite.
+        """
+        rest = super().parse_args(ctx, args)
+        for parameter in self.get_params(ctx):
+            value = ctx.params.get(parameter.name or "")
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, float) and not math.isfinite(number):
+                    message = f"'{number}' is not a finite number."
+                    raise click.BadParameter(message, ctx, parameter)
+        return rest
 
     def section_of(self, parameter: click.Parameter) -> str:
         """Return the title under which the help lists a parameter."""
