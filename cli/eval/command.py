@@ -194,8 +194,7 @@ def command(
         if align == "none" and track.frame and reference.frame and track.frame != reference.frame:
             console.warn(
                 f"the poses of {device} are in the frame {track.frame!r}, its truth in "
-                f"{reference.frame!r}: errors of position are meaningless unless they are the same; "
-                "--align fits one to the other"
+                f"{reference.frame!r}: unless they are the same, errors need --align"
             )
     if unpaired:
         console.warn(f"no truth for {', '.join(unpaired)}")
