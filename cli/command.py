@@ -61,20 +61,22 @@ def section(title: str, *decorators: Callable[[Any], Any]) -> Callable[[Any], An
 class Command(click.Command):
     """Command whose help lists its options in the sections given by :func:`section`."""
 
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; numbers that are not finite are in no range, although click lets them.
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; fail if a number is infinite or nan, which no range excludes.
 
         Raises
         ------
         click.BadParameter
-            An option is ``nan`` or ``inf``.
+            A number is not finite.
         """
+        rest = super().parse_args(ctx, args)
         for parameter in self.get_params(ctx):
             value = ctx.params.get(parameter.name or "")
             for number in value if isinstance(value, tuple) else (value,):
                 if isinstance(number, float) and not math.isfinite(number):
-                    raise click.BadParameter(f"{number} is not a number.", ctx, parameter)
-        return super().invoke(ctx)
+                    message = f"'{number}' is not a finite number."
+                    raise click.BadParameter(message, ctx, parameter)
+        return rest
 
     def section_of(self, parameter: click.Parameter) -> str:
         """Return the title under which the help lists a parameter."""

@@ -100,6 +100,7 @@ def _drives(
 
     drives: list[CalibrationDrive] = []
     left_out: dict[str, str] = {}
+    measurements = recordings.Measurements()
     with recordings.iterate(sessions, "Reading") as bar:
         for path in bar:
             with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
@@ -109,6 +110,7 @@ def _drives(
                 odometry = {track.device: track for track in observations.read_odometry(session)}
                 samples = observations.read_halls(session)
                 for each in samples:
+                    measurements.add(str(path), each.time_ns, each.field_t)
                     name = str(path) if len(samples) == 1 else f"{path}: {each.device}"
                     drive = calibrate.read_drive(name, each, odometry.get(each.device), floor)
                     if isinstance(drive, str):

@@ -3,11 +3,42 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from locatk.cli import console, failures
-from locatk.core.errors import LocatkError
+from locatk.core.errors import InputError, LocatkError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+class Measurements:
+    """Measurements read so far; those that are given twice would count as independent ones."""
+
+    def __init__(self) -> None:
+        self._names: dict[bytes, str] = {}
+
+    def add(self, name: str, *arrays: np.ndarray) -> None:
+        """Add the measurements of a recording.
+
+        Raises
+        ------
+        InputError
+            They were added before: from the same file, from a copy, or from the same bytes that
+            were decoded again.
+        """
+        digest = hashlib.sha256(repr([array.shape for array in arrays]).encode())
+        for array in arrays:
+            digest.update(array.tobytes())
+        key = digest.digest()
+        if key in self._names:
+            raise InputError(
+                f"the same measurements as in {self._names[key]}", hint="Give each recording once"
+            )
+        self._names[key] = name
 
 
 @contextlib.contextmanager

@@ -14,9 +14,12 @@ from locatk.cli.command import Command, section
 from locatk.core.errors import InputError, LocatkError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from locatk.core.dots.calibration.floor import FloorRecording, FloorReport
     from locatk.core.dots.calibration.floor_frame import BuiltSheet
     from locatk.core.dots.camera import Camera
+    from locatk.core.dots.frames import Frames
     from locatk.core.dots.sheet import Manifest
     from locatk.core.trajectory import Trajectory
 
@@ -151,6 +154,7 @@ def _recordings(
     found: list[FloorRecording] = []
     tracks = [_tracks(path) for path in truth]
     left_out: dict[str, str] = {}
+    measurements = recordings.Measurements()
     for index, path in enumerate(sessions):
         with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
             session = Session.open(path)
@@ -163,6 +167,8 @@ def _recordings(
             own = camera or observations.read_camera(session)
             cameras = observations.read_frames(session)
             for frames in cameras:
+                # If the times and the first frames are equal, the others are, too.
+                measurements.add(str(path), frames.time_ns, *_first_image(frames))
                 name = str(path) if len(cameras) == 1 else f"{path}: {frames.device}"
                 true = None
                 if truth:
@@ -170,6 +176,14 @@ def _recordings(
                     true = _track_of(frames.device, tracks[file], truth[file])
                 found.append(FloorRecording(name, frames, own, true, offset))
     return found, left_out
+
+
+def _first_image(frames: Frames) -> list[np.ndarray]:
+    """Return the first image; nothing if it is damaged, because such frames are left out later."""
+    try:
+        return [frames.images[0]]
+    except InputError:
+        return []
 
 
 def _tracks(path: Path) -> list[Trajectory]:

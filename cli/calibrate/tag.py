@@ -96,6 +96,7 @@ def _passes(
     solve_options = polaris.SolveOptions(method="joint", speed_mps=speed)
     passes: list[TagPass] = []
     left_out: dict[str, str] = {}
+    measurements = recordings.Measurements()
     with recordings.iterate(sessions, "Solving") as bar:
         for path in bar:
             solution = None
@@ -104,6 +105,8 @@ def _passes(
                 if is_checked:
                     _check_same(tags, _attached(path), path)
                 samples = observations.read_magnetometers(session)
+                for each in samples:
+                    measurements.add(str(path), each.time_ns, each.field_t)
                 odometry = observations.read_odometry(session)
                 solution = polaris.solve(samples, design, solve_options, odometry=odometry)
             if solution is None:

@@ -36,6 +36,8 @@ class _Quantity(click.ParamType[float]):
             return value
         match = _NUMBER.fullmatch(value.strip())
         factor = self._units.get(match[2].lower()) if match else None
+        if match and not match[2] and float(match[1]) == 0:
+            factor = 1.0  # Zero needs no unit.
         number = math.nan if match is None or factor is None else float(match[1]) * factor
         if not 0 <= number < MAX_QUANTITY or (number == 0 and not self._can_be_zero):
             self.fail(f"{value!r} is not a {self.name}; examples: {self._example}", param, ctx)

@@ -191,6 +191,11 @@ def command(
         device = track.device
         if has_names and reference.device != device and device not in true_names:
             console.say(f"{device} is compared with {reference.device}, the only other device")
+        if align == "none" and track.frame and reference.frame and track.frame != reference.frame:
+            console.warn(
+                f"the poses of {device} are in the frame {track.frame!r}, its truth in "
+                f"{reference.frame!r}: unless they are the same, errors need --align"
+            )
     if unpaired:
         console.warn(f"no truth for {', '.join(unpaired)}")
     if match == "auto":

@@ -80,9 +80,12 @@ def _recording(file: Path) -> dict[str, Any]:
     """Describe a session, a solution, or a recording of another tool."""
     from locatk.formats.descriptions import dots, landmarks, lighthouse, polaris
     from locatk.formats.sessions import capture_record
-    from locatk.formats.sessions.reader import Session
+    from locatk.formats.sessions.reader import Session, find_damage
 
     session = Session.open(file, damaged_ok=True)
+    # Not all chunks of a file are read to describe it, for example those of the poses.
+    if session.damage is None and file.stat().st_size <= capture_record.MAX_DESCRIBED_BYTES:
+        session.damage = find_damage(file)
     facts = session.facts
     described = {
         "kind": facts.get("kind"),

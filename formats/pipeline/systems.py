@@ -308,6 +308,12 @@ def find_solver(session: Session) -> Solver:
     for entry in metadata.entry_points(group=ENTRY_POINT_GROUP, name=name):
         solver: Solver = entry.load()
         return solver
+    if not name:
+        raise FormatError(
+            "nothing in it can be solved: no sweeps, frames, magnetometers or hall sensors",
+            file=session.path,
+            hint="`locatk info` lists its contents; `locatk decode` decodes raw bytes again",
+        )
     raise FormatError(
         f"no solver for the system {name!r}",
         file=session.path,

@@ -299,6 +299,12 @@ def read_index(stream: IO[bytes]) -> Index:
     return index
 
 
+def find_damage(path: str | os.PathLike[str]) -> str | None:
+    """Read all of a file and describe its first damage; return None if it is whole."""
+    with open_mcap(path) as stream:
+        return describe_damage(salvage(stream))
+
+
 def time_error(path: str | os.PathLike[str], topic: str, time_ns: int) -> FormatError:
     """Return the error for a time that int64 nanoseconds do not hold."""
     return FormatError(

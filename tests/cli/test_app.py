@@ -268,6 +268,27 @@ def test_wrong_usage_is_one_line(locatk: Run) -> None:
         assert "Hint: See `locatk " in result.stderr
 
 
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e999"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("eval", "SESSION", "--truth", "SESSION", "--max-gap"),
+        ("emulate", "SESSION", "--speed"),
+        ("emulate", "SESSION", "--drop"),
+        ("solve", "SESSION", "--speed"),
+        ("calibrate", "camera", "SESSION", "-o", "camera.toml", "--focal-px"),
+    ],
+)
+def test_numbers_are_finite(
+    locatk: Run, session: Path, given: tuple[str, ...], number: str
+) -> None:
+    result = locatk(*(session if each == "SESSION" else each for each in given), number)
+    assert result.exit_code == 2
+    assert given[-1] in result.stderr
+    assert "Traceback" not in result.stderr
+    assert "internal error" not in result.stderr
+
+
 def test_no_arguments_show_help(locatk: Run) -> None:
     result = locatk()
     assert result.exit_code == 2

@@ -168,6 +168,15 @@ def test_a_single_device_with_another_name_is_reported(
     assert "compared" not in locatk("eval", other, "--truth", run, "--pair", "robot=red").stderr
 
 
+def test_frames_of_other_names_are_reported(locatk, run: Path, tmp_path: Path) -> None:
+    other = solution(tmp_path / "other.mcap", replace(solved(), frame="tag-0"))
+    words = "the poses of red are in the frame 'tag-0', its truth in 'floor'"
+    assert words in locatk("eval", other, "--truth", run).stderr
+    assert words not in locatk("eval", other, "--truth", run, "--align", "se2").stderr
+    write_tum(tmp_path / "red.tum", solved())  # A file without a name of the frame.
+    assert "frame" not in locatk("eval", tmp_path / "red.tum", "--truth", run).stderr
+
+
 def test_devices_of_other_names(locatk, tmp_path: Path) -> None:
     red, blue = drive(), replace(drive(), device="blue")
     blue = replace(blue, position=blue.position + [1.0, 0.0, 0.0])

@@ -136,7 +136,8 @@ class ColumnLayout:
         """Return the clock (n,) of lines (n, columns) in microseconds; None without a clock."""
         if self.clock is None:
             return None
-        return lines[:, self.clock.number] * (self.clock.factor / NANOSECONDS_PER_TICK)
+        with np.errstate(over="ignore"):  # Infinite clocks are damaged, as all that are too large.
+            return lines[:, self.clock.number] * (self.clock.factor / NANOSECONDS_PER_TICK)
 
     def sequences(self, lines: Array) -> Array | None:
         """Return the counter (n,) of lines (n, columns); None without a counter."""

@@ -102,6 +102,18 @@ def test_sessions_in_a_map_as_built_out(calibration: tuple[Result, Path]) -> Non
 
 
 @pytest.mark.slow
+def test_a_drive_counts_once(
+    locatk, runs: list[Path], calibration: tuple[Result, Path], tmp_path: Path
+) -> None:
+    copy, out = tmp_path / "copy.mcap", tmp_path / "built.toml"
+    copy.write_bytes(runs[0].read_bytes())
+    result = locatk("calibrate", "map", *runs, copy, "-o", out)
+    assert result.exit_code == 3
+    assert f"{copy}: the same measurements as in {runs[0]}" in result.stderr
+    assert out.read_text() == calibration[1].read_text()
+
+
+@pytest.mark.slow
 def test_json_is_all_that_is_on_stdout(locatk, runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "built.toml"
     result = locatk("calibrate", "map", *runs, "-o", out, "--json")

@@ -163,6 +163,16 @@ def test_usage_errors(locatk, seam: Path, beside: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_recording_counts_once(locatk, seam: Path, tmp_path: Path) -> None:
+    once, out = tmp_path / "once.toml", tmp_path / "built.toml"
+    assert locatk("calibrate", "sheet", seam, "-o", once).exit_code == 0
+    result = locatk("calibrate", "sheet", seam, seam, "-o", out)
+    assert result.exit_code == 3
+    assert f"{seam}: the same measurements as in {seam}" in result.stderr
+    assert out.read_text() == once.read_text()
+
+
+@pytest.mark.slow
 def test_a_session_of_another_floor_is_left_out(locatk, seam: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.mcap"
     session = seen(2, 20.0, 10.0, 3)

@@ -19,7 +19,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.cli.capture import text as capture_text
-from locatk.cli.capture.options import DURATION, ROTATION, SIZE
+from locatk.cli.capture.options import DURATION, ROTATION, SIZE, SIZE_OR_ZERO
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.tag import Tags
 from locatk.formats.artifacts import tags
@@ -455,7 +455,17 @@ def test_times(text: str, seconds: float) -> None:
 )
 def test_sizes(text: str, count: float) -> None:
     assert SIZE.convert(text, None, None) == count
+    assert SIZE_OR_ZERO.convert(text, None, None) == count
     assert ROTATION.convert(text, None, None) == ("size", count)
+
+
+@pytest.mark.parametrize("text", ["0", "0.0", "0B", "0 MB"])
+def test_no_space_needs_to_stay_free(text: str) -> None:
+    assert SIZE_OR_ZERO.convert(text, None, None) == 0
+    with pytest.raises(click.BadParameter):
+        SIZE.convert(text, None, None)
+    with pytest.raises(click.BadParameter):  # 0 is the only number that needs no unit.
+        SIZE_OR_ZERO.convert("5", None, None)
 
 
 @pytest.mark.parametrize("text", ["", "s", "1e3", "5 GiBs", "1,5s", "--", "1m2s", "nan", "inf"])

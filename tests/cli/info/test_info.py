@@ -181,6 +181,21 @@ def test_a_large_session_of_sweeps(locatk, session: Path, large: None) -> None:
     assert locatk("info", session).exit_code == 0
 
 
+def test_damage_of_what_is_not_described_is_found(locatk, tmp_path: Path) -> None:
+    session, solved = tmp_path / "run.mcap", tmp_path / "solved.mcap"
+    assert locatk("simulate", "dots", "--frames", 3, "-o", session).exit_code == 0
+    assert locatk("solve", session, "-o", solved).exit_code == 0
+    assert facts(locatk, solved)["damage"] is None
+    chunk = min(segment.offset for segment in Session.open(solved).index.segments)
+    data = bytearray(solved.read_bytes())
+    data[chunk + 100] ^= 1
+    solved.write_bytes(data)
+    result = locatk("info", solved, "--json")
+    assert result.exit_code == 3
+    assert json.loads(result.stdout)["damage"] == f"a damaged chunk at byte {chunk}"
+    assert "`locatk recover` saves the rest" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("system", "topic", "schema"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
 import types
 from dataclasses import replace
@@ -215,8 +216,8 @@ def test_info_of_a_session_with_damaged_samples(locatk, tmp_path: Path) -> None:
 
 
 def record(path: Path, known: Tags | None = TAGS) -> Path:
-    """A session of nothing but noise."""
-    field = np.random.default_rng(1).normal(size=(40, 9, 3)) * 1e-6
+    """A session of nothing but noise, which differs from those of other names."""
+    field = np.random.default_rng(list(path.name.encode())).normal(size=(40, 9, 3)) * 1e-6
     time_ns = START_NS + 10_000_000 * np.arange(40)
     samples = Samples("bar", SensorArray(bar(9, 0.02)), time_ns, field)
     field_samples.write_magnetometers(path, [samples], tags=known)
@@ -546,6 +547,21 @@ def test_one_pass_is_too_few(locatk, solver: Solver, tmp_path: Path) -> None:
         assert words in result.stderr
         assert "Pass each tag at least twice" in result.stderr
     assert not out.exists()
+
+
+def test_a_pass_counts_once(locatk, solver: Solver, tmp_path: Path) -> None:
+    """Whether its file is given twice, copied, or decoded again."""
+    solver.seen = passes()
+    first, second = (record(tmp_path / f"run{k}.mcap") for k in range(2))
+    copy = Path(shutil.copy(first, tmp_path / "copy.mcap"))
+    out = tmp_path / "built.toml"
+    result = locatk("calibrate", "tag", first, second, copy, second, "-o", out, "--json")
+    assert result.exit_code == 3
+    assert f"{copy}: the same measurements as in {first}" in result.stderr
+    assert f"{second}: the same measurements as in {second}" in result.stderr
+    assert tags.read_tags(out).built[ID].passes == 2
+    (tag,) = json.loads(result.stdout)["tags"]
+    assert len(tag["used"]) == 2
 
 
 def test_an_earlier_calibration_does_not_come_back(locatk, solver: Solver, tmp_path: Path) -> None:

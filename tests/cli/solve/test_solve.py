@@ -208,6 +208,7 @@ def test_files_other_than_sessions_are_refused(
     solved = tmp_path / "solved.mcap"
     assert locatk("solve", session, "-o", solved).exit_code == 0
     unknown = record(tmp_path / "unknown.mcap", system="sonar")
+    raw = record(tmp_path / "raw.mcap", system="")
     empty = tmp_path / "empty.mcap"
     empty.touch()
     hollow = tmp_path / "hollow"
@@ -219,6 +220,7 @@ def test_files_other_than_sessions_are_refused(
     for path, words in (
         (solved, "a solution, not a session"),
         (unknown, "no solver for the system 'sonar'"),
+        (raw, "nothing in it can be solved"),
         (empty, "empty"),
         (text, "not an MCAP file"),
         (cut, "cut short"),

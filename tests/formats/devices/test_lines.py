@@ -380,6 +380,13 @@ def test_clocks(name: str, cell: str, ticks: Ticks, tick: int) -> None:
     assert (stream.ticks, records["tick"], stream.names) == (ticks, [tick], ("v",))
 
 
+def test_infinite_clocks_are_damaged() -> None:
+    decoder, batches = decode(b"t_s,a\n1,2\n2,3\n1e308,4\n-1e308,5\n3,6\n")
+    _, columns = only(batches, "readings")
+    assert np.concatenate([columns["value"]]).ravel().tolist() == [2, 3, 6]
+    assert decoder.counts.bad == 2
+
+
 def test_a_clock_that_counts_beyond_32_bits() -> None:
     data = "t_us,v\n" + "".join(f"{(1 << 32) + k},{k}\n" for k in (-2, -1, 0, -1, 1))
     for step in (3, len(data)):
