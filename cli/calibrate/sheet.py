@@ -315,4 +315,5 @@ def _sheet_entry(sheet: BuiltSheet) -> dict[str, Any]:
         "truth_frames": sheet.truth_frames,
         "has_map": sheet.distortion is not None,
         "sigma_print_m": [value * 1e-3 for value in sheet.distortion_sigma_mm],
+        "sigma_print_rad": sheet.distortion_sigma_rad,
     }

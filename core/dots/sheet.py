@@ -134,6 +134,8 @@ class Sheet:
     distortion_sigma_mm : (x, y)
         Standard deviation of the errors of the print that :attr:`distortion` does not contain,
         along the paper's axes.
+    distortion_sigma_deg : float
+        Standard deviation of the local rotation of the print by these errors.
     """
 
     id: str
@@ -147,6 +149,7 @@ class Sheet:
     covariance_mm_deg: tuple[tuple[float, float, float], ...] | None = None
     distortion: Distortion | None = None
     distortion_sigma_mm: tuple[float, float] = (0.0, 0.0)
+    distortion_sigma_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -335,6 +338,7 @@ class Manifest:
             rotation = self._rotation(number)
         result[..., :2, :2] = rotation @ np.diag(np.square(sheet.distortion_sigma_mm)) @ rotation.T
         result[..., :2, :2] *= 1e-6
+        result[..., 2, 2] = math.radians(sheet.distortion_sigma_deg) ** 2
         if sheet.position_mm is not None and sheet.covariance_mm_deg is not None:
             lever = position - np.array(sheet.position_mm) * 1e-3
             effect = np.zeros((*position.shape[:-1], 3, 3))
