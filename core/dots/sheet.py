@@ -9,6 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from locatk.core.geometry import rotation_matrix_2d
+
 MM_PER_INCH = 25.4
 
 DOT_OFFSET_PITCHES = 1 / 6
@@ -280,9 +282,7 @@ class Manifest:
 
     def _rotation(self, number: int) -> NDArray[np.float64]:
         """Return the rotation (2, 2) from the paper to the frame of poses."""
-        angle = math.radians(self.sheets[number].heading_deg)
-        c, s = math.cos(angle), math.sin(angle)
-        return np.array([[c, -s], [s, c]])
+        return rotation_matrix_2d(math.radians(self.sheets[number].heading_deg))
 
     def to_grid(self, number: int, position_m: ArrayLike) -> NDArray[np.float64]:
         """Return the grid coordinates (..., 2) of positions; inverts :meth:`to_metres`."""

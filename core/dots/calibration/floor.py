@@ -31,7 +31,6 @@ from locatk.core.dots.calibration.floor_fit import (
     cross_validate,
     fit_floor,
     lay_out_unknowns,
-    planar_rotation,
 )
 from locatk.core.dots.calibration.floor_frame import BuiltSheet, build_sheets
 from locatk.core.dots.calibration.seam_measurements import (
@@ -50,13 +49,15 @@ from locatk.core.dots.localization.frames import (
     unlocalized_frames,
 )
 from locatk.core.dots.localization.recordings import OTHER_SIZE, batches, find_sheets
-from locatk.core.dots.localization.seams import may_show_seam, separate_sheets
+from locatk.core.dots.localization.seams import may_show_seam
+from locatk.core.dots.localization.separation import separate_sheets
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.evaluation.association import associate
 from locatk.core.geometry import (
     heading_from_quaternion,
     quaternion_from_heading,
+    rotation_matrix_2d,
     umeyama,
     wrap_angle,
 )
@@ -196,7 +197,7 @@ def calibrate_floor(
     recordings : sequence of FloorRecording
     manifest : Manifest
         Sheets with or without positions; those with positions are searched within
-        :data:`~locatk.core.dots.localization.seams.MAX_PLACE_ERROR_MM` of them.
+        :data:`~locatk.core.dots.localization.separation.MAX_POSITION_ERROR_MM` of them.
     advance : callable
         Called twice for each frame, when it is localized and when it is examined for seams.
 
@@ -517,11 +518,11 @@ def _seam_edges(
     for first, second, point, pose in _pairs(seams):
         if first > second:
             # Of the second paper's corner, from the pose of a point on it.
-            corner = pose[:2] - planar_rotation(pose[2]) @ point
+            corner = pose[:2] - rotation_matrix_2d(pose[2]) @ point
             inverse = _inverse(np.append(corner, pose[2]))
             relative.setdefault(((SHEET, second), (SHEET, first)), []).append(inverse)
         else:
-            corner = pose[:2] - planar_rotation(pose[2]) @ point
+            corner = pose[:2] - rotation_matrix_2d(pose[2]) @ point
             both = (SHEET, first), (SHEET, second)
             relative.setdefault(both, []).append(np.append(corner, pose[2]))
     return {
@@ -564,12 +565,12 @@ def _truth_edges(truths: Sequence[TruthObservations]) -> dict[tuple[Node, Node],
 
 
 def _compose(pose: Array, relative: Array) -> Array:
-    position = pose[:2] + planar_rotation(pose[2]) @ relative[:2]
+    position = pose[:2] + rotation_matrix_2d(pose[2]) @ relative[:2]
     return np.append(position, wrap_angle(pose[2] + relative[2]))
 
 
 def _inverse(pose: Array) -> Array:
-    return np.append(-planar_rotation(-pose[2]) @ pose[:2], -pose[2])
+    return np.append(-rotation_matrix_2d(-pose[2]) @ pose[:2], -pose[2])
 
 
 def _with_rough_positions(manifest: Manifest, seams: list[SeamMeasurement]) -> Manifest:

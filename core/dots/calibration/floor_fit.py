@@ -40,7 +40,7 @@ from scipy.special import chdtri
 
 from locatk.core.dots.calibration.seam_measurements import SeamMeasurement
 from locatk.core.dots.sheet import Manifest, interpolation_weights
-from locatk.core.geometry import wrap_angle
+from locatk.core.geometry import rotation_matrix_2d, wrap_angle
 from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE
 
 Array = NDArray[np.float64]
@@ -421,7 +421,7 @@ class FloorProblem:
         """Return points (n, 2) of a sheet's paper on the floor."""
         layout, n = self.layout, len(points)
         x, y, angle = self.pose(number, state)
-        rotation = planar_rotation(angle)
+        rotation = rotation_matrix_2d(angle)
         by_position, by_heading = np.zeros((n, 2, layout.size)), np.zeros((n, layout.size))
         on_paper, heading = points, np.full(n, angle)
         if layout.alignments:
@@ -480,7 +480,7 @@ class FloorProblem:
         """Return predicted minus measured poses (3 k,) in mm and rad, and derivatives."""
         first = self.sheet_points(seam.numbers[0], seam.poses[:, :2], state)
         to_first = np.eye(3)
-        to_first[:2, :2] = planar_rotation(self.pose(seam.numbers[0], state)[2]).T
+        to_first[:2, :2] = rotation_matrix_2d(self.pose(seam.numbers[0], state)[2]).T
         residuals, jacobians = [], []
         for k, number in enumerate(seam.numbers[1:]):
             other = self.sheet_points(number, seam.points_mm[k : k + 1], state)
@@ -510,7 +510,7 @@ class FloorProblem:
         index = self.layout.alignment(truth.alignment)
         x, y, angle, lever_x, lever_y, mounting = state[index]
         on_floor = self.sheet_points(truth.number, truth.points_mm, state)
-        rotation = planar_rotation(angle)
+        rotation = rotation_matrix_2d(angle)
         rotated = on_floor.position @ rotation.T
         predicted = rotated + [x, y]
         jacobian = rotation @ on_floor.by_position
@@ -531,12 +531,6 @@ class FloorProblem:
         residual = (predicted - truth.truth_mm).ravel()
         flat = jacobian.reshape(-1, self.layout.size)
         yield POSITION, Equations(residual, flat, rows.repeat(2), truth.variance[:, 0].mean())
-
-
-def planar_rotation(angle: float) -> Array:
-    """Return the counter-clockwise rotation (2, 2) by an angle in rad."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s], [s, c]])
 
 
 def _perpendicular(vectors: Array) -> Array:

@@ -19,11 +19,10 @@ from locatk.core.dots.calibration.floor_fit import (
     cell_quarters,
     field_weights,
     node_positions,
-    planar_rotation,
     unresolved_variance,
 )
 from locatk.core.dots.sheet import Distortion
-from locatk.core.geometry import wrap_angle
+from locatk.core.geometry import rotation_matrix_2d, wrap_angle
 
 Array = NDArray[np.float64]
 
@@ -132,7 +131,7 @@ def _rigid_pose(fit: FloorFit, number: int) -> tuple[Array, Array]:
         derivative[:, index] = np.eye(3)
     if number in problem.layout.nodes:
         to_floor = np.eye(3)
-        to_floor[:2, :2] = planar_rotation(pose[2])
+        to_floor[:2, :2] = rotation_matrix_2d(pose[2])
         operator, _ = _rigid_part(fit, number)
         unknowns = problem.layout.field(number).ravel()
         derivative[:, unknowns] = to_floor @ operator
@@ -145,7 +144,7 @@ def _in_datum(
 ) -> tuple[Array, Array]:
     """Return a pose in the frame in which the datum sheet has the pose ``datum``."""
     angle = datum[2] - datum_pose[2]
-    rotation = planar_rotation(angle)
+    rotation = rotation_matrix_2d(angle)
     lever = rotation @ (pose[:2] - datum_pose[:2])
     by_angle = np.array([-lever[1], lever[0]])
     derivative = np.empty_like(by_unknowns)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.localization.seams import SheetView
+from locatk.core.dots.localization.separation import SheetView
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest, Sheet
 from locatk.core.least_squares import DenseEquations, Indices, minimize
 from locatk.core.robust import robust_sigma
