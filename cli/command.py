@@ -18,6 +18,7 @@ rich-click (the least of 15 runs each); help shall open within 200 ms on slower 
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -59,6 +60,19 @@ def section(title: str, *decorators: Callable[[Any], Any]) -> Callable[[Any], An
 
 class Command(click.Command):
     """Command whose help lists its options in the sections given by :func:`section`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the command line; refuse numbers that are nan or infinite.
+
+        ``float`` and ``click.FloatRange`` accept both.
+        """
+        remaining = super().parse_args(ctx, args)
+        for parameter in self.get_params(ctx):
+            value = ctx.params.get(parameter.name or "")
+            for each in value if isinstance(value, tuple | list) else (value,):
+                if isinstance(each, float) and not math.isfinite(each):
+                    raise click.BadParameter(f"{each} is not a finite number.", ctx, parameter)
+        return remaining
 
     def section_of(self, parameter: click.Parameter) -> str:
         """Return the title under which the help lists a parameter."""

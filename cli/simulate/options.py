@@ -187,8 +187,8 @@ def _parameter_type(kind: Kind, metavar: str) -> click.ParamType:
     """Return click's type of a kind of value."""
     if isinstance(kind, Number):
         if kind == ANY_NUMBER:
-            return _FiniteFloat()
-        return _FiniteRange(
+            return click.FLOAT
+        return click.FloatRange(
             None if math.isinf(kind.low) else kind.low,
             None if math.isinf(kind.high) else kind.high,
             min_open=kind.is_low_excluded,
@@ -199,21 +199,6 @@ def _parameter_type(kind: Kind, metavar: str) -> click.ParamType:
     if isinstance(kind, Text):
         return click.Choice(kind.choices) if kind.choices else click.STRING
     return click.STRING if isinstance(kind, FilePath) else _Form(kind, metavar)
-
-
-class _FiniteFloat(click.types.FloatParamType):
-    """Number that is neither infinite nor nan."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse the text; fail if the number is not finite."""
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number", param, ctx)
-        return number
-
-
-class _FiniteRange(_FiniteFloat, click.FloatRange):
-    """Finite number in a range."""
 
 
 class _Form(click.ParamType):

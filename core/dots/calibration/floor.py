@@ -38,6 +38,7 @@ from locatk.core.dots.calibration.seam_measurements import (
     add_systematic_errors,
     crop_overlaps,
     measure_seam,
+    refuse_contained_tiles,
 )
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec, codec
@@ -208,8 +209,8 @@ def calibrate_floor(
         other at all seams; there are neither seams nor usable truth; or the camera of a recording
         cannot be estimated.
     InputError
-        The manifest has a single sheet and there is no truth, its codec is unknown, or a camera
-        has frames of another size.
+        The manifest has a single sheet and there is no truth, a tile is inside of another one, the
+        codec is unknown, or a camera has frames of another size.
     """
     has_truth = any(recording.truth is not None for recording in recordings)
     if len(manifest.sheets) < 2 and not has_truth:
@@ -222,6 +223,7 @@ def calibrate_floor(
             "a sheet is named 'floor', which is the name of the frame of all sheets",
             hint="Rename it in the manifest",
         )
+    refuse_contained_tiles(manifest)
     code = codec(manifest.codec)
     examined = [
         _examine(index, recording, manifest, code, advance)

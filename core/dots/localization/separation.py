@@ -50,9 +50,8 @@ MIN_SHEET_DOTS = 20
 lattice by chance in 4 % of the cases (the square of twice the gate), seven in a frame of 180."""
 
 MIN_EXCLUSIVE_DOTS = 7
-"""Least lead of a sheet in dots that no other sheet has, from which they are of this sheet. A dot
-at random has the right symbol in a quarter of the cases: odds of 16,000, as :data:`MIN_LOG_ODDS`
-requires."""
+"""Least number of dots that no other sheet has. A dot at random has the right symbol in a quarter
+of the cases: odds of 16,000, as :data:`MIN_LOG_ODDS` requires."""
 
 NEIGHBOURS = 8
 """Number of nearest dots that decide to which sheet the surroundings of a dot belong."""
@@ -136,7 +135,7 @@ def separate_sheets(
     """Return the dots of each sheet that a frame (h, w) shows, most dots first.
 
     Empty if no sheet is decoded. A dot that is printed on several sheets (the overlap of tiles) is
-    one of each that predicts it.
+    one of each that predicts it; a sheet with no other dots is left out.
     """
     first = _first_view(image, manifest, code, camera)
     frame = None if first is None else _rectify(image, first, manifest, code, camera)
@@ -153,6 +152,9 @@ def separate_sheets(
         pose = None
         if frame.is_unassigned.sum() >= MIN_SHEET_DOTS:
             pose = frame.match_neighbour(visible) or frame.decode_rest(image, visible)
+    # The first one is the reference of the others, even if the frame does not show whose dots they
+    # are.
+    views = [view for view in views if _is_of_one_sheet(view, manifest)]
     return sorted(views, key=lambda view: -len(view.pixels))
 
 
@@ -182,21 +184,23 @@ def _decode(
 
 
 def view_of_sheet(dots: DotCorrespondences, manifest: Manifest) -> SheetView | None:
-    """Return the dots of the sheet to which most of the dots of a lattice belong.
-
-    None if they are few, or if other sheets have them as well.
-    """
+    """Return the dots of the sheet to which most of the dots of a lattice belong, if any do."""
     grid = dots.origin + dots.grid
     is_member = manifest.contains(grid, dots.section)
+    # Dots that are printed on a single sheet decide.
     exclusive = (is_member & (is_member.sum(axis=0) == 1)).sum(axis=1)
-    number = int(np.argmax(exclusive))
-    is_own = is_member[number]
-    is_ambiguous = exclusive[number] < MIN_EXCLUSIVE_DOTS + np.delete(exclusive, number).max(
-        initial=0
-    )
-    if is_ambiguous or is_own.sum() < MIN_SHEET_DOTS:
+    total = is_member.sum(axis=1)
+    number = int(np.argmax(exclusive + total / (1 + len(grid))))
+    if total[number] < MIN_SHEET_DOTS:
         return None
+    is_own = is_member[number]
     return SheetView(number, dots.pixels[is_own], grid[is_own])
+
+
+def _is_of_one_sheet(view: SheetView, manifest: Manifest) -> bool:
+    """Return whether a view has dots that no other sheet has."""
+    is_member = manifest.contains(view.grid, manifest.sheets[view.number].section)
+    return int((is_member.sum(axis=0) == 1).sum()) >= MIN_EXCLUSIVE_DOTS
 
 
 def _halves(image: Image) -> Iterator[Image]:

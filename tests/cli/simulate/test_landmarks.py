@@ -389,6 +389,9 @@ def test_a_robot_drives_by_the_published_method(locatk, floor: Path) -> None:
 @pytest.mark.parametrize("flag", ["--noise", "--speed", "--rate", "--stop"])
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_numbers_of_flags_are_finite(locatk, tmp_path: Path, flag: str, value: str) -> None:
-    result = locatk("simulate", "landmarks", "map.toml", "-o", tmp_path / "run.mcap", flag, value)
+    (tmp_path / "map.toml").touch()
+    result = locatk(
+        *("simulate", "landmarks", tmp_path / "map.toml", "-o", tmp_path / "run.mcap", flag, value)
+    )
     assert result.exit_code == 2
     assert "is not a finite number" in result.stderr
