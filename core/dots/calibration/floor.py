@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from locatk.core.dots.calibration.camera import CalibrateOptions, calibrate
 from locatk.core.dots.calibration.camera_views import MIN_CALIBRATION_FRAMES
 from locatk.core.dots.calibration.floor_fit import (
+    GROSS_OUTLIER_SIGMAS,
     FloorFit,
     FloorProblem,
     TruthObservations,
@@ -651,10 +652,9 @@ def fit_consistent_sheets(
         given = given or problem
         if not problem.seams and not problem.truths:
             raise DegenerateError(
-                f"the frames contradict each other: no {MIN_SEAM_FRAMES} frames, and not most of "
-                "them, agree on the pose of any sheet",
-                hint="Record again on a flat floor, slowly, or calibrate the camera first "
-                "(--camera)",
+                f"no sheet is connected with {manifest.sheets[sheets[0]].id}: at its seams, fewer "
+                f"than {MIN_SEAM_FRAMES} frames agree, or as many do not",
+                hint="Record these seams again, slowly, with the papers flat on the floor",
             )
         fit = fit_floor(problem, state)
         used = fit.problem
@@ -755,6 +755,12 @@ def notes_of(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
         if rejected and (kept[pair] < MIN_SEAM_FRAMES or kept[pair] <= rejected):
             first, other = (manifest.sheets[number].id for number in sorted(pair))
             yield f"{first} and {other}: {kept[pair]} of {total[pair]} frames at their seam agree"
+    if fit.problem.seams and fit.noise.seam > GROSS_OUTLIER_SIGMAS:
+        yield (
+            f"frames at one seam differ {fit.noise.seam:.0f} times as much as the noise of their "
+            "dots explains: is the floor flat, the lens calibrated, and does the floor consist of "
+            "these sheets? Do not trust the standard deviations"
+        )
     for number in given.layout.sheets:
         if number not in placed:
             yield (
