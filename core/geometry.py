@@ -10,6 +10,7 @@ is several times as fast for long arrays as operating on rows of four.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -197,6 +198,12 @@ def heading_from_quaternion(quaternion: ArrayLike) -> Array:
 def wrap_angle(angle_rad: ArrayLike) -> Array:
     """Return the equivalent angles (...) in [-pi, pi)."""
     return np.asarray(np.remainder(np.asarray(angle_rad, float) + np.pi, 2 * np.pi) - np.pi)
+
+
+def rotation_matrix_2d(angle_rad: float) -> Array:
+    """Return the counter-clockwise rotation (2, 2) by an angle."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[c, -s], [s, c]])
 
 
 def rotation_exp(vectors: ArrayLike) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
 from locatk.cli.calibrate import recordings
 from locatk.cli.command import Command, section
 from locatk.core.errors import InputError, LocatkError
@@ -29,7 +29,7 @@ MAX_SHEETS = 60
 
 @click.command("sheet", cls=Command, short_help="Fit tiles and sheets of a floor as built.")
 @options.sessions
-@options.output("Manifest to write (.toml), with the sheets as built.")
+@options.output("Manifest to write (.toml), with the sheets as built.", endings=(".toml",))
 @options.overwrite
 @section(
     "Input",
@@ -85,6 +85,9 @@ def command(
     sheet, if the poses support it. The truth may be in any frame with z up, and of any point
     of the body that carries the camera.
 
+    The exit status is 3 if a sheet has no position, if frames were rejected because they
+    contradict the others, or if a session was not used.
+
     \b
     Examples:
       locatk calibrate sheet run.mcap -o floor-built.toml
@@ -92,7 +95,6 @@ def command(
       locatk calibrate sheet run.mcap --truth mocap.tum -o floor-built.toml --json
       locatk solve later.mcap -o solved.mcap --artifact floor-built.toml
     """
-    from locatk.core.dots.calibration.floor import calibrate_floor
     from locatk.formats.artifacts import sheets
 
     inputs = [*sessions, *(path for path in (artifact, camera) if path), *truth]
@@ -102,23 +104,58 @@ def command(
             f"{len(truth)} files for {len(sessions)} sessions.", param_hint="--truth"
         )
     manifest = sheets.read_manifest(artifact) if artifact else _attached(sessions[0])
-    given = sheets.read_camera(camera) if camera else None
-    found, left_out = _recordings(sessions, manifest, given, truth, offset, artifact is None)
-    if not found:
-        raise InputError("no session can be used", hint="The messages above name the reasons")
-    # Each frame is localized, and examined for seams.
-    with console.steps(2 * sum(len(each.frames) for each in found), "Calibrating") as advance:
-        try:
-            report = calibrate_floor(found, manifest, advance)
-        except LocatkError as error:
-            # Solvers work on arrays and do not know the file.
-            error.file = error.file or str(sessions[0])
-            raise
+    common_camera = sheets.read_camera(camera) if camera else None
+    floor_recordings, left_out = _read_recordings(
+        sessions,
+        manifest,
+        common_camera,
+        truth,
+        offset,
+        must_have_manifest=artifact is None,
+    )
+    report = _calibrate(sessions[0], manifest, floor_recordings)
     sheets.write_manifest(output, report.manifest, overwrite=overwrite)
     recordings.print_result(_text(output, report), report.notes, left_out)
     if as_json:
         console.emit_json(_entry(sessions, output, report, left_out))
     recordings.check_all_used(left_out, "recording was", "recordings were")
+    _check_complete(report)
+
+
+def _calibrate(
+    path: Path, manifest: Manifest, floor_recordings: list[FloorRecording]
+) -> FloorReport:
+    """Calibrate with a progress bar; ``path`` is the file that errors name."""
+    from locatk.core.dots.calibration.floor import calibrate_floor
+
+    if not floor_recordings:
+        raise InputError("no session can be used", hint="The messages above name the reasons")
+    # Each frame is localized, and examined for seams.
+    steps = 2 * sum(len(each.frames) for each in floor_recordings)
+    with console.steps(steps, "Calibrating") as advance:
+        try:
+            return calibrate_floor(floor_recordings, manifest, advance)
+        except LocatkError as error:
+            # Solvers work on arrays and do not know the file.
+            error.file = error.file or str(path)
+            raise
+
+
+def _check_complete(report: FloorReport) -> None:
+    """Raise Incomplete if a sheet has no position, or frames were rejected."""
+    losses = []
+    if report.unplaced:
+        losses.append(f"without a position: {', '.join(report.unplaced)}")
+    if report.rejected:
+        losses.append(f"rejected: {_frames_text(report.rejected)}")
+    if losses:
+        raise failures.Incomplete("; ".join(losses))
+
+
+def _frames_text(rejected: int) -> str:
+    if rejected == 1:
+        return "1 frame that contradicts the others"
+    return f"{rejected} frames that contradict the others"
 
 
 def _attached(path: Path) -> Manifest:
@@ -135,47 +172,48 @@ def _attached(path: Path) -> Manifest:
     return manifest
 
 
-def _recordings(
+def _read_recordings(
     sessions: tuple[Path, ...],
     manifest: Manifest,
-    camera: Camera | None,
+    common_camera: Camera | None,
     truth: tuple[Path, ...],
     offset: float,
-    is_checked: bool,
+    *,
+    must_have_manifest: bool,
 ) -> tuple[list[FloorRecording], dict[str, str]]:
     """Read the cameras of all sessions; return them, and why others cannot be used, by name.
 
-    With ``is_checked``, each session must have the sheets of ``manifest``.
+    With ``must_have_manifest``, each session must have the sheets of ``manifest``.
     """
     from locatk.core.dots.calibration.floor import FloorRecording
     from locatk.formats.sessions import observations
     from locatk.formats.sessions.reader import Session
 
-    found: list[FloorRecording] = []
+    floor_recordings: list[FloorRecording] = []
     tracks = [_tracks(path) for path in truth]
     left_out: dict[str, str] = {}
     measurements = recordings.Measurements()
     for index, path in enumerate(sessions):
         with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
             session = Session.open(path)
-            if is_checked and _attached(path) != manifest:
+            if must_have_manifest and _attached(path) != manifest:
                 raise InputError(
                     "the manifest differs from that of the first session",
                     file=path,
                     hint="Calibrate sessions of one floor, or give its manifest with --artifact",
                 )
-            own = camera or observations.read_camera(session)
+            camera = common_camera or observations.read_camera(session)
             cameras = observations.read_frames(session)
             for frames in cameras:
                 # If the times and the first frames are equal, the others are, too.
                 measurements.add(str(path), frames.time_ns, *_first_image(frames))
                 name = str(path) if len(cameras) == 1 else f"{path}: {frames.device}"
-                true = None
+                trajectory = None
                 if truth:
                     file = min(index, len(truth) - 1)
-                    true = _track_of(frames.device, tracks[file], truth[file])
-                found.append(FloorRecording(name, frames, own, true, offset))
-    return found, left_out
+                    trajectory = _track_of(frames.device, tracks[file], truth[file])
+                floor_recordings.append(FloorRecording(name, frames, camera, trajectory, offset))
+    return floor_recordings, left_out
 
 
 def _first_image(frames: Frames) -> list[np.ndarray]:
@@ -206,7 +244,7 @@ def _track_of(device: str, tracks: list[Trajectory], path: Path) -> Trajectory:
 
 def _text(output: Path, report: FloorReport) -> str:
     """Format a table of the sheets, and how well the observations agree."""
-    header = ("sheet", "x [mm]", "y", "[deg]", "dx", "dy", "turn", "sigma", "[deg]", "frames")
+    header = ("sheet", "x [mm]", "y", "[deg]", "dx", "dy", "[deg]", "sigma", "[deg]", "frames")
     rows = [_row(sheet, report.datum) for sheet in report.sheets[:MAX_SHEETS]]
     lines = [
         f"{len(report.sheets)} sheets from {report.seam_frames} frames with a seam, of "
@@ -230,16 +268,15 @@ def _text(output: Path, report: FloorReport) -> str:
                "; the poses do not support maps")
         )  # fmt: skip
     if report.rejected:
-        lines.append(f"rejected: {report.rejected} frames that contradict the others")
+        lines.append(f"rejected: {_frames_text(report.rejected)}")
     if report.unplaced:
-        names = console.wrapped(f"without a position: {', '.join(report.unplaced)}, not seen")
-        lines.append(names)
+        lines.append(console.wrapped(f"without a position: {', '.join(report.unplaced)}"))
     return "\n".join([*lines, f"Wrote {output}"])
 
 
 def _row(sheet: BuiltSheet, datum: str) -> tuple[Any, ...]:
     x, y, heading = sheet.pose.tolist()
-    dx, dy, turn = sheet.shift.tolist()
+    dx, dy, rotation = sheet.shift.tolist()
     sigma = ("datum", "")
     if sheet.id != datum:
         sigma_x, sigma_y, sigma_heading = sheet.sigma.tolist()
@@ -251,7 +288,7 @@ def _row(sheet: BuiltSheet, datum: str) -> tuple[Any, ...]:
         f"{y:.2f}",
         f"{math.degrees(heading):.3f}",
         *("-" if math.isnan(value) else f"{value:+.2f}" for value in (dx, dy)),
-        "-" if math.isnan(turn) else f"{math.degrees(turn):+.3f}",
+        "-" if math.isnan(rotation) else f"{math.degrees(rotation):+.3f}",
         *sigma,
         sheet.seam_frames + sheet.truth_frames,
     )
@@ -312,7 +349,7 @@ def _entry(
 
 def _sheet_entry(sheet: BuiltSheet) -> dict[str, Any]:
     x, y, heading = sheet.pose.tolist()
-    dx, dy, turn = sheet.shift.tolist()
+    dx, dy, rotation = sheet.shift.tolist()
     sigma_x, sigma_y, sigma_heading = sheet.sigma.tolist()
     return {
         "id": sheet.id,
@@ -321,7 +358,7 @@ def _sheet_entry(sheet: BuiltSheet) -> dict[str, Any]:
         "heading_rad": heading,
         "dx_m": dx * 1e-3,
         "dy_m": dy * 1e-3,
-        "dheading_rad": turn,
+        "dheading_rad": rotation,
         "sigma_x_m": sigma_x * 1e-3,
         "sigma_y_m": sigma_y * 1e-3,
         "sigma_heading_rad": sigma_heading,
@@ -329,4 +366,5 @@ def _sheet_entry(sheet: BuiltSheet) -> dict[str, Any]:
         "truth_frames": sheet.truth_frames,
         "has_map": sheet.distortion is not None,
         "sigma_print_m": [value * 1e-3 for value in sheet.distortion_sigma_mm],
+        "sigma_print_rad": sheet.distortion_sigma_rad,
     }

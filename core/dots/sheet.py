@@ -9,6 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from locatk.core.geometry import rotation_matrix_2d
+
 MM_PER_INCH = 25.4
 
 DOT_OFFSET_PITCHES = 1 / 6
@@ -134,6 +136,8 @@ class Sheet:
     distortion_sigma_mm : (x, y)
         Standard deviation of the errors of the print that :attr:`distortion` does not contain,
         along the paper's axes.
+    distortion_sigma_deg : float
+        Standard deviation of the local rotation of the print by these errors.
     """
 
     id: str
@@ -147,6 +151,7 @@ class Sheet:
     covariance_mm_deg: tuple[tuple[float, float, float], ...] | None = None
     distortion: Distortion | None = None
     distortion_sigma_mm: tuple[float, float] = (0.0, 0.0)
+    distortion_sigma_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -277,9 +282,7 @@ class Manifest:
 
     def _rotation(self, number: int) -> NDArray[np.float64]:
         """Return the rotation (2, 2) from the paper to the frame of poses."""
-        angle = math.radians(self.sheets[number].heading_deg)
-        c, s = math.cos(angle), math.sin(angle)
-        return np.array([[c, -s], [s, c]])
+        return rotation_matrix_2d(math.radians(self.sheets[number].heading_deg))
 
     def to_grid(self, number: int, position_m: ArrayLike) -> NDArray[np.float64]:
         """Return the grid coordinates (..., 2) of positions; inverts :meth:`to_metres`."""
@@ -335,6 +338,7 @@ class Manifest:
             rotation = self._rotation(number)
         result[..., :2, :2] = rotation @ np.diag(np.square(sheet.distortion_sigma_mm)) @ rotation.T
         result[..., :2, :2] *= 1e-6
+        result[..., 2, 2] = math.radians(sheet.distortion_sigma_deg) ** 2
         if sheet.position_mm is not None and sheet.covariance_mm_deg is not None:
             lever = position - np.array(sheet.position_mm) * 1e-3
             effect = np.zeros((*position.shape[:-1], 3, 3))

@@ -161,6 +161,7 @@ def _sheet_values(sheet: Sheet, pitch_mm: float) -> Values:
         "distortion_sigma_mm": sheet.distortion_sigma_mm
         if any(sheet.distortion_sigma_mm)
         else None,
+        "distortion_sigma_deg": sheet.distortion_sigma_deg or None,
     }
 
 
@@ -229,6 +230,13 @@ _SHEET = Table(
             Row(NOT_NEGATIVE, 2),
             "standard deviation of the print's other errors, along the paper's axes",
             (0.0, 0.0),
+            is_si=False,
+        ),
+        Key(
+            "distortion_sigma_deg",
+            NOT_NEGATIVE,
+            "standard deviation of the local rotation of the print by these errors",
+            0.0,
             is_si=False,
         ),
     ),

@@ -14,7 +14,8 @@ are.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,13 +25,13 @@ from numpy.typing import NDArray
 from locatk.core.dots.calibration.camera import CalibrateOptions, calibrate
 from locatk.core.dots.calibration.camera_views import MIN_CALIBRATION_FRAMES
 from locatk.core.dots.calibration.floor_fit import (
+    GROSS_OUTLIER_SIGMAS,
     FloorFit,
     FloorProblem,
     TruthObservations,
     cross_validate,
     fit_floor,
     lay_out_unknowns,
-    planar_rotation,
 )
 from locatk.core.dots.calibration.floor_frame import BuiltSheet, build_sheets
 from locatk.core.dots.calibration.seam_measurements import (
@@ -38,6 +39,7 @@ from locatk.core.dots.calibration.seam_measurements import (
     add_systematic_errors,
     crop_overlaps,
     measure_seam,
+    refuse_contained_tiles,
 )
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec, codec
@@ -49,13 +51,15 @@ from locatk.core.dots.localization.frames import (
     unlocalized_frames,
 )
 from locatk.core.dots.localization.recordings import OTHER_SIZE, batches, find_sheets
-from locatk.core.dots.localization.seams import may_show_seam, separate_sheets
+from locatk.core.dots.localization.seams import may_show_seam
+from locatk.core.dots.localization.separation import separate_sheets
 from locatk.core.dots.sheet import Manifest
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.evaluation.association import associate
 from locatk.core.geometry import (
     heading_from_quaternion,
     quaternion_from_heading,
+    rotation_matrix_2d,
     umeyama,
     wrap_angle,
 )
@@ -74,10 +78,19 @@ MIN_TRUTH_EXTENT_MM = 20.0
 """Least extent of these poses; a shorter one determines no direction."""
 
 MAX_TRUTH_FRAMES = 1500
-"""Maximum number of poses with truth that are fitted; of more, every n-th."""
+"""Maximum number of poses with truth that are fitted of each recording, spread evenly over it."""
 
 MAX_LISTED_SHEETS = 6
 """Maximum number of sheets that an error names."""
+
+SEAM_HINT = (
+    "Move the camera slowly across each seam, at several places, or give --truth; remove sheets "
+    "that are not part of the floor from the manifest"
+)
+
+TRUTH_HINT = (
+    "Check --offset, and that the truth is of these recordings; or move the camera across seams"
+)
 
 
 @dataclass(frozen=True)
@@ -136,7 +149,8 @@ class FloorReport:
     sheets : tuple of BuiltSheet
     seams : tuple of SeamReport
     unplaced : tuple of str
-        Sheets that no frame shows and that have no position.
+        Sheets without a position: no frame shows them, or too few of the frames that connect them
+        with others agree.
     frames, localized, seam_frames, truth_frames : int
         Number of frames, of those with a pose on a sheet, with a measured seam, and with truth.
     rejected : int
@@ -185,18 +199,19 @@ def calibrate_floor(
     recordings : sequence of FloorRecording
     manifest : Manifest
         Sheets with or without positions; those with positions are searched within
-        :data:`~locatk.core.dots.localization.seams.MAX_PLACE_ERROR_MM` of them.
+        :data:`~locatk.core.dots.localization.separation.MAX_POSITION_ERROR_MM` of them.
     advance : callable
         Called twice for each frame, when it is localized and when it is examined for seams.
 
     Raises
     ------
     DegenerateError
-        The frames do not connect all sheets that they show, or not all tiles, or the camera of a
-        recording cannot be estimated from them.
+        The frames do not connect all sheets that they show, or not all tiles, or contradict each
+        other at all seams; there are neither seams nor usable truth; or the camera of a recording
+        cannot be estimated.
     InputError
-        The manifest has a single sheet and there is no truth, its codec is unknown, or a camera
-        has frames of another size.
+        The manifest has a single sheet and there is no truth, a tile is inside of another one, the
+        codec is unknown, or a camera has frames of another size.
     """
     has_truth = any(recording.truth is not None for recording in recordings)
     if len(manifest.sheets) < 2 and not has_truth:
@@ -209,6 +224,7 @@ def calibrate_floor(
             "a sheet is named 'floor', which is the name of the frame of all sheets",
             hint="Rename it in the manifest",
         )
+    refuse_contained_tiles(manifest)
     code = codec(manifest.codec)
     examined = [
         _examine(index, recording, manifest, code, advance)
@@ -227,15 +243,20 @@ def calibrate_floor(
     seams = add_systematic_errors(seams, manifest.pitch_mm)
     truths = list(_truth_observations(examined, manifest))
     sheets = _visible_sheets(manifest, examined, seams)
-    poses = initial_poses(manifest, sheets, seams, truths, MIN_SEAM_FRAMES)
-    require_connected(manifest, sheets, poses)
-    problem, state = floor_problem(manifest, sheets, seams, truths, poses)
-    fit = fit_floor(problem, state)
+    require_connected(manifest, sheets, initial_poses(manifest, sheets, seams, truths))
+    unused = unused_truth(truths) if has_truth else ""
+    if not seams and not _truth_edges(truths):
+        raise DegenerateError(
+            unused or "no frame shows a seam between two sheets",
+            hint=TRUTH_HINT if unused else SEAM_HINT,
+        )
+    given, problem, state, fit = fit_consistent_sheets(manifest, sheets, seams, truths)
     validation = cross_validate(fit) if fit.problem.truths else (math.nan, math.nan)
     if fit.problem.layout.nodes and validation[1] > validation[0]:
         fit = fit_floor(replace(problem, layout=replace(problem.layout, nodes={})), state)
         validation = validation[0], validation[0]
-    return _report(manifest, examined, problem, fit, validation)
+    notes = [unused] if unused else []
+    return _report(manifest, examined, given, fit, validation, [*notes, *notes_of(given, fit)])
 
 
 # ---- frames
@@ -419,6 +440,7 @@ def _on_paper(manifest: Manifest, number: int) -> Manifest:
         covariance_mm_deg=None,
         distortion=None,
         distortion_sigma_mm=(0.0, 0.0),
+        distortion_sigma_deg=0.0,
     )
     return replace(manifest, sheets=(sheet,))
 
@@ -430,6 +452,9 @@ Node = tuple[str, int]
 """Sheet or frame of a truth, with its number."""
 
 SHEET, TRUTH = "sheet", "truth"
+
+Pair = frozenset[int]
+"""Numbers of two sheets."""
 
 
 def _visible_sheets(
@@ -459,15 +484,17 @@ def _visible_sheets(
 def initial_poses(
     manifest: Manifest,
     sheets: list[int],
-    seams: list[SeamMeasurement],
-    truths: list[TruthObservations],
-    min_frames: int,
+    seams: Sequence[SeamMeasurement],
+    truths: Sequence[TruthObservations],
+    min_frames: int = MIN_SEAM_FRAMES,
+    rejected: Mapping[Pair, int] | None = None,
 ) -> dict[Node, Array]:
     """Return the poses (x, y [mm], heading [rad]) of all nodes connected with the datum.
 
-    Each edge has the median of its measurements.
+    Each edge has the median of its measurements, of which there must be ``min_frames`` and more
+    than were ``rejected``.
     """
-    edges = _seam_edges(seams, min_frames) | _truth_edges(truths)
+    edges = _seam_edges(seams, min_frames, rejected or {}) | _truth_edges(truths)
     sheet = manifest.sheets[sheets[0]]
     x, y = sheet.position_mm or (0.0, 0.0)
     poses: dict[Node, Array] = {
@@ -486,27 +513,35 @@ def initial_poses(
     return poses
 
 
-def _seam_edges(seams: list[SeamMeasurement], min_frames: int) -> dict[tuple[Node, Node], Array]:
+def _seam_edges(
+    seams: Sequence[SeamMeasurement], min_frames: int, rejected: Mapping[Pair, int]
+) -> dict[tuple[Node, Node], Array]:
     """Return the median relative pose of each two sheets that enough frames show together."""
     relative: dict[tuple[Node, Node], list[Array]] = {}
     for first, second, point, pose in _pairs(seams):
         if first > second:
             # Of the second paper's corner, from the pose of a point on it.
-            corner = pose[:2] - planar_rotation(pose[2]) @ point
+            corner = pose[:2] - rotation_matrix_2d(pose[2]) @ point
             inverse = _inverse(np.append(corner, pose[2]))
             relative.setdefault(((SHEET, second), (SHEET, first)), []).append(inverse)
         else:
-            corner = pose[:2] - planar_rotation(pose[2]) @ point
+            corner = pose[:2] - rotation_matrix_2d(pose[2]) @ point
             both = (SHEET, first), (SHEET, second)
             relative.setdefault(both, []).append(np.append(corner, pose[2]))
     return {
         edge: _median_pose(np.array(poses))
         for edge, poses in relative.items()
         if len(poses) >= min_frames
+        and len(poses) > rejected.get(frozenset(number for _, number in edge), 0)
     }
 
 
-def _pairs(seams: list[SeamMeasurement]) -> Iterator[tuple[int, int, Array, Array]]:
+def count_frames(seams: Sequence[SeamMeasurement]) -> Counter[Pair]:
+    """Return the number of measurements of each two sheets."""
+    return Counter(frozenset((first, other)) for first, other, _, _ in _pairs(seams))
+
+
+def _pairs(seams: Sequence[SeamMeasurement]) -> Iterator[tuple[int, int, Array, Array]]:
     """Yield first and other sheet, point and pose of each measurement."""
     for seam in seams:
         for k, number in enumerate(seam.numbers[1:]):
@@ -519,7 +554,7 @@ def _median_pose(poses: Array) -> Array:
     return np.append(np.median(poses[:, :2], axis=0), np.median(heading))
 
 
-def _truth_edges(truths: list[TruthObservations]) -> dict[tuple[Node, Node], Array]:
+def _truth_edges(truths: Sequence[TruthObservations]) -> dict[tuple[Node, Node], Array]:
     """Return the pose of the frame of each truth on the sheets that have enough poses in it."""
     edges = {}
     for truth in truths:
@@ -533,12 +568,12 @@ def _truth_edges(truths: list[TruthObservations]) -> dict[tuple[Node, Node], Arr
 
 
 def _compose(pose: Array, relative: Array) -> Array:
-    position = pose[:2] + planar_rotation(pose[2]) @ relative[:2]
-    return np.append(position, pose[2] + relative[2])
+    position = pose[:2] + rotation_matrix_2d(pose[2]) @ relative[:2]
+    return np.append(position, wrap_angle(pose[2] + relative[2]))
 
 
 def _inverse(pose: Array) -> Array:
-    return np.append(-planar_rotation(-pose[2]) @ pose[:2], -pose[2])
+    return np.append(-rotation_matrix_2d(-pose[2]) @ pose[:2], -pose[2])
 
 
 def _with_rough_positions(manifest: Manifest, seams: list[SeamMeasurement]) -> Manifest:
@@ -567,16 +602,78 @@ def require_connected(manifest: Manifest, sheets: list[int], poses: dict[Node, A
     raise DegenerateError(
         f"{listed}{more} {verb} not connected with {manifest.sheets[sheets[0]].id}: fewer than "
         f"{MIN_SEAM_FRAMES} frames show a seam between them",
-        hint="Move the camera slowly across each seam, at several places, or give --truth; remove "
-        "sheets that are not part of the floor from the manifest",
+        hint=SEAM_HINT,
     )
+
+
+def unused_truth(truths: Sequence[TruthObservations]) -> str:
+    """Return why some poses with truth cannot be used; empty if all can."""
+    if not truths:
+        return "no frame on a single sheet has truth at its time"
+    aligned = {alignment for _, (_, alignment) in _truth_edges(truths)}
+    unused = sum(len(truth.time_ns) for truth in truths if truth.alignment not in aligned)
+    if not unused:
+        return ""
+    return (
+        f"{unused} poses with truth cannot be used: at least {MIN_TRUTH_FRAMES} on one sheet, over "
+        f"{MIN_TRUTH_EXTENT_MM:.0f} mm, are required"
+    )
+
+
+def fit_consistent_sheets(
+    manifest: Manifest,
+    sheets: list[int],
+    seams: Sequence[SeamMeasurement],
+    truths: Sequence[TruthObservations],
+) -> tuple[FloorProblem, FloorProblem, Array, FloorFit]:
+    """Fit a floor, without the sheets that too few consistent frames connect with the datum.
+
+    A fit rejects frames that contradict the others. The rest connects two sheets only if it has
+    still :data:`MIN_SEAM_FRAMES` and is the majority: otherwise nobody knows which frames are
+    wrong.
+
+    Returns
+    -------
+    given, problem : FloorProblem
+        With all sheets, and without those that are left out.
+    state : (size,) ndarray
+        Initial guess of the unknowns of ``problem``.
+    fit : FloorFit
+
+    Raises
+    ------
+    DegenerateError
+        No observations are left.
+    """
+    given: FloorProblem | None = None
+    while True:
+        poses = initial_poses(manifest, sheets, seams, truths)
+        problem, state = floor_problem(manifest, sheets, seams, truths, poses)
+        given = given or problem
+        if not problem.seams and not problem.truths:
+            raise DegenerateError(
+                f"no sheet is connected with {manifest.sheets[sheets[0]].id}: at its seams, fewer "
+                f"than {MIN_SEAM_FRAMES} frames agree, or as many do not",
+                hint="Record these seams again, slowly, with the papers flat on the floor",
+            )
+        fit = fit_floor(problem, state)
+        used = fit.problem
+        rejected = count_frames(seams) - count_frames(used.seams)
+        connected = initial_poses(
+            manifest, sheets, used.seams, used.truths, MIN_SEAM_FRAMES, rejected
+        )
+        if all((SHEET, number) in connected for number in sheets) and (used.seams or used.truths):
+            return given, problem, state, fit
+        sheets = [number for number in sheets if (SHEET, number) in connected]
+        seams = [seam for seam in seams if set(seam.numbers) <= set(sheets)]
+        truths = [truth for truth in truths if truth.number in sheets and used.truths]
 
 
 def floor_problem(
     manifest: Manifest,
     sheets: list[int],
-    seams: list[SeamMeasurement],
-    truths: list[TruthObservations],
+    seams: Sequence[SeamMeasurement],
+    truths: Sequence[TruthObservations],
     poses: dict[Node, Array],
 ) -> tuple[FloorProblem, Array]:
     """Return the problem of a floor and the initial guess of its unknowns."""
@@ -612,6 +709,7 @@ def _report(
     given: FloorProblem,
     fit: FloorFit,
     validation: tuple[float, float],
+    notes: Sequence[str],
 ) -> FloorReport:
     """Return the result of a calibration."""
     problem = fit.problem
@@ -643,12 +741,32 @@ def _report(
         cameras={
             each.recording.name: each.camera for each in examined if each.recording.camera is None
         },
-        notes=tuple(notes_of(given, fit)),
+        notes=tuple(notes),
     )
 
 
 def notes_of(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
     """Report what the calibration could not estimate."""
+    manifest, total = given.manifest, count_frames(given.seams)
+    kept = count_frames(fit.problem.seams)
+    placed = fit.problem.layout.sheets
+    for pair in sorted(total, key=sorted):
+        rejected = total[pair] - kept[pair]
+        if rejected and (kept[pair] < MIN_SEAM_FRAMES or kept[pair] <= rejected):
+            first, other = (manifest.sheets[number].id for number in sorted(pair))
+            yield f"{first} and {other}: {kept[pair]} of {total[pair]} frames at their seam agree"
+    if fit.problem.seams and fit.noise.seam > GROSS_OUTLIER_SIGMAS:
+        yield (
+            f"frames at one seam differ {fit.noise.seam:.0f} times as much as the noise of their "
+            "dots explains: is the floor flat, the lens calibrated, and does the floor consist of "
+            "these sheets? Do not trust the standard deviations"
+        )
+    for number in given.layout.sheets:
+        if number not in placed:
+            yield (
+                f"{manifest.sheets[number].id} has no position: its seams have fewer than "
+                f"{MIN_SEAM_FRAMES} frames that agree, or as many that do not"
+            )
     if not given.layout.nodes:
         yield (
             "the floor has too many sheets for a model of the errors of their print: the standard "
@@ -665,8 +783,14 @@ def notes_of(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
 def built_manifest(
     manifest: Manifest, built: Sequence[BuiltSheet], scale: tuple[float, float]
 ) -> Manifest:
-    """Return the manifest of a floor as built; ``scale`` is nan if it was not estimated."""
-    sheets = list(manifest.sheets)
+    """Return the manifest of a floor as built; ``scale`` is nan if it was not estimated.
+
+    Sheets that are not among those built have no position, not even that of the design.
+    """
+    sheets = [
+        replace(sheet, position_mm=None, heading_deg=0.0, covariance_mm_deg=None)
+        for sheet in manifest.sheets
+    ]
     for sheet in built:
         to_degrees = np.diag([1.0, 1.0, math.degrees(1)])
         covariance = to_degrees @ sheet.covariance @ to_degrees
@@ -678,6 +802,7 @@ def built_manifest(
             covariance_mm_deg=tuple(tuple(row) for row in covariance.tolist()),
             distortion=sheet.distortion,
             distortion_sigma_mm=sheet.distortion_sigma_mm,
+            distortion_sigma_deg=math.degrees(sheet.distortion_sigma_rad),
         )
     result = replace(manifest, sheets=tuple(sheets))
     if math.isfinite(scale[0]):

@@ -40,7 +40,7 @@ from scipy.special import chdtri
 
 from locatk.core.dots.calibration.seam_measurements import SeamMeasurement
 from locatk.core.dots.sheet import Manifest, interpolation_weights
-from locatk.core.geometry import wrap_angle
+from locatk.core.geometry import rotation_matrix_2d, wrap_angle
 from locatk.core.robust import SIGMA_PER_MEDIAN_ABSOLUTE
 
 Array = NDArray[np.float64]
@@ -287,6 +287,57 @@ def field_weights(
     )
 
 
+def cell_quarters(manifest: Manifest, number: int, nodes: tuple[int, int]) -> Array:
+    """Return four points (n, 2) in mm in each cell between the nodes of a sheet."""
+    finer = (4 * (nodes[0] - 1) + 1, 4 * (nodes[1] - 1) + 1)
+    grid = node_positions(manifest, number, finer).reshape(finer[1], finer[0], 2)
+    return grid[1::2, 1::2].reshape(-1, 2)
+
+
+def field_correlation(points: Array, others: Array, length_mm: float) -> tuple[Array, Array]:
+    """Return the correlations of a field at two sets of points (n, 2), (m, 2) in mm.
+
+    Returns
+    -------
+    correlation : (n, m) ndarray
+        Matern, smoothness 3/2 (Rasmussen and Williams 2006, eq. 4.17).
+    slope : (n, m, 2) ndarray
+        Its derivatives by the first points, per mm.
+    """
+    rate = math.sqrt(3) / length_mm
+    offset = points[:, None] - others
+    ratio = rate * np.linalg.norm(offset, axis=2)
+    decay = np.exp(-ratio)
+    return (1 + ratio) * decay, -(rate**2) * offset * decay[..., None]
+
+
+def unresolved_variance(
+    nodes: Array, points: Array, weights: FieldWeights, length_mm: float
+) -> tuple[float, float, float]:
+    """Return the mean variance of a field about its interpolation between true nodes.
+
+    It is relative to that of the field, of the displacement and of its derivatives by x and y.
+    """
+    among, _ = field_correlation(nodes, nodes, length_mm)
+    to_nodes, slope = field_correlation(points, nodes, length_mm)
+    squared_rate = 3 / length_mm**2
+    value, by_x, by_y = (
+        float(
+            np.mean(
+                variance
+                - 2 * (each * cross).sum(axis=1)
+                + np.einsum("ni,ij,nj->n", each, among, each)
+            )
+        )
+        for variance, each, cross in (
+            (1.0, weights.value, to_nodes),
+            (squared_rate, weights.by_x, slope[..., 0]),
+            (squared_rate, weights.by_y, slope[..., 1]),
+        )
+    )
+    return value, by_x, by_y
+
+
 # ---- observations as linear equations
 
 
@@ -370,7 +421,7 @@ class FloorProblem:
         """Return points (n, 2) of a sheet's paper on the floor."""
         layout, n = self.layout, len(points)
         x, y, angle = self.pose(number, state)
-        rotation = planar_rotation(angle)
+        rotation = rotation_matrix_2d(angle)
         by_position, by_heading = np.zeros((n, 2, layout.size)), np.zeros((n, layout.size))
         on_paper, heading = points, np.full(n, angle)
         if layout.alignments:
@@ -429,7 +480,7 @@ class FloorProblem:
         """Return predicted minus measured poses (3 k,) in mm and rad, and derivatives."""
         first = self.sheet_points(seam.numbers[0], seam.poses[:, :2], state)
         to_first = np.eye(3)
-        to_first[:2, :2] = planar_rotation(self.pose(seam.numbers[0], state)[2]).T
+        to_first[:2, :2] = rotation_matrix_2d(self.pose(seam.numbers[0], state)[2]).T
         residuals, jacobians = [], []
         for k, number in enumerate(seam.numbers[1:]):
             other = self.sheet_points(number, seam.points_mm[k : k + 1], state)
@@ -459,7 +510,7 @@ class FloorProblem:
         index = self.layout.alignment(truth.alignment)
         x, y, angle, lever_x, lever_y, mounting = state[index]
         on_floor = self.sheet_points(truth.number, truth.points_mm, state)
-        rotation = planar_rotation(angle)
+        rotation = rotation_matrix_2d(angle)
         rotated = on_floor.position @ rotation.T
         predicted = rotated + [x, y]
         jacobian = rotation @ on_floor.by_position
@@ -480,12 +531,6 @@ class FloorProblem:
         residual = (predicted - truth.truth_mm).ravel()
         flat = jacobian.reshape(-1, self.layout.size)
         yield POSITION, Equations(residual, flat, rows.repeat(2), truth.variance[:, 0].mean())
-
-
-def planar_rotation(angle: float) -> Array:
-    """Return the counter-clockwise rotation (2, 2) by an angle in rad."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s], [s, c]])
 
 
 def _perpendicular(vectors: Array) -> Array:
@@ -605,8 +650,8 @@ class Prior:
         key = number, length_mm
         if key not in self._inverse:
             points = self._positions[number]
-            ratio = math.sqrt(3) / length_mm * np.linalg.norm(points[:, None] - points, axis=2)
-            matrix = (1 + ratio) * np.exp(-ratio) + RELATIVE_JITTER * np.eye(len(points))
+            matrix, _ = field_correlation(points, points, length_mm)
+            matrix += RELATIVE_JITTER * np.eye(len(points))
             _, log_determinant = np.linalg.slogdet(matrix)
             self._inverse[key] = np.linalg.inv(matrix), -float(log_determinant)
         return self._inverse[key]
@@ -640,10 +685,12 @@ def fit_noise(
     """
     grams = _Grams.of(problem.linearize(state), state)
     prior = Prior(problem.manifest, problem.layout)
+    names = _free_parameters(problem)
+    if not names:
+        return noise
     best: tuple[float, Noise] | None = None
     for length_mm in lengths_mm or (noise.length_mm,):
         start = replace(noise if best is None else best[1], length_mm=length_mm)
-        names = _free_parameters(problem)
 
         def loss(logarithms: Array, names: list[str] = names, start: Noise = start) -> float:
             try:
@@ -798,6 +845,8 @@ def _is_explained(fit: FloorFit) -> bool:
     """Return whether seams agree within the noise of their dots, without fields and truth."""
     if fit.problem.truths:
         return False
+    if not fit.problem.seams:
+        return True
     residual = fit.problem.linearize(fit.state)[SEAM].residual
     excess = float(residual @ residual) / len(residual) - 1
     return excess < MAX_EXCESS_SIGMAS * math.sqrt(2 / len(residual))

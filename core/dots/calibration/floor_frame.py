@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.calibration.floor_fit import (
     FloorFit,
+    cell_quarters,
     field_weights,
     node_positions,
-    planar_rotation,
+    unresolved_variance,
 )
 from locatk.core.dots.sheet import Distortion
+from locatk.core.geometry import rotation_matrix_2d, wrap_angle
 
 Array = NDArray[np.float64]
 
@@ -48,6 +50,8 @@ class BuiltSheet:
     distortion : Distortion or None
     distortion_sigma_mm : (x, y)
         Standard deviation of the errors of the print that are not in the map.
+    distortion_sigma_rad : float
+        Standard deviation of the local rotation by these errors.
     """
 
     number: int
@@ -59,6 +63,7 @@ class BuiltSheet:
     truth_frames: int
     distortion: Distortion | None
     distortion_sigma_mm: tuple[float, float]
+    distortion_sigma_rad: float
 
     @property
     def sigma(self) -> Array:
@@ -82,21 +87,22 @@ def build_sheets(fit: FloorFit) -> tuple[BuiltSheet, ...]:
         truth_frames = sum(
             len(truth.time_ns) for truth in fit.problem.truths if truth.number == number
         )
-        distortion, sigma = _distortion(fit, number, truth_frames >= MIN_MAPPED_FRAMES)
+        is_mapped = truth_frames >= MIN_MAPPED_FRAMES
         nominal = np.full(3, np.nan)
         if sheet.position_mm is not None:
             nominal = np.array([*sheet.position_mm, math.radians(sheet.heading_deg)])
+        shift = in_frame - nominal
+        shift[2] = wrap_angle(shift[2])
         built.append(
             BuiltSheet(
                 number,
                 sheet.id,
                 in_frame,
                 derivative @ fit.covariance @ derivative.T,
-                in_frame - nominal,
+                shift,
                 sum(number in seam.numbers for seam in fit.problem.seams),
                 truth_frames,
-                distortion,
-                sigma,
+                *_distortion(fit, number, is_mapped),
             )
         )
     return tuple(built)
@@ -125,7 +131,7 @@ def _rigid_pose(fit: FloorFit, number: int) -> tuple[Array, Array]:
         derivative[:, index] = np.eye(3)
     if number in problem.layout.nodes:
         to_floor = np.eye(3)
-        to_floor[:2, :2] = planar_rotation(pose[2])
+        to_floor[:2, :2] = rotation_matrix_2d(pose[2])
         operator, _ = _rigid_part(fit, number)
         unknowns = problem.layout.field(number).ravel()
         derivative[:, unknowns] = to_floor @ operator
@@ -138,23 +144,26 @@ def _in_datum(
 ) -> tuple[Array, Array]:
     """Return a pose in the frame in which the datum sheet has the pose ``datum``."""
     angle = datum[2] - datum_pose[2]
-    rotation = planar_rotation(angle)
+    rotation = rotation_matrix_2d(angle)
     lever = rotation @ (pose[:2] - datum_pose[:2])
     by_angle = np.array([-lever[1], lever[0]])
     derivative = np.empty_like(by_unknowns)
     derivative[:2] = rotation @ (by_unknowns[:2] - datum_by_unknowns[:2])
     derivative[:2] -= by_angle[:, None] * datum_by_unknowns[2]
     derivative[2] = by_unknowns[2] - datum_by_unknowns[2]
-    return np.append(datum[:2] + lever, pose[2] + angle), derivative
+    return np.append(datum[:2] + lever, wrap_angle(pose[2] + angle)), derivative
 
 
 def _distortion(
     fit: FloorFit, number: int, is_mapped: bool
-) -> tuple[Distortion | None, tuple[float, float]]:
-    """Return the map of a sheet's errors, and the standard deviations of those that are left."""
+) -> tuple[Distortion | None, tuple[float, float], float]:
+    """Return the map of a sheet's errors, and the standard deviations of those that are left.
+
+    These are of displacements along both axes [mm], and of the local rotation [rad].
+    """
     layout = fit.problem.layout
     if number not in layout.nodes:
-        return None, (0.0, 0.0)
+        return None, (0.0, 0.0), 0.0
     unknowns = layout.field(number).ravel()
     operator, basis = _rigid_part(fit, number)
     other = np.eye(len(unknowns)) - basis @ operator
@@ -162,32 +171,36 @@ def _distortion(
     covariance = other @ fit.covariance[np.ix_(unknowns, unknowns)] @ other.T
     if not is_mapped:
         covariance = covariance + np.outer(mean, mean)
-    x, y = np.sqrt(_mean_variance(fit, number, covariance)).tolist()
+    x, y, rotation = np.sqrt(_mean_variance(fit, number, covariance)).tolist()
     if not is_mapped:
-        return None, (x, y)
+        return None, (x, y), rotation
     columns, rows = layout.nodes[number]
     along_x, along_y = mean.reshape(2, rows, columns)
-    return Distortion(_as_rows(along_x), _as_rows(along_y)), (x, y)
+    return Distortion(_as_rows(along_x), _as_rows(along_y)), (x, y), rotation
 
 
 def _mean_variance(fit: FloorFit, number: int, covariance: Array) -> Array:
-    """Return the variance (2,) of displacements along both axes, as the mean over the sheet.
+    """Return the variance (3,) of displacements along both axes and of the local rotation.
 
-    ``covariance`` (2 nodes, 2 nodes) is that of the nodes, of which those at the ends are the least
-    certain. The mean is over the middles of the cells between them.
+    It is the mean over the sheet, at the quarters of the cells between the nodes. ``covariance``
+    (2 nodes, 2 nodes) is that of the nodes. What the nodes do not resolve has its variance a
+    priori.
     """
     manifest, nodes = fit.problem.manifest, fit.problem.layout.nodes[number]
-    columns, rows = nodes
-    grid = node_positions(manifest, number, nodes).reshape(rows, columns, 2)
-    middles = (grid[:-1, :-1] + grid[1:, 1:]).reshape(-1, 2) / 2
-    weights = field_weights(manifest, number, nodes, middles).value
-    by_axis = covariance.reshape(2, columns * rows, 2, columns * rows)
-    return np.array(
-        [
-            np.einsum("ni,ij,nj->n", weights, by_axis[axis, :, axis], weights).mean()
-            for axis in (0, 1)
-        ]
+    points = cell_quarters(manifest, number, nodes)
+    weights = field_weights(manifest, number, nodes, points)
+    none = np.zeros_like(weights.value)
+    rows = [
+        np.hstack([weights.value, none]),
+        np.hstack([none, weights.value]),
+        np.hstack([-weights.by_y, weights.by_x]) / 2,
+    ]
+    resolved = [np.einsum("ni,ij,nj->n", row, covariance, row).mean() for row in rows]
+    value, by_x, by_y = unresolved_variance(
+        node_positions(manifest, number, nodes), points, weights, fit.noise.length_mm
     )
+    x, y = np.square(fit.noise.field_mm)
+    return np.array(resolved) + [value * x, value * y, (by_x * y + by_y * x) / 4]
 
 
 def _as_rows(values: Array) -> tuple[tuple[float, ...], ...]:

@@ -14,13 +14,14 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
-from locatk.core.dots.localization.seams import SheetView
+from locatk.core.dots.localization.separation import SheetView
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest, Sheet
+from locatk.core.errors import DegenerateError, InputError
+from locatk.core.geometry import apply_homography, fit_homography, umeyama
 from locatk.core.least_squares import DenseEquations, Indices, minimize
 from locatk.core.robust import robust_sigma
 
@@ -89,7 +90,8 @@ def measure_seam(
 ) -> SeamMeasurement | None:
     """Measure the relative poses of the sheets in a frame.
 
-    None if fewer than two sheets have :data:`MIN_VIEW_DOTS`, or if the dots do not fit.
+    None if fewer than two sheets have :data:`MIN_VIEW_DOTS`, if these are collinear, or if the dots
+    do not fit.
     """
     if len(views) < 2:
         return None
@@ -97,7 +99,10 @@ def measure_seam(
     views = [view for view in views if len(view.pixels) >= MIN_VIEW_DOTS]
     if len(views) < 2:
         return None
-    fit = _SeamFit.of(views, manifest, camera)
+    try:
+        fit = _SeamFit.of(views, manifest, camera)
+    except DegenerateError:
+        return None
     covariance, scatter = fit.refine()
     slope = fit.parameters[[0, 1, 3, 4]].reshape(2, 2)
     pitch = manifest.pitch_mm * math.sqrt(abs(float(np.linalg.det(slope))))
@@ -124,7 +129,7 @@ def without_ambiguous_dots(views: list[SheetView]) -> list[SheetView]:
     is_unique = (count == 1)[index.ravel()]
     ends = np.cumsum([len(view.pixels) for view in views])[:-1]
     return [
-        SheetView(view.number, view.pixels[kept], view.grid[kept])
+        replace(view, pixels=view.pixels[kept], grid=view.grid[kept])
         for view, kept in zip(views, np.split(is_unique, ends), strict=True)
     ]
 
@@ -167,6 +172,13 @@ class _SeamFit:
 
     @classmethod
     def of(cls, views: list[SheetView], manifest: Manifest, camera: Camera) -> _SeamFit:
+        """Return the initial guess of the fit of some views.
+
+        Raises
+        ------
+        DegenerateError
+            The dots of the first sheet are collinear.
+        """
         half_diagonal = math.hypot(*camera.size) / 2
         pixels = np.concatenate([view.pixels for view in views])
         observed = (camera.undistort(pixels) - camera.centre_px) / half_diagonal
@@ -175,16 +187,15 @@ class _SeamFit:
         middles = np.array([position.mean(axis=0) for position in positions])
         paper = np.concatenate(positions) - middles[sheet]
         first = sheet == 0
-        homography, _ = cv2.findHomography(paper[first], observed[first])
+        homography = fit_homography(paper[first], observed[first])
         parameters = [homography.ravel()[:8] / homography[2, 2]]
         inverse = np.linalg.inv(homography)
         for other in range(1, len(views)):
             rows = sheet == other
-            plane = cv2.perspectiveTransform(observed[rows][:, None], inverse)[:, 0]
-            shift = plane.mean(axis=0)
-            cross = paper[rows].T @ (plane - shift)
-            angle = math.atan2(cross[0, 1] - cross[1, 0], cross[0, 0] + cross[1, 1])
-            parameters.append(np.array([angle, *shift]))
+            plane = apply_homography(inverse, observed[rows])
+            rigid = umeyama(paper[rows], plane, with_scale=False)
+            angle = math.atan2(rigid.rotation[1, 0], rigid.rotation[0, 0])
+            parameters.append(np.array([angle, *rigid.translation]))
         return cls(observed, paper, sheet, middles, np.concatenate(parameters))
 
     def refine(self) -> tuple[Array, float]:
@@ -300,6 +311,31 @@ def crop_overlaps(manifest: Manifest, seams: Iterable[SeamMeasurement]) -> Manif
     return replace(manifest, sheets=tuple(sheets))
 
 
+def refuse_contained_tiles(manifest: Manifest) -> None:
+    """Refuse tiles inside of others, which no cut separates.
+
+    Raises
+    ------
+    InputError
+        The pattern of a tile contains that of another one.
+    """
+    low = np.array([sheet.origin for sheet in manifest.sheets])
+    high = low + [sheet.size for sheet in manifest.sheets]
+    section = np.array([sheet.section for sheet in manifest.sheets])
+    is_tile = np.array([sheet.position_mm is not None for sheet in manifest.sheets])
+    for number in np.flatnonzero(is_tile):
+        is_around = (low <= low[number]).all(axis=1) & (high >= high[number]).all(axis=1)
+        is_around &= is_tile & (section == section[number]).all(axis=1)
+        is_around[number] = False
+        if is_around.any():
+            inner, outer = manifest.sheets[number], manifest.sheets[int(is_around.argmax())]
+            raise InputError(
+                f"the pattern of tile {inner.id} is inside of that of {outer.id}",
+                hint="Tiles overlap at their sides only; remove the one that is not part of the "
+                "floor from the manifest",
+            )
+
+
 def _overlap(
     first: Sheet, second: Sheet, axis: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
@@ -312,7 +348,8 @@ def _overlap(
     ends = [np.array(sheet.origin) + sheet.size for sheet in (first, second)]
     low, high = np.maximum(first.origin, second.origin), np.minimum(*ends)
     across = 1 - axis
-    if (low >= high).any() or second.origin[axis] <= first.origin[axis]:
+    continues = second.origin[axis] > first.origin[axis] and ends[1][axis] > ends[0][axis]
+    if (low >= high).any() or not continues:
         return None
     # Diagonal neighbours share a corner only.
     is_side = high[across] - low[across] > min(first.size[across], second.size[across]) / 2

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from locatk.core.dots.calibration import floor as calibration
 from locatk.core.dots.calibration.floor import FloorRecording, built_manifest, calibrate_floor
 from locatk.core.dots.calibration.floor_fit import (
+    FieldWeights,
     FloorFit,
     FloorProblem,
     Noise,
@@ -21,6 +22,7 @@ from locatk.core.dots.calibration.floor_fit import (
     cross_validate,
     fit_floor,
     lay_out_unknowns,
+    unresolved_variance,
 )
 from locatk.core.dots.calibration.floor_frame import build_sheets
 from locatk.core.dots.calibration.seam_measurements import SeamMeasurement
@@ -28,6 +30,8 @@ from locatk.core.dots.camera import Camera
 from locatk.core.dots.frames import Frames
 from locatk.core.dots.sheet import Distortion, Manifest, Sheet
 from locatk.core.errors import DegenerateError, InputError
+from locatk.core.geometry import quaternion_from_heading
+from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Warp = Callable[[Array], Array]
@@ -184,6 +188,79 @@ def test_wrong_frames_are_rejected() -> None:
     assert nees(floor.errors(fit)) < 3
 
 
+def displaced(seam: SeamMeasurement, x_mm: float, y_mm: float) -> SeamMeasurement:
+    return replace(seam, poses=seam.poses + [[x_mm, y_mm, 0.0]])
+
+
+def test_a_sheet_whose_frames_disagree_has_no_position() -> None:
+    """One of three frames is right, so that the rejection of outliers may leave any of them."""
+    for seed in range(3):
+        floor = Floor(seed, 3, 1)
+        good = floor.measure(0, 1, 0, 8)
+        doubtful = floor.measure(1, 2, 0, 3)
+        doubtful[1:] = [displaced(doubtful[1], 4, 3), displaced(doubtful[2], -5, 6)]
+        given, problem, _, fit = calibration.fit_consistent_sheets(
+            floor.manifest, [0, 1, 2], good + doubtful, []
+        )
+        built = build_sheets(fit)
+        assert [sheet.number for sheet in built] == [0, 1]
+        assert np.hypot(*(built[1].pose - floor.poses[1])[:2]) < 0.03
+        assert problem.layout.sheets == (0, 1)
+        notes = list(calibration.notes_of(given, fit))
+        assert "c1r0 and c2r0: 0 of 3 frames at their seam agree" in notes
+        assert any(note.startswith("c2r0 has no position") for note in notes)
+        # The position of the design is not one of the floor as built.
+        manifest = built_manifest(floor.manifest, built, (math.nan, math.nan))
+        assert manifest.frame(1) == "floor"
+        assert manifest.frame(2) == "c2r0"
+
+
+def test_of_two_opinions_with_equal_votes_neither_is_believed() -> None:
+    floor = Floor(3, 3, 1)
+    seams = floor.measure(0, 1, 0, 8) + floor.measure(1, 2, 0, 10)
+    seams[-5:] = [displaced(seam, 0.4, -0.3) for seam in seams[-5:]]
+    _, _, _, fit = calibration.fit_consistent_sheets(floor.manifest, [0, 1, 2], seams, [])
+    assert [sheet.number for sheet in build_sheets(fit)] == [0, 1]
+    # One vote more decides.
+    seams += floor.measure(1, 2, 0, 4)
+    _, _, _, fit = calibration.fit_consistent_sheets(floor.manifest, [0, 1, 2], seams, [])
+    _, _, last = build_sheets(fit)
+    assert last.seam_frames == 9
+    assert np.hypot(*(last.pose - floor.poses[2])[:2]) < 0.03
+
+
+def test_a_floor_whose_datum_is_not_connected_is_refused() -> None:
+    floor = Floor(3, 3, 1)
+    seams = floor.measure(0, 1, 0, 3)
+    seams[1:] = [displaced(seams[1], 4, 3), displaced(seams[2], -5, 6)]
+    seams += floor.measure(1, 2, 0, 8)
+    with pytest.raises(DegenerateError, match="no sheet is connected with c0r0"):
+        calibration.fit_consistent_sheets(floor.manifest, [0, 1, 2], seams, [])
+
+
+def test_a_seam_without_a_majority_is_named() -> None:
+    floor = Floor(3, 2, 1)
+    seams = floor.measure(0, 1, 0, 10)
+    seams[5:] = [displaced(seam, 0.4, -0.3) for seam in seams[5:]]
+    given, _, _, fit = calibration.fit_consistent_sheets(floor.manifest, [0, 1], seams, [])
+    (note,) = calibration.notes_of(given, fit)
+    assert "times as much as the noise of their dots" in note
+
+
+def test_headings_are_compared_modulo_a_turn() -> None:
+    floor = Floor(2, 3, 1)
+    sheets = list(floor.manifest.sheets)
+    sheets[1] = replace(sheets[1], heading_deg=180.0, position_mm=(300.0, 210.0))
+    sheets[2] = replace(sheets[2], heading_deg=-90.0, position_mm=(300.0, 500.0))
+    floor.manifest = replace(floor.manifest, sheets=tuple(sheets))
+    floor.poses = np.array([[0, 0, 0], [300.3, 210.2, 0.004 - math.pi], [300, 500, -math.pi / 2]])
+    seams = floor.measure(0, 1, 0, 20) + floor.measure(1, 2, 0, 20)
+    _, second, third = build_sheets(floor.fit(seams))
+    assert second.shift == pytest.approx([0.3, 0.2, 0.004], abs=0.05)
+    assert third.shift == pytest.approx([0, 0, 0], abs=0.05)
+    assert abs(third.pose[2]) <= math.pi
+
+
 @pytest.mark.slow
 def test_errors_of_the_print_along_a_seam_widen_the_covariance() -> None:
     """Errors of 0.1 mm along the seams, where a frame measures to 5 um."""
@@ -202,8 +279,33 @@ def test_errors_of_the_print_along_a_seam_widen_the_covariance() -> None:
         sheets = build_sheets(fit)
         assert all(sheet.distortion is None for sheet in sheets)
         assert all(0.02 < sheet.distortion_sigma_mm[0] < 0.4 for sheet in sheets)
+        # Local rotations are half the curl: 0.1 mm / 35 mm and / 40 mm, two sines.
+        rotation = 0.05 * math.hypot(1 / 35, 1 / 40) / math.sqrt(2)
+        assert all(0.3 < sheet.distortion_sigma_rad / rotation < 3 for sheet in sheets)
         errors += floor.errors(fit)
     assert nees(errors) < 3
+
+
+def test_what_the_nodes_of_a_field_do_not_resolve() -> None:
+    """Against fields that are drawn at the nodes and next to a point, with weights of nodes."""
+    rng = np.random.default_rng(0)
+    nodes = np.stack(np.meshgrid([0.0, 40, 80], [0.0, 40, 80]), axis=-1).reshape(-1, 2)
+    point, step, length = np.array([[27.0, 51.0]]), 0.5, 50.0
+    near = point + step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    every = np.concatenate([nodes, near])
+    ratio = math.sqrt(3) / length * np.linalg.norm(every[:, None] - every, axis=2)
+    root = np.linalg.cholesky((1 + ratio) * np.exp(-ratio) + 1e-12 * np.eye(len(every)))
+    drawn = rng.normal(size=(40_000, len(every))) @ root.T
+    value, by_x, by_y = rng.normal(0, [[0.2], [0.01], [0.01]], (3, 9))
+    at_nodes, around = drawn[:, :9], drawn[:, 9:]
+    weights = FieldWeights(value[None], by_x[None], by_y[None])
+    result = unresolved_variance(nodes, point, weights, length)
+    errors = (
+        around[:, 0] - at_nodes @ value,
+        (around[:, 1] - around[:, 2]) / (2 * step) - at_nodes @ by_x,
+        (around[:, 3] - around[:, 4]) / (2 * step) - at_nodes @ by_y,
+    )
+    assert result == pytest.approx([np.mean(error**2) for error in errors], rel=0.04)
 
 
 def stretched(points: Array) -> Array:
@@ -362,6 +464,10 @@ def blank_recording() -> FloorRecording:
 def test_refusals() -> None:
     with pytest.raises(InputError, match="a single sheet"):
         calibrate_floor([blank_recording()], designed(1, 1))
+    small = replace(designed(2, 1).sheets[0], id="small", size=(50, 394))
+    inside = replace(designed(2, 1), sheets=(*designed(2, 1).sheets, small))
+    with pytest.raises(InputError, match="tile small is inside of that of c0r0"):
+        calibrate_floor([blank_recording()], inside)
     with pytest.raises(DegenerateError, match="no frame shows a sheet"):
         calibrate_floor([blank_recording()], designed(2, 1))
     large = replace(blank_recording(), camera=Camera((320, 240), 348.7, (159.5, 119.5)))
@@ -371,6 +477,52 @@ def test_refusals() -> None:
     with pytest.raises(DegenerateError, match="camera of blank cannot be estimated") as error:
         calibrate_floor([without], designed(2, 1))
     assert "--camera" in str(error.value.hint)
+
+
+@pytest.fixture(scope="module")
+def left_alone(
+    laid_sheet: Callable[..., Any], shoot_floor: Callable[..., Any]
+) -> tuple[Manifest, Frames]:
+    """Two sheets without positions, and frames over the first one only, 10 mm apart."""
+    size, page, first = (300, 200), (160.0, 110.0), (3.0, 3.0)
+    manifest = Manifest(
+        (
+            Sheet("first", (1000, 2000), size, (0, 0), page, first),
+            Sheet("second", (5000, 9000), size, (0, 0), page, first),
+        )
+    )
+    floor = (laid_sheet((1000, 2000), size, page, first),)
+    images = [shoot_floor(floor, 40.0 + 10 * k, 50.0, seed=k) for k in range(8)]
+    times = 10**18 + np.arange(8) * 10**8
+    return manifest, Frames("cam", times, tuple(map(str, range(8))), images)
+
+
+@pytest.mark.parametrize(
+    ("has_truth", "delay_s", "words"),
+    [
+        (False, 0.0, "no frame shows a seam between two sheets"),
+        (True, 0.0, "8 poses with truth cannot be used: at least 10 on one sheet, over 20 mm"),
+        (True, 1e4, "no frame on a single sheet has truth at its time"),
+    ],
+    ids=["no seam", "few poses", "another time"],
+)
+def test_frames_without_use_are_refused(
+    left_alone: tuple[Manifest, Frames], has_truth: bool, delay_s: float, words: str
+) -> None:
+    manifest, frames = left_alone
+    truth = None
+    if has_truth:
+        x = 0.04 + 0.01 * np.arange(8)
+        truth = Trajectory(
+            *("body", "room", frames.time_ns + round(delay_s * 1e9)),
+            np.column_stack([x, 0.05 + 0 * x, 0 * x]),
+            quaternion_from_heading(0 * x),
+            np.full((8, 6, 6), np.nan),
+        )
+    camera = Camera((188, 120), 348.7, (93.5, 59.5))
+    with pytest.raises(DegenerateError, match=words) as error:
+        calibrate_floor([FloorRecording("run", frames, camera, truth)], manifest)
+    assert error.value.hint
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from locatk.core.dots.calibration.seam_measurements import (
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.localization.seams import SheetView, separate_sheets
+from locatk.core.dots.localization.separation import SheetView, separate_sheets
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.solver import SolveOptions, solve
 

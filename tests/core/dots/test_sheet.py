@@ -190,6 +190,8 @@ def test_the_covariance_of_a_floor_is_that_of_its_sheets() -> None:
     c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
     expected = np.array([[c, -s], [s, c]]) @ np.diag([1e-8, 9e-8]) @ np.array([[c, s], [-s, c]])
     np.testing.assert_allclose(rough.covariance(0, position[0])[:2, :2], expected)
+    turned = Manifest((replace(PAGE, distortion_sigma_deg=0.1),)).covariance(0, position[0])
+    np.testing.assert_allclose(turned, np.diag([0, 0, np.radians(0.1) ** 2]))
     assert not Manifest((PAGE,)).covariance(0, position).any()
 
 

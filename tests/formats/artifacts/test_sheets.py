@@ -160,6 +160,10 @@ def test_tiles_may_share_their_rims() -> None:
 COVARIANCE = """
 covariance_mm_deg = [[1.0, 0.1, 0.0], [0.1, 4.0, 0.0], [0.0, 0.0, 0.01]]
 """
+SIGMAS = """
+distortion_sigma_mm = [0.02, 0.05]
+distortion_sigma_deg = 0.03
+"""
 DISTORTION = """
 [sheets.distortion]
 x_mm = [[0.1, 0.2], [0.3, 0.4]]
@@ -168,10 +172,11 @@ y_mm = [[0.5, 0.6], [0.7, 0.8]]
 
 
 def test_sheets_as_built() -> None:
-    text = HEAD + SHEET + TILE + COVARIANCE + "distortion_sigma_mm = [0.02, 0.05]" + DISTORTION
+    text = HEAD + SHEET + TILE + COVARIANCE + SIGMAS + DISTORTION
     (sheet,) = loads_manifest(text).sheets
     assert sheet.covariance_mm_deg == ((1.0, 0.1, 0.0), (0.1, 4.0, 0.0), (0.0, 0.0, 0.01))
     assert sheet.distortion_sigma_mm == (0.02, 0.05)
+    assert sheet.distortion_sigma_deg == 0.03
     assert sheet.distortion is not None
     assert sheet.distortion.y_mm == ((0.5, 0.6), (0.7, 0.8))
     sheet.distortion.displacement_mm  # noqa: B018 - computed once; it is no part of the file
