@@ -39,12 +39,14 @@ from locatk.core.dots.identification.phase_voting import (
     estimate_rotated_windows,
     estimate_windows,
     following_phases,
+    kernel_tables,
     phase_scores,
     rotate_to_print,
     rotation_scores,
 )
 from locatk.core.dots.identification.rival_codecs import PrintedWindows, rival_likelihood
 from locatk.core.errors import InputError
+from locatk.core.kernels import kernels
 
 MIN_CONFIDENCE = 0.999
 """Least confidence of an accepted result."""
@@ -420,6 +422,27 @@ def search_position(
     rivals : (n,) float64 ndarray
         Likelihood of the other candidates relative to this one.
     """
+    if kernels is None:
+        return search_position_numpy(
+            scores, codec, try_misread_columns=try_misread_columns, beam_width=beam_width
+        )
+    n, length, _ = scores.shape
+    positions, rivals = np.empty((n, 2), np.int64), np.empty(n)
+    kernels.search_positions(
+        np.ascontiguousarray(scores),
+        *(n, length),
+        *kernel_tables(codec),
+        *(SECTION_LENGTH, sequences.MIN_SHIFT),
+        *(beam_width, MISREAD_COLUMNS if try_misread_columns else 0, PHASES_PER_MISREAD_COLUMN),
+        *(MIN_MARGINAL_PROBABILITY, positions, rivals),
+    )
+    return positions[:, 0], positions[:, 1], rivals
+
+
+def search_position_numpy(
+    scores: Bits, codec: Codec, *, try_misread_columns: bool, beam_width: int = FIRST_BEAM_WIDTH
+) -> tuple[Integers, Integers, NDArray[np.float64]]:
+    """Search positions as :func:`search_position`, without the compiled kernel."""
     n, length, _ = scores.shape
     candidates = _likely_candidates(scores, codec, beam_width)
     if try_misread_columns:
@@ -485,11 +508,17 @@ def _likely_candidates(scores: Bits, codec: Codec, beam_width: int) -> Integers:
 
 
 def _candidates_from_misread_columns(scores: Bits, codec: Codec) -> Integers:
-    """Return positions (n, candidates) for all combinations of phases of uncertain columns."""
+    """Return positions (n, candidates) for all combinations of phases of uncertain columns.
+
+    Columns without dots are not uncertain but unknown; they do not vote.
+    """
     n, length, _ = scores.shape
-    ranked = np.argsort(-scores, axis=2)[:, :, :PHASES_PER_MISREAD_COLUMN]
+    ranked = np.argsort(-scores, axis=2, kind="stable")[:, :, :PHASES_PER_MISREAD_COLUMN]
     score = np.take_along_axis(scores, ranked, axis=2)
-    uncertain = np.argsort(score[..., 0] - score[..., 1], axis=1)[:, :MISREAD_COLUMNS]
+    has_dots = scores.any(axis=2)
+    lead = np.where(has_dots, score[..., 0] - score[..., 1], np.inf)
+    uncertain = np.argsort(lead, axis=1, kind="stable")[:, :MISREAD_COLUMNS]
+    is_step = (has_dots[:, 1:] & has_dots[:, :-1])[:, None, :, None]
     rank = np.indices((PHASES_PER_MISREAD_COLUMN,) * MISREAD_COLUMNS)
     rank = rank.reshape(MISREAD_COLUMNS, -1).T
     phases = np.repeat(ranked[:, None, :, 0], len(rank), axis=1)
@@ -499,7 +528,7 @@ def _candidates_from_misread_columns(scores: Bits, codec: Codec) -> Integers:
     ]
     shift = (phases[..., 1:] - phases[..., :-1]) % MAIN_SEQUENCE_LENGTH
     residues = [
-        (digits[shift].reshape(n, len(rank), -1) @ ballots).argmax(axis=2)
+        ((digits[shift] * is_step).reshape(n, len(rank), -1) @ ballots).argmax(axis=2)
         for digits, ballots in zip(digit_tables(), ballot_tables(codec, length - 1), strict=True)
     ]
     return codec.position(np.stack(residues, axis=2))
