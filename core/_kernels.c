@@ -1963,7 +1963,8 @@ static void following_phases(const Codec *codec, int64_t position, int length, i
             residues[k] = residues[k] + 1 < codec->lengths[k] ? residues[k] + 1 : 0;
             prefix += codec->lengths[k] + 1;
         }
-        phase = ++position < codec->range ? remainder_of(phase, PERIOD) : 0;
+        phase = remainder_of(phase, PERIOD);
+        if (++position == codec->range) position = phase = 0;
     }
 }
 

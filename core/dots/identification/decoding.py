@@ -44,7 +44,13 @@ from locatk.core.dots.identification.phase_voting import (
     rotate_to_print,
     rotation_scores,
 )
-from locatk.core.dots.identification.rival_codecs import PrintedWindows, rival_likelihood
+from locatk.core.dots.identification.rival_codecs import (
+    CoreLines,
+    core_lines,
+    has_rivals,
+    other_codecs,
+    rival_likelihood,
+)
 from locatk.core.errors import InputError
 from locatk.core.kernels import kernels
 
@@ -126,6 +132,9 @@ class DecodedWindows:
     border : (n,) bool ndarray
         Whether there are dots on both sides of the border of a section; such a window has no
         confidence.
+    rival_odds : (n,) float64 ndarray
+        Odds that the window is one of another codec at another position, included in the
+        confidence.
     """
 
     x: Integers
@@ -136,6 +145,7 @@ class DecodedWindows:
     corrected: Integers
     confidence: NDArray[np.float64]
     border: NDArray[np.bool_]
+    rival_odds: NDArray[np.float64]
 
 
 def identify_windows(
@@ -180,10 +190,9 @@ def identify_windows(
             getattr(result, field.name)[doubtful] = getattr(soft, field.name)
     if other_codec_odds:
         decoded = np.flatnonzero(result.confidence >= MIN_CODE_CONFIDENCE)
-        printed = _as_printed(result, column_bits, row_bits, decoded)
-        rivals = rival_likelihood(printed, result.corrected[decoded], codec)
-        confidence = result.confidence[decoded]
-        result.confidence[decoded] = confidence / (1 + confidence * other_codec_odds * rivals)
+        odds = other_codec_odds * _rival_likelihood(result, column_bits, row_bits, decoded, codec)
+        result.rival_odds[decoded] = odds
+        result.confidence[decoded] /= 1 + result.confidence[decoded] * odds
     return result
 
 
@@ -205,6 +214,7 @@ def _decode_exact(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWin
         corrected=np.zeros(n, np.int64),
         confidence=np.where(exact.ok & (weakest > 0), (1 + np.exp(-log_odds)) ** -2, 0.0),
         border=np.zeros(n, np.bool_),
+        rival_odds=np.zeros(n),
     )
 
 
@@ -355,26 +365,45 @@ def as_decoded(
         corrected=estimates.wrong.sum(axis=1),
         confidence=np.where(border, 0.0, confidence),
         border=border,
+        rival_odds=np.zeros(len(dots)),
     )
 
 
-def _as_printed(
-    decoded: DecodedWindows, column_bits: Bits, row_bits: Bits, chosen: NDArray[np.intp]
-) -> PrintedWindows:
-    """Return the ``chosen`` (m,) windows as printed, squared, with the phases of their corner."""
+def _rival_likelihood(
+    decoded: DecodedWindows,
+    column_bits: Bits,
+    row_bits: Bits,
+    chosen: NDArray[np.intp],
+    codec: Codec,
+) -> NDArray[np.float64]:
+    """Return how likely other codecs are, relative to the ``chosen`` (m,) decoded windows.
+
+    It is the mean over the other known codecs, so that its product with the prior odds that the
+    sheet is one of these are the posterior odds against the decoded position.
+    """
+    result = np.zeros(len(chosen))
+    if not len(chosen):
+        return result
     _, rows, columns = column_bits.shape
     length = max(rows, columns)
-    rotation = decoded.rotation[chosen]
-    column, row = rotate_to_print(
-        _pad_to_square(column_bits[chosen]), _pad_to_square(row_bits[chosen]), rotation
-    )
-    corner = np.column_stack([decoded.x[chosen], decoded.y[chosen]])
+    bits = _pad_to_square(column_bits[chosen]), _pad_to_square(row_bits[chosen])
+    rotation, section = decoded.rotation[chosen], decoded.section[chosen]
+    corner = np.stack([decoded.x[chosen], decoded.y[chosen]], axis=1)
     corner -= _printed_padding(rotation, (length - rows, length - columns))
-    return PrintedWindows(
-        lines=(column.transpose(0, 2, 1), row),
-        position=corner % SECTION_LENGTH,
-        shift=(decoded.section[chosen] + corner[:, ::-1]) % MAIN_SEQUENCE_LENGTH,
-    )
+    core = core_lines(bits[0] != 0, rotation, decoded.corrected[chosen])
+    others = other_codecs(codec)
+    for other, is_possible in zip(others, has_rivals(core, corner, codec).T, strict=True):
+        k = np.flatnonzero(is_possible)
+        if len(k):
+            printed = rotate_to_print(bits[0][k], bits[1][k], rotation[k])
+            result[k] += rival_likelihood(
+                np.stack([printed[0].transpose(0, 2, 1), printed[1]], axis=1),
+                corner[k] % SECTION_LENGTH,
+                (section[k] + corner[k, ::-1]) % MAIN_SEQUENCE_LENGTH,
+                CoreLines(*(v[k] for v in core)),
+                (codec, other),
+            ) / len(others)
+    return result
 
 
 def _printed_padding(rotation: Integers, padding: tuple[int, int]) -> Integers:

@@ -48,6 +48,10 @@ MIN_TRIED_LEVELS = 4
 """Number of sizes that are tried, each half of the previous one; more if the preferred one is
 smaller still."""
 
+SETTLED_FRACTION = 0.9
+"""Fraction of the detected dots of a frame beyond which other dots do not decide between codecs:
+windows of two codecs that are the same go on to be the same for tens of columns."""
+
 TOO_FEW_DOTS = "too_few_dots"
 NO_GRID = "no_grid"
 NO_CODE = "no_code"
@@ -77,6 +81,9 @@ class LocalizedFrames:
         Probability that the position is right.
     rejected : (n,) object ndarray of str
         Reason of rejection; ``""`` if the frame is localized.
+    ambiguous : (n,) bool ndarray
+        Whether only another codec, which has nearly all of the frame's dots at another position,
+        limits the confidence.
     """
 
     grid: NDArray[np.float64]
@@ -87,6 +94,7 @@ class LocalizedFrames:
     corrected: NDArray[np.int64]
     confidence: NDArray[np.float64]
     rejected: NDArray[np.object_]
+    ambiguous: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.rejected)
@@ -96,6 +104,11 @@ class LocalizedFrames:
         """Whether each frame (n,) is localized."""
         result: NDArray[np.bool_] = self.rejected == ""
         return result
+
+    @property
+    def settled(self) -> NDArray[np.bool_]:
+        """Whether no other size of the frame and no other lattice improve the result (n,)."""
+        return self.accepted | self.ambiguous
 
     def update(self, indices: NDArray[np.int64], part: LocalizedFrames) -> None:
         """Store ``part`` for the ``indices`` that it localizes or has no less confidence in."""
@@ -120,6 +133,7 @@ def unlocalized_frames(n: int, reason: str) -> LocalizedFrames:
         corrected=np.zeros(n, np.int64),
         confidence=np.zeros(n),
         rejected=np.full(n, reason, object),
+        ambiguous=np.zeros(n, np.bool_),
     )
 
 
@@ -157,10 +171,7 @@ def localize_frames(
                 points, dots, codec, camera is None, min_confidence, other_codec_odds
             )
             # Strong tilt, strong distortion and covered frames take longer than all others.
-            if part.accepted.all():
-                result.update(remaining, part)
-                break
-            again = np.flatnonzero(~part.accepted & (part.rejected != TOO_FEW_DOTS))
+            again = np.flatnonzero(~part.settled & (part.rejected != TOO_FEW_DOTS))
             if len(again):
                 thorough, _, _ = _localize_dots(
                     points[again],
@@ -173,7 +184,7 @@ def localize_frames(
                 )
                 part.update(again, thorough)
             result.update(remaining, part)
-            remaining = remaining[~result.accepted[remaining]]
+            remaining = remaining[~result.settled[remaining]]
             if not len(remaining):
                 break
     return result
@@ -248,6 +259,9 @@ def _localize_lattices(
     rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
     rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
     rejected[(rejected != "") & windows.border] = SECTION_BORDER
+    certain = windows.confidence >= min_confidence * (1 - windows.confidence * windows.rival_odds)
+    ambiguous = certain & (rejected != "")
+    ambiguous &= windows.dots > SETTLED_FRACTION * lattices.valid.sum(axis=1)
     frames = LocalizedFrames(
         grid=poses.grid,
         section=windows.section,
@@ -257,6 +271,7 @@ def _localize_lattices(
         corrected=windows.corrected,
         confidence=windows.confidence,
         rejected=rejected,
+        ambiguous=ambiguous,
     )
     return frames, lattices, windows
 

@@ -201,13 +201,23 @@ def test_readings_are_the_same(name: str, side: int, missing: float, wrong: floa
     np.testing.assert_allclose(mine.log_odds[agree], twin.log_odds[agree], atol=1e-3)
 
 
+def across_sections(x: int, side: int, name: str) -> NDArray[np.uint8]:
+    """Symbols from column ``x`` on, continued at the first column."""
+    first = min(side, SECTION_LENGTH - x)
+    parts = [codec(name).symbols((x, 7), (first, side))]
+    if first < side:
+        parts.append(codec(name).symbols((0, 7), (side - first, side)))
+    return np.concatenate(parts, axis=1)
+
+
 def column_scores(
     seed: int, n: int, side: int, missing: float, wrong: float, name: str = "anoto"
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Scores of the columns of windows with wrong bits, and the positions of their first ones."""
     rng = np.random.default_rng(seed)
     position = rng.integers(0, SECTION_LENGTH - side, n)
-    windows = [codec(name).symbols((int(x), 7), (side, side)) for x in position]
+    position[::2] = SECTION_LENGTH - rng.integers(1, side, n // 2)  # on into the next section
+    windows = [across_sections(int(x), side, name) for x in position]
     bits = np.where(np.array(windows) & 1, 1, -1) * rng.uniform(2, 8, (n, side, side))
     bits[rng.random(bits.shape) < wrong] *= -1
     bits[rng.random(bits.shape) < missing] = 0
@@ -247,7 +257,7 @@ def test_misread_columns_are_found_between_columns_without_dots(search: Search) 
         search(s, ANOTO, try_misread_columns=True, beam_width=1) for s in (scores, padded)
     )
     assert (alone[0] == position).mean() > 0.8
-    assert np.array_equal(alone[0], (among[0] + 5) % SECTION_LENGTH)
+    assert (alone[0] == (among[0] + 5) % SECTION_LENGTH).mean() > 0.95
 
 
 @needs_kernels
