@@ -1279,7 +1279,7 @@ static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid,
         a[2] -= shift[axis];
     }
     double squares = 0;
-    for (int i = 0; i < m; i++) {
+    for (int i = 0; i < m && i < d->count; i++) {
         uv[2 * i] = d->u[i] - (float)shift[0];
         uv[2 * i + 1] = d->v[i] - (float)shift[1];
         cells[2 * i] = rintf(uv[2 * i]);
@@ -1361,6 +1361,10 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             load_dots(&d, points + 2 * dot, valid + dot, (int)m);
+            /* Other frames of the batch may have more dots, which are padding in this one. */
+            size_t last = (size_t)m;
+            while (last && !valid[dot + last - 1]) last--;
+            d.count = (int)(last + LANES - 1) / LANES * LANES;
             found[k] = (uint8_t)fit_lattice(&d, points + 2 * dot, valid + dot, (int)m, lens,
                                             &options, scratch, parameters + k * PARAMETERS,
                                             uv + 2 * dot, cells + 2 * dot, sigma + k);

@@ -544,7 +544,7 @@ def _candidates_from_misread_columns(scores: Bits, codec: Codec) -> Integers:
     n, length, _ = scores.shape
     ranked = np.argsort(-scores, axis=2, kind="stable")[:, :, :PHASES_PER_MISREAD_COLUMN]
     score = np.take_along_axis(scores, ranked, axis=2)
-    has_dots = scores.any(axis=2)
+    has_dots = (scores != 0).any(axis=2)
     lead = np.where(has_dots, score[..., 0] - score[..., 1], np.inf)
     uncertain = np.argsort(lead, axis=1, kind="stable")[:, :MISREAD_COLUMNS]
     is_step = (has_dots[:, 1:] & has_dots[:, :-1])[:, None, :, None]

@@ -92,8 +92,7 @@ def has_rivals(core: CoreLines, position: Integers, own: Codec) -> NDArray[np.bo
     common = np.array([_common_lines(own, count)[k] for count, k in pairs])
     common = common.reshape(*residue.shape, -1, 2)
     is_explained = common >= core.needed[..., None, None]
-    result: NDArray[np.bool_] = is_explained[..., 0].all(axis=1) & is_explained[..., 1].any(axis=1)
-    return result
+    return np.logical_and(is_explained[..., 0].all(axis=1), is_explained[..., 1].any(axis=1))
 
 
 def rival_likelihood(
