@@ -147,6 +147,10 @@ class DecodedWindows:
     border: NDArray[np.bool_]
     rival_odds: NDArray[np.float64]
 
+    def select(self, indices: NDArray[np.int64]) -> DecodedWindows:
+        """Return the results for some of the windows."""
+        return DecodedWindows(*(getattr(self, f.name)[indices] for f in fields(DecodedWindows)))
+
 
 def identify_windows(
     column_bits: Bits,
@@ -229,14 +233,22 @@ def _decode_soft(
     dots = np.count_nonzero(windows[0], axis=(1, 2))
     doubtful = np.flatnonzero((confidence < MIN_CONFIDENCE) & (dots <= MAX_SMALL_WINDOW_DOTS))
     if is_thorough and len(doubtful):
-        part = windows[0][doubtful], windows[1][doubtful]
-        for rotation in np.argsort(-rotation_scores(*part), axis=0)[:2]:
-            other = estimate_rotated_windows(*part, rotation, codec)
+        scores = rotation_scores(windows[0][doubtful], windows[1][doubtful])
+        evidence = 0.5 * scores - sum(_random_evidence(bits[doubtful]) for bits in windows)
+        # Both axes need that much, even if each line had its best phase.
+        is_possible = evidence > 2 * (LOG_HYPOTHESES + MIN_LOG_ODDS)
+        for rotation in np.argsort(-scores, axis=0)[:2]:
+            kept = is_possible[rotation, np.arange(len(doubtful))]
+            if not kept.any():
+                continue
+            chosen = doubtful[kept]
+            part = windows[0][chosen], windows[1][chosen]
+            other = estimate_rotated_windows(*part, rotation[kept], codec)
             other_confidence = resolve_doubts(other, *part, codec, beam_width=SECOND_BEAM_WIDTH)
-            better = other_confidence > confidence[doubtful]
+            better = other_confidence > confidence[chosen]
             for values, other_values in zip(estimates, other, strict=True):
-                values[doubtful[better]] = other_values[better]
-            confidence[doubtful[better]] = other_confidence[better]
+                values[chosen[better]] = other_values[better]
+            confidence[chosen[better]] = other_confidence[better]
     _, rows, columns = column_bits.shape
     return as_decoded(estimates, confidence, dots, (length - rows, length - columns))
 
@@ -331,12 +343,23 @@ def _search_axis(
 def is_decodable(lines: Bits, scores: Bits) -> NDArray[np.bool_]:
     """Return whether windows (n,) could be accepted if each line had its best phase."""
     best = scores.max(axis=2)
-    evidence = 0.5 * best.sum(axis=1) - np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
+    evidence = 0.5 * best.sum(axis=1) - _random_evidence(lines)
     likely = (scores > best[..., None] - MAX_LIKELY_PHASE_GAP).sum(axis=2)
     order = np.log(MAIN_SEQUENCE_LENGTH / likely).sum(axis=1)
     result: NDArray[np.bool_] = (evidence > LOG_HYPOTHESES + MIN_LOG_ODDS) & (
         order > LOG_HYPOTHESES + MIN_LOG_ODDS + math.log(OTHER_CODEC_ODDS * AGREEING_AXIS_FRACTION)
     )
+    return result
+
+
+def _random_evidence(bits: Bits) -> NDArray[np.float64]:
+    """Return the log likelihood (n,) of windows of random bits, where half the sum of the bits'
+    correlation with a pattern is that of the pattern.
+    """
+    flat = bits.reshape(len(bits), -1)
+    window, dot = np.nonzero(flat)
+    evidence = np.log(np.cosh(0.5 * flat[window, dot]))
+    result: NDArray[np.float64] = np.bincount(window, evidence, len(flat)).astype(np.float64)
     return result
 
 

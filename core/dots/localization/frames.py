@@ -254,25 +254,20 @@ def _localize_lattices(
     windows = identify_windows(
         *bits, codec, is_thorough=is_thorough, other_codec_odds=other_codec_odds
     )
-    poses = localize_windows(lattices, half, windows, codec)
-    rejected = np.full(len(windows.confidence), "", object)
-    rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
-    rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
-    rejected[(rejected != "") & windows.border] = SECTION_BORDER
+    frames = unlocalized_frames(len(windows.confidence), "")
+    decoded = np.flatnonzero(windows.confidence >= MIN_CODE_CONFIDENCE)
+    if len(decoded):
+        poses = localize_windows(lattices.select(decoded), half, windows.select(decoded), codec)
+        frames.grid[decoded], frames.heading[decoded] = poses.grid, poses.heading
+        frames.covariance[decoded] = poses.covariance
+    for name in ("section", "dots", "corrected", "confidence"):
+        getattr(frames, name)[:] = getattr(windows, name)
+    frames.rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
+    frames.rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
+    frames.rejected[~frames.accepted & windows.border] = SECTION_BORDER
     certain = windows.confidence >= min_confidence * (1 - windows.confidence * windows.rival_odds)
-    ambiguous = certain & (rejected != "")
-    ambiguous &= windows.dots > SETTLED_FRACTION * lattices.valid.sum(axis=1)
-    frames = LocalizedFrames(
-        grid=poses.grid,
-        section=windows.section,
-        heading=poses.heading,
-        covariance=poses.covariance,
-        dots=windows.dots,
-        corrected=windows.corrected,
-        confidence=windows.confidence,
-        rejected=rejected,
-        ambiguous=ambiguous,
-    )
+    is_covered = windows.dots > SETTLED_FRACTION * lattices.valid.sum(axis=1)
+    frames.ambiguous[:] = certain & ~frames.accepted & is_covered
     return frames, lattices, windows
 
 
