@@ -1477,7 +1477,7 @@ static PyObject *soft_bits(PyObject *self, PyObject *args)
 
 /* ---- First reading of windows ----------------------------------------------------------- */
 
-enum { PERIOD = 63, SEQUENCES = 4, BASE = 3 };
+enum { PERIOD = 63, SEQUENCES = 4, BASE = 3, MAX_WINDOW_CELLS = 1024 };
 
 typedef struct {
     const int64_t *lengths, *weights, *crt; /* of the four secondary sequences */
@@ -1514,6 +1514,25 @@ static int64_t phase_at(const Codec *codec, int64_t position)
         prefix += length + 1;
     }
     return remainder_of(total, PERIOD);
+}
+
+/* Phases of lines from a position on, across the end of the section. */
+static void following_phases(const Codec *codec, int64_t position, int length, int *phases)
+{
+    int64_t residues[SEQUENCES], phase = phase_at(codec, position);
+    for (int k = 0; k < SEQUENCES; k++) residues[k] = position % codec->lengths[k];
+    for (int i = 0; i < length; i++) {
+        phases[i] = (int)phase;
+        const int64_t *prefix = codec->prefixes;
+        phase += codec->smallest_shift;
+        for (int k = 0; k < SEQUENCES; k++) {
+            phase += codec->weights[k] * (prefix[residues[k] + 1] - prefix[residues[k]]);
+            residues[k] = residues[k] + 1 < codec->lengths[k] ? residues[k] + 1 : 0;
+            prefix += codec->lengths[k] + 1;
+        }
+        phase = remainder_of(phase, PERIOD);
+        if (++position == codec->range) position = phase = 0;
+    }
 }
 
 /* Find the most likely position and shift of one axis by votes of the most likely phase of each
@@ -1564,10 +1583,10 @@ HOT static void vote_position(const Codec *codec, const float *const *scores, in
     }
     axis->position = position;
     float shift_votes[PERIOD] = {0};
-    for (int i = 0; i < lines; i++) {
-        const int64_t expected = phase_at(codec, (position + i) % codec->range);
-        shift_votes[remainder_of(phase[i] - expected, PERIOD)] += margin[i];
-    }
+    int expected[MAX_WINDOW_CELLS];
+    following_phases(codec, position, lines, expected);
+    for (int i = 0; i < lines; i++)
+        shift_votes[(phase[i] - expected[i] + PERIOD) % PERIOD] += margin[i];
     int best = 0;
     for (int k = 1; k < PERIOD; k++)
         if (shift_votes[k] > shift_votes[best]) best = k;
@@ -1579,8 +1598,7 @@ HOT static void vote_position(const Codec *codec, const float *const *scores, in
         if (top <= 0) continue;
         int likely = 0;
         for (int k = 0; k < PERIOD; k++) likely += scores[i][k] > top - 2;
-        const int64_t expected = phase_at(codec, (position + i) % codec->range);
-        const float score = scores[i][remainder_of(expected + best, PERIOD)];
+        const float score = scores[i][(expected[i] + best) % PERIOD];
         axis->order_log_odds += codec->phase_log_odds[likely] - 0.5 * (double)(top - score);
     }
 }
@@ -1594,10 +1612,11 @@ static void score_position(const Codec *codec, const float *bits, float sign, in
     axis->wrong = 0;
     axis->first = length;
     axis->last = -1;
+    int phases[MAX_WINDOW_CELLS];
+    following_phases(codec, axis->position, length, phases);
     for (int i = 0; i < length; i++) {
         const float *line = bits + start + i * across;
-        const int64_t phase = remainder_of(
-            phase_at(codec, (axis->position + i) % codec->range) + axis->shift, PERIOD);
+        const int64_t phase = (phases[i] + axis->shift) % PERIOD;
         int has_dots = 0;
         for (int j = 0; j < length; j++) {
             const float bit = line[j * along];
@@ -1676,7 +1695,7 @@ HOT static void read_window(const Codec *codec, const float *x_bits, const float
 }
 
 /* Limits of a codec. They bound indices into its tables and keep sums of phases within 64 bits. */
-enum { MAX_SEQUENCE = 512, MAX_WINDOW_CELLS = 1024, MAX_WEIGHT = 1000 };
+enum { MAX_SEQUENCE = 512, MAX_WEIGHT = 1000 };
 #define MAX_POSITIONS (1LL << 40)
 #define MAX_COORDINATE (1LL << 60)
 
@@ -1951,25 +1970,6 @@ static int likely_candidates(const Codec *codec, const Search *s)
         s->candidates[i] = position;
     }
     return entries;
-}
-
-/* Phases of lines from a position on, across the end of the section. */
-static void following_phases(const Codec *codec, int64_t position, int length, int *phases)
-{
-    int64_t residues[SEQUENCES], phase = phase_at(codec, position);
-    for (int k = 0; k < SEQUENCES; k++) residues[k] = position % codec->lengths[k];
-    for (int i = 0; i < length; i++) {
-        phases[i] = (int)phase;
-        const int64_t *prefix = codec->prefixes;
-        phase += codec->smallest_shift;
-        for (int k = 0; k < SEQUENCES; k++) {
-            phase += codec->weights[k] * (prefix[residues[k] + 1] - prefix[residues[k]]);
-            residues[k] = residues[k] + 1 < codec->lengths[k] ? residues[k] + 1 : 0;
-            prefix += codec->lengths[k] + 1;
-        }
-        phase = remainder_of(phase, PERIOD);
-        if (++position == codec->range) position = phase = 0;
-    }
 }
 
 HOT static uint8_t largest_byte(const uint8_t *bytes, int count)

@@ -29,7 +29,7 @@ from locatk.core.dots.identification.decoding import (
     identify_windows,
 )
 from locatk.core.dots.identification.soft_bits import soft_bits, window_half_width
-from locatk.core.dots.localization.pose import assign_dots, localize_windows
+from locatk.core.dots.localization.pose import GridPoses, assign_dots, localize_windows
 from locatk.core.errors import InputError
 
 Images = NDArray[np.uint8]
@@ -170,6 +170,9 @@ def localize_frames(
             part, _, _ = _localize_dots(
                 points, dots, codec, camera is None, min_confidence, other_codec_odds
             )
+            if part.settled.all():
+                result.update(remaining, part)
+                break
             # Strong tilt, strong distortion and covered frames take longer than all others.
             again = np.flatnonzero(~part.settled & (part.rejected != TOO_FEW_DOTS))
             if len(again):
@@ -254,21 +257,42 @@ def _localize_lattices(
     windows = identify_windows(
         *bits, codec, is_thorough=is_thorough, other_codec_odds=other_codec_odds
     )
-    frames = unlocalized_frames(len(windows.confidence), "")
-    decoded = np.flatnonzero(windows.confidence >= MIN_CODE_CONFIDENCE)
-    if len(decoded):
-        poses = localize_windows(lattices.select(decoded), half, windows.select(decoded), codec)
-        frames.grid[decoded], frames.heading[decoded] = poses.grid, poses.heading
-        frames.covariance[decoded] = poses.covariance
-    for name in ("section", "dots", "corrected", "confidence"):
-        getattr(frames, name)[:] = getattr(windows, name)
-    frames.rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
-    frames.rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
-    frames.rejected[~frames.accepted & windows.border] = SECTION_BORDER
+    rejected = np.full(len(windows.confidence), "", object)
+    rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
+    rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
+    rejected[(rejected != "") & windows.border] = SECTION_BORDER
     certain = windows.confidence >= min_confidence * (1 - windows.confidence * windows.rival_odds)
     is_covered = windows.dots > SETTLED_FRACTION * lattices.valid.sum(axis=1)
-    frames.ambiguous[:] = certain & ~frames.accepted & is_covered
+    poses = _localize_decoded(lattices, half, windows, codec)
+    frames = LocalizedFrames(
+        grid=poses.grid,
+        section=windows.section,
+        heading=poses.heading,
+        covariance=poses.covariance,
+        dots=windows.dots,
+        corrected=windows.corrected,
+        confidence=windows.confidence,
+        rejected=rejected,
+        ambiguous=certain & is_covered & (rejected != ""),
+    )
     return frames, lattices, windows
+
+
+def _localize_decoded(
+    lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
+) -> GridPoses:
+    """Estimate the poses of windows that contain the code; those of others are nan."""
+    has_code = windows.confidence >= MIN_CODE_CONFIDENCE
+    if has_code.all():
+        return localize_windows(lattices, half, windows, codec)
+    n = len(has_code)
+    poses = GridPoses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
+    decoded = np.flatnonzero(has_code)
+    if len(decoded):
+        part = localize_windows(lattices.select(decoded), half, windows.select(decoded), codec)
+        for field in fields(GridPoses):
+            getattr(poses, field.name)[decoded] = getattr(part, field.name)
+    return poses
 
 
 def _levels(height: int, width: int) -> list[int]:
