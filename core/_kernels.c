@@ -1064,6 +1064,46 @@ static int estimate_seed(const float *points, const uint8_t *valid, int m,
 /* Number of frequencies along an axis of a spectrum; the other has half of them and zero. */
 enum { MAX_FREQUENCIES = 48 };
 
+/* Power of dots at the frequencies (column, row) and (-column, row) in multiples of `step`, from 0
+ * to `half` each; 1 if all dots have the same phase. `waves` holds 2 MAX_FREQUENCIES floats for each
+ * dot. */
+HOT static void spectrum(const float *restrict x, const float *restrict y, int count, float step,
+                         int half, float *restrict waves, float *restrict power)
+{
+    enum { ROW = MAX_FREQUENCIES / 2 };
+    for (int i = 0; i < count; i++) {
+        float *wave = waves + i * 4 * ROW;
+        for (int axis = 0; axis < 2; axis++, wave += 2 * ROW) {
+            const float phase = 6.2831853f * step * (axis ? y[i] : x[i]);
+            const float c = cosf(phase), s = sinf(phase);
+            wave[0] = 1;
+            wave[ROW] = 0;
+            for (int k = 1; k < ROW; k++) {
+                wave[k] = wave[k - 1] * c - wave[ROW + k - 1] * s;
+                wave[ROW + k] = wave[k - 1] * s + wave[ROW + k - 1] * c;
+            }
+        }
+    }
+    const float scale = 1 / (float)(count * count);
+    for (int row = 0; row <= half; row++) {
+        float sums[4][ROW] = {{0}};
+        for (int i = 0; i < count; i++) {
+            const float *restrict a = waves + i * 4 * ROW, *restrict b = a + ROW;
+            const float c = a[2 * ROW + row], d = a[3 * ROW + row];
+            for (int k = 0; k < ROW; k++) sums[0][k] += a[k] * c;
+            for (int k = 0; k < ROW; k++) sums[1][k] += b[k] * d;
+            for (int k = 0; k < ROW; k++) sums[2][k] += a[k] * d;
+            for (int k = 0; k < ROW; k++) sums[3][k] += b[k] * c;
+        }
+        for (int k = 0; k <= half; k++)
+            for (int side = 0; side < 2; side++) {
+                const float re = side ? sums[0][k] + sums[1][k] : sums[0][k] - sums[1][k];
+                const float im = side ? sums[2][k] - sums[3][k] : sums[2][k] + sums[3][k];
+                power[(row * (half + 1) + k) * 2 + side] = (re * re + im * im) * scale;
+            }
+    }
+}
+
 /* Estimate the lattice of the dots nearest to `middle` from the two highest peaks of their spectrum
  * in different directions, which no tilt and few foreign dots change; node (0, 0) is at the median
  * of the dots. Return 0 if the peaks are weak. `scratch` holds m floats and, for each seed, 10 and
@@ -1107,52 +1147,10 @@ static int spectral_seed(const float *points, const uint8_t *valid, int m, const
     /* Frequencies up to 1.7 per pitch, so near to each other that no peak is missed. */
     const int half = (int)lesser(ceilf(1.7f / pitch / (0.3f / radius)), MAX_FREQUENCIES / 2 - 1);
     const float step = 1.7f / pitch / (float)half;
-    const float two_pi = 6.2831853f;
-    float *waves[2][2]; /* cosine and sine of x and y, for each frequency and dot */
-    for (int axis = 0; axis < 2; axis++)
-        for (int part = 0; part < 2; part++)
-            waves[axis][part] = work + (2 * axis + part) * MAX_FREQUENCIES / 2 * seeds;
-    for (int axis = 0; axis < 2; axis++)
-        for (int k = 0; k <= half; k++)
-            for (int i = 0; i < count; i++) {
-                const float phase = two_pi * step * (float)k * (axis ? y[i] : x[i]);
-                waves[axis][0][k * count + i] = cosf(phase);
-                waves[axis][1][k * count + i] = sinf(phase);
-            }
-    float *power = work + 4 * MAX_FREQUENCIES / 2 * seeds;
+    float *power = work + 4 * (MAX_FREQUENCIES / 2) * seeds;
+    spectrum(x, y, count, step, half, work, power);
     float best[2] = {0, 0}, frequency[2][2] = {{0}};
     double phasor[2][2] = {{0}};
-    for (int row = 0; row <= half; row++)
-        for (int column = 0; column <= half; column++) {
-            const float *restrict a = waves[0][0] + column * count;
-            const float *restrict b = waves[0][1] + column * count;
-            const float *restrict c = waves[1][0] + row * count;
-            const float *restrict d = waves[1][1] + row * count;
-            float sums[4][LANES] = {{0}};
-            int i = 0;
-            for (; i + LANES <= count; i += LANES)
-                for (int l = 0; l < LANES; l++) {
-                    sums[0][l] += a[i + l] * c[i + l];
-                    sums[1][l] += b[i + l] * d[i + l];
-                    sums[2][l] += a[i + l] * d[i + l];
-                    sums[3][l] += b[i + l] * c[i + l];
-                }
-            float total[4];
-            for (int k = 0; k < 4; k++) total[k] = (float)sum_lanes(sums[k]);
-            for (; i < count; i++) {
-                total[0] += a[i] * c[i];
-                total[1] += b[i] * d[i];
-                total[2] += a[i] * d[i];
-                total[3] += b[i] * c[i];
-            }
-            /* Frequencies (column, row) and (-column, row). */
-            for (int side = 0; side < 2; side++) {
-                const float re = side ? total[0] + total[1] : total[0] - total[1];
-                const float im = side ? total[2] - total[3] : total[2] + total[3];
-                power[(row * (half + 1) + column) * 2 + side] =
-                    (re * re + im * im) / (float)(count * count);
-            }
-        }
     for (int peak = 0; peak < 2; peak++) {
         int index = -1;
         for (int k = 0; k < 2 * (half + 1) * (half + 1); k++) {
@@ -1281,7 +1279,7 @@ static int fit_lattice(const Dots *d, const float *points, const uint8_t *valid,
         a[2] -= shift[axis];
     }
     double squares = 0;
-    for (int i = 0; i < m; i++) {
+    for (int i = 0; i < m && i < d->count; i++) {
         uv[2 * i] = d->u[i] - (float)shift[0];
         uv[2 * i + 1] = d->v[i] - (float)shift[1];
         cells[2 * i] = rintf(uv[2 * i]);
@@ -1363,6 +1361,10 @@ static PyObject *fit_lattices(PyObject *self, PyObject *args)
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             load_dots(&d, points + 2 * dot, valid + dot, (int)m);
+            /* Other frames of the batch may have more dots, which are padding in this one. */
+            size_t last = (size_t)m;
+            while (last && !valid[dot + last - 1]) last--;
+            d.count = (int)(last + LANES - 1) / LANES * LANES;
             found[k] = (uint8_t)fit_lattice(&d, points + 2 * dot, valid + dot, (int)m, lens,
                                             &options, scratch, parameters + k * PARAMETERS,
                                             uv + 2 * dot, cells + 2 * dot, sigma + k);
@@ -1475,7 +1477,7 @@ static PyObject *soft_bits(PyObject *self, PyObject *args)
 
 /* ---- First reading of windows ----------------------------------------------------------- */
 
-enum { PERIOD = 63, SEQUENCES = 4, BASE = 3 };
+enum { PERIOD = 63, SEQUENCES = 4, BASE = 3, MAX_WINDOW_CELLS = 1024 };
 
 typedef struct {
     const int64_t *lengths, *weights, *crt; /* of the four secondary sequences */
@@ -1512,6 +1514,25 @@ static int64_t phase_at(const Codec *codec, int64_t position)
         prefix += length + 1;
     }
     return remainder_of(total, PERIOD);
+}
+
+/* Phases of lines from a position on, across the end of the section. */
+static void following_phases(const Codec *codec, int64_t position, int length, int *phases)
+{
+    int64_t residues[SEQUENCES], phase = phase_at(codec, position);
+    for (int k = 0; k < SEQUENCES; k++) residues[k] = position % codec->lengths[k];
+    for (int i = 0; i < length; i++) {
+        phases[i] = (int)phase;
+        const int64_t *prefix = codec->prefixes;
+        phase += codec->smallest_shift;
+        for (int k = 0; k < SEQUENCES; k++) {
+            phase += codec->weights[k] * (prefix[residues[k] + 1] - prefix[residues[k]]);
+            residues[k] = residues[k] + 1 < codec->lengths[k] ? residues[k] + 1 : 0;
+            prefix += codec->lengths[k] + 1;
+        }
+        phase = remainder_of(phase, PERIOD);
+        if (++position == codec->range) position = phase = 0;
+    }
 }
 
 /* Find the most likely position and shift of one axis by votes of the most likely phase of each
@@ -1562,10 +1583,10 @@ HOT static void vote_position(const Codec *codec, const float *const *scores, in
     }
     axis->position = position;
     float shift_votes[PERIOD] = {0};
-    for (int i = 0; i < lines; i++) {
-        const int64_t expected = phase_at(codec, (position + i) % codec->range);
-        shift_votes[remainder_of(phase[i] - expected, PERIOD)] += margin[i];
-    }
+    int expected[MAX_WINDOW_CELLS];
+    following_phases(codec, position, lines, expected);
+    for (int i = 0; i < lines; i++)
+        shift_votes[(phase[i] - expected[i] + PERIOD) % PERIOD] += margin[i];
     int best = 0;
     for (int k = 1; k < PERIOD; k++)
         if (shift_votes[k] > shift_votes[best]) best = k;
@@ -1577,8 +1598,7 @@ HOT static void vote_position(const Codec *codec, const float *const *scores, in
         if (top <= 0) continue;
         int likely = 0;
         for (int k = 0; k < PERIOD; k++) likely += scores[i][k] > top - 2;
-        const int64_t expected = phase_at(codec, (position + i) % codec->range);
-        const float score = scores[i][remainder_of(expected + best, PERIOD)];
+        const float score = scores[i][(expected[i] + best) % PERIOD];
         axis->order_log_odds += codec->phase_log_odds[likely] - 0.5 * (double)(top - score);
     }
 }
@@ -1592,10 +1612,11 @@ static void score_position(const Codec *codec, const float *bits, float sign, in
     axis->wrong = 0;
     axis->first = length;
     axis->last = -1;
+    int phases[MAX_WINDOW_CELLS];
+    following_phases(codec, axis->position, length, phases);
     for (int i = 0; i < length; i++) {
         const float *line = bits + start + i * across;
-        const int64_t phase = remainder_of(
-            phase_at(codec, (axis->position + i) % codec->range) + axis->shift, PERIOD);
+        const int64_t phase = (phases[i] + axis->shift) % PERIOD;
         int has_dots = 0;
         for (int j = 0; j < length; j++) {
             const float bit = line[j * along];
@@ -1674,7 +1695,7 @@ HOT static void read_window(const Codec *codec, const float *x_bits, const float
 }
 
 /* Limits of a codec. They bound indices into its tables and keep sums of phases within 64 bits. */
-enum { MAX_SEQUENCE = 512, MAX_WINDOW_CELLS = 1024, MAX_WEIGHT = 1000 };
+enum { MAX_SEQUENCE = 512, MAX_WEIGHT = 1000 };
 #define MAX_POSITIONS (1LL << 40)
 #define MAX_COORDINATE (1LL << 60)
 
@@ -1781,6 +1802,395 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
     free(scores);
     free((void *)lines);
     free(phase);
+    return finish_call(&call, has_memory);
+}
+
+/* ---- Search of positions ---------------------------------------------------------------- */
+
+/* Largest number of lines of a window; votes of its lines are counted in a byte. */
+enum { MAX_SEARCH_LINES = 255, MAX_BEAM = 1 << 16, MAX_MISREAD = 6, MAX_RANKS = 4 };
+
+/* Combinations of digits of the first sequence, of the first two and so on. */
+enum { DIGITS_1 = BASE, DIGITS_2 = DIGITS_1 * BASE, DIGITS_3 = DIGITS_2 * BASE,
+       DIGITS_4 = DIGITS_3 * BASE, ALL_DIGITS = DIGITS_1 + DIGITS_2 + DIGITS_3 + DIGITS_4 };
+
+/* Row of doubled scores: those of all shifts from each phase on are contiguous. */
+enum { DOUBLED = 2 * PERIOD + 2 };
+
+/* Candidates this much less likely than the best one do not count as rivals. */
+#define NEGLIGIBLE_LOG_LIKELIHOOD 40.0f
+
+typedef struct {
+    float votes;
+    int entry, residue;
+} Choice;
+
+typedef struct {
+    int width, misread, ranks;   /* of the beam; misread lines, and phases of each */
+    float min_probability;       /* added to the probability of a digit */
+    int steps;                   /* from one line with dots to the next */
+    int *step;                   /* the first line of each step */
+    float *doubled, *odds;       /* (length, DOUBLED) scores; (steps, ALL_DIGITS) log odds */
+    float *votes, *sorted;       /* (MAX_SEQUENCE), (2 width) */
+    Choice *pool;                /* (2 width) */
+    int *residues[2];            /* (width, SEQUENCES) of the entries of the beam */
+    uint8_t *digits[2];          /* (width, steps) combination of the digits of the entries */
+    uint8_t *masks, *counts;     /* masks of the codec as bytes; votes (SEQUENCES + 1, MAX_SEQUENCE) */
+    uint8_t *chosen;             /* (2, length) steps whose votes are counted */
+    int64_t *candidates;
+    int *phase;                  /* (length) */
+} Search;
+
+/* Logarithms of the probabilities of digits for the step between two lines: of those of the first
+ * sequence, of the first two and so on. The probability of a shift is the circular correlation of
+ * those of both phases. */
+HOT static void step_odds(const Codec *codec, const float *line, const float *following,
+                          float min_probability, float *odds)
+{
+    float first[PERIOD], second[DOUBLED], shifts[PERIOD] = {0}, tops[2] = {line[0], following[0]};
+    float sums[2] = {0};
+    for (int k = 1; k < PERIOD; k++) {
+        tops[0] = tops[0] > line[k] ? tops[0] : line[k];
+        tops[1] = tops[1] > following[k] ? tops[1] : following[k];
+    }
+    for (int k = 0; k < PERIOD; k++) {
+        sums[0] += first[k] = expf(0.5f * (line[k] - tops[0]));
+        sums[1] += second[k] = second[k + PERIOD] = expf(0.5f * (following[k] - tops[1]));
+    }
+    for (int phase = 0; phase < PERIOD; phase++) {
+        if (!(first[phase] > 1e-9f)) continue;
+        const float *restrict shifted = second + phase;
+        for (int k = 0; k < PERIOD; k++) shifts[k] += first[phase] * shifted[k];
+    }
+    const float scale = 1 / (sums[0] * sums[1]);
+    for (int k = 0; k < ALL_DIGITS; k++) odds[k] = 0;
+    for (int shift = 0; shift < PERIOD; shift++) {
+        float *level = odds;
+        for (int k = 0, index = 0, size = BASE; k < SEQUENCES; k++, level += size, size *= BASE) {
+            const int digit = codec->digits[k * PERIOD + shift];
+            if (digit < 0) break;
+            index = BASE * index + digit;
+            level[index] += scale * shifts[shift];
+        }
+    }
+    for (int k = 0; k < ALL_DIGITS; k++) odds[k] = logf(odds[k] + min_probability);
+}
+
+/* Add the votes of the three digits of a step for all residues of a sequence. */
+HOT static void add_votes(const float *restrict odds, const float *restrict masks, int64_t widest,
+                          int length, float *restrict votes)
+{
+    const float zero = odds[0], one = odds[1] - odds[0], two = odds[2] - odds[0];
+    const float *restrict ones = masks + widest, *restrict twos = masks + 2 * widest;
+    for (int q = 0; q < length; q++) votes[q] += zero + one * ones[q] + two * twos[q];
+}
+
+HOT static int any_above(const float *values, int count, float limit)
+{
+    int any = 0;
+    for (int i = 0; i < count; i++) any |= values[i] > limit;
+    return any;
+}
+
+/* Order of choices by falling votes; none is NaN. */
+static int by_votes(const void *a, const void *b)
+{
+    const Choice *x = a, *y = b;
+    return (x->votes < y->votes) - (x->votes > y->votes);
+}
+
+/* Keep the choices of most votes; return the least of these. */
+static float shrink_pool(const Search *s, int *count)
+{
+    if (*count < s->width) return -INFINITY;
+    for (int i = 0; i < *count; i++) s->sorted[i] = s->pool[i].votes;
+    const float least = nth_smallest(s->sorted, *count, *count - s->width);
+    int kept = 0, equal = s->width;
+    for (int i = 0; i < *count; i++) equal -= s->pool[i].votes > least;
+    for (int i = 0; i < *count; i++) {
+        const float votes = s->pool[i].votes;
+        if (votes > least || (votes == least && equal-- > 0)) s->pool[kept++] = s->pool[i];
+    }
+    *count = kept;
+    return least;
+}
+
+/* Write the positions that the shifts between adjacent lines make likely; return their number. A
+ * beam search selects the residue of one sequence after the other. */
+static int likely_candidates(const Codec *codec, const Search *s)
+{
+    int entries = 1;
+    memset(s->residues[0], 0, SEQUENCES * sizeof(int));
+    memset(s->digits[0], 0, (size_t)s->steps);
+    const float *odds = s->odds;
+    const int64_t *prefix = codec->prefixes;
+    for (int k = 0, size = BASE; k < SEQUENCES; k++, odds += size, size *= BASE) {
+        const int length = (int)codec->lengths[k];
+        const uint8_t *digits = s->digits[k % 2];
+        const float *masks = codec->masks + (size_t)(k * BASE) * (size_t)codec->widest;
+        float least = -INFINITY;
+        int count = 0;
+        for (int entry = 0; entry < entries; entry++) {
+            memset(s->votes, 0, (size_t)length * sizeof(float));
+            for (int i = 0; i < s->steps; i++)
+                add_votes(odds + i * ALL_DIGITS + BASE * digits[entry * s->steps + i],
+                          masks + s->step[i] % length, codec->widest, length, s->votes);
+            if (!any_above(s->votes, length, least)) continue;
+            for (int q = 0; q < length; q++) {
+                if (!(s->votes[q] > least)) continue;
+                s->pool[count++] = (Choice){s->votes[q], entry, q};
+                if (count == 2 * s->width) least = shrink_pool(s, &count);
+            }
+        }
+        shrink_pool(s, &count);
+        /* The best first, so that soon few of the next choices are better than the least one. */
+        qsort(s->pool, (size_t)count, sizeof(Choice), by_votes);
+        for (int i = 0; i < count; i++) {
+            const Choice *choice = s->pool + i;
+            int *residues = s->residues[(k + 1) % 2] + i * SEQUENCES;
+            uint8_t *chosen = s->digits[(k + 1) % 2] + i * s->steps;
+            memcpy(residues, s->residues[k % 2] + choice->entry * SEQUENCES,
+                   SEQUENCES * sizeof(int));
+            residues[k] = choice->residue;
+            for (int j = 0; j < s->steps; j++) {
+                const int64_t *sum = prefix + (choice->residue + s->step[j]) % length;
+                chosen[j] = (uint8_t)(BASE * digits[choice->entry * s->steps + j]
+                                      + remainder_of(sum[1] - sum[0], BASE));
+            }
+        }
+        entries = count;
+        prefix += length + 1;
+    }
+    for (int i = 0; i < entries; i++) {
+        int64_t position = 0;
+        for (int k = 0; k < SEQUENCES; k++)
+            position = (position
+                        + codec->crt[k] * s->residues[SEQUENCES % 2][i * SEQUENCES + k])
+                       % codec->range;
+        s->candidates[i] = position;
+    }
+    return entries;
+}
+
+HOT static uint8_t largest_byte(const uint8_t *bytes, int count)
+{
+    uint8_t largest = 0;
+    for (int i = 0; i < count; i++) largest = bytes[i] > largest ? bytes[i] : largest;
+    return largest;
+}
+
+/* Add one vote of each chosen step for the residues that have its digit. */
+HOT static void count_votes(const Codec *codec, const Search *s, int k, const uint8_t *chosen,
+                            const int *phase, uint8_t *restrict counts)
+{
+    const int length = (int)codec->lengths[k];
+    for (int i = 0; i < s->steps; i++) {
+        if (!chosen[i]) continue;
+        const int line = s->step[i];
+        const int difference = (phase[line + 1] - phase[line] + PERIOD) % PERIOD;
+        const int digit = codec->digits[k * PERIOD + difference];
+        if (digit < 0) continue;
+        const uint8_t *restrict mask =
+            s->masks + (k * BASE + digit) * codec->widest + line % length;
+        for (int q = 0; q < length; q++) counts[q] = (uint8_t)(counts[q] + mask[q]);
+    }
+}
+
+/* Write the positions of all combinations of the likeliest phases of the least certain lines;
+ * return their number. The other lines have their likeliest phase. `used` are the lines with dots.
+ */
+static int misread_candidates(const Codec *codec, const Search *s, const uint8_t *used, int length,
+                              int64_t *candidates)
+{
+    int misread[MAX_MISREAD], ranked[MAX_MISREAD][MAX_RANKS], count = 0, combinations = 1;
+    float gaps[MAX_MISREAD];
+    for (int i = 0; i < length; i++) {
+        if (!used[i]) continue;
+        const float *score = s->doubled + (size_t)i * DOUBLED;
+        int top[MAX_RANKS] = {0}, ranks = 0;
+        for (int k = 0; k < PERIOD; k++) {
+            if (ranks == s->ranks && !(score[k] > score[top[ranks - 1]])) continue;
+            int rank = ranks < s->ranks ? ranks++ : ranks - 1;
+            for (; rank > 0 && score[k] > score[top[rank - 1]]; rank--) top[rank] = top[rank - 1];
+            top[rank] = k;
+        }
+        s->phase[i] = top[0];
+        const float gap = score[top[0]] - score[top[1]];
+        if (count == s->misread && !(gap < gaps[count - 1])) continue;
+        int rank = count < s->misread ? count++ : count - 1;
+        for (; rank > 0 && gap < gaps[rank - 1]; rank--) {
+            gaps[rank] = gaps[rank - 1];
+            misread[rank] = misread[rank - 1];
+            memcpy(ranked[rank], ranked[rank - 1], sizeof(*ranked));
+        }
+        gaps[rank] = gap;
+        misread[rank] = i;
+        memcpy(ranked[rank], top, sizeof(top));
+    }
+    /* Steps that no combination changes are counted once. */
+    uint8_t *is_fixed = s->chosen, *is_changing = is_fixed + s->steps;
+    for (int i = 0; i < s->steps; i++) {
+        is_changing[i] = 0;
+        for (int j = 0; j < count; j++)
+            is_changing[i] |= misread[j] == s->step[i] || misread[j] == s->step[i] + 1;
+        is_fixed[i] = !is_changing[i];
+    }
+    uint8_t *fixed = s->counts, *votes = fixed + SEQUENCES * MAX_SEQUENCE;
+    memset(fixed, 0, SEQUENCES * MAX_SEQUENCE);
+    for (int k = 0; k < SEQUENCES; k++)
+        count_votes(codec, s, k, is_fixed, s->phase, fixed + k * MAX_SEQUENCE);
+    for (int j = 0; j < count; j++) combinations *= s->ranks;
+    for (int c = 0; c < combinations; c++) {
+        for (int j = 0, rest = c; j < count; j++, rest /= s->ranks)
+            s->phase[misread[j]] = ranked[j][rest % s->ranks];
+        int64_t position = 0;
+        for (int k = 0; k < SEQUENCES; k++) {
+            const size_t size = (size_t)codec->lengths[k];
+            memcpy(votes, fixed + k * MAX_SEQUENCE, size);
+            count_votes(codec, s, k, is_changing, s->phase, votes);
+            const uint8_t *first = memchr(votes, largest_byte(votes, (int)size), size);
+            position = (position + codec->crt[k] * (first - votes)) % codec->range;
+        }
+        candidates[c] = position;
+    }
+    return combinations;
+}
+
+static int by_position(const void *a, const void *b)
+{
+    const int64_t x = *(const int64_t *)a, y = *(const int64_t *)b;
+    return (x > y) - (x < y);
+}
+
+/* Add the scores of all lines at the phases of a candidate, for each shift. */
+HOT static void add_scores(const float *doubled, const int *phase, const uint8_t *used, int length,
+                           float *restrict joint)
+{
+    float sums[PERIOD + 1] = {0};
+    for (int i = 0; i < length; i++) {
+        if (!used[i]) continue;
+        const float *restrict score = doubled + (size_t)i * DOUBLED + phase[i];
+        for (int k = 0; k < PERIOD + 1; k++) sums[k] += score[k];
+    }
+    memcpy(joint, sums, sizeof(sums));
+}
+
+/* Search the likeliest position and shift of a window on one axis, and the likelihood of the other
+ * candidates relative to it. */
+static void search_position(const Codec *codec, const Search *s, const float *scores, int length,
+                            uint8_t *used, int64_t *position, int64_t *shift, double *rivals)
+{
+    for (int i = 0; i < length; i++) {
+        const float *score = scores + (size_t)i * PERIOD;
+        float *row = s->doubled + (size_t)i * DOUBLED;
+        memcpy(row, score, PERIOD * sizeof(float));
+        memcpy(row + PERIOD, score, PERIOD * sizeof(float));
+        row[2 * PERIOD] = row[2 * PERIOD + 1] = 0;
+        used[i] = 0;
+        for (int k = 0; k < PERIOD; k++) used[i] |= score[k] != 0;
+    }
+    Search part = *s;
+    part.steps = 0;
+    for (int i = 0; i + 1 < length; i++)
+        if (used[i] && used[i + 1]) {
+            step_odds(codec, s->doubled + (size_t)i * DOUBLED,
+                      s->doubled + (size_t)(i + 1) * DOUBLED, s->min_probability,
+                      s->odds + (size_t)part.steps * ALL_DIGITS);
+            part.step[part.steps++] = i;
+        }
+    int count = likely_candidates(codec, &part);
+    if (s->misread) count += misread_candidates(codec, &part, used, length, s->candidates + count);
+    qsort(s->candidates, (size_t)count, sizeof(int64_t), by_position);
+    *position = *shift = 0;
+    float best = -INFINITY;
+    double sum = INFINITY;
+    for (int c = 0; c < count; c++) {
+        if (c && s->candidates[c] == s->candidates[c - 1]) continue;
+        float joint[PERIOD + 1];
+        following_phases(codec, s->candidates[c], length, s->phase);
+        add_scores(s->doubled, s->phase, used, length, joint);
+        for (int k = 0; k < PERIOD; k++) {
+            const float log_likelihood = 0.5f * joint[k];
+            if (log_likelihood > best) {
+                sum = best > -INFINITY ? sum * exp(best - log_likelihood) + 1 : 1;
+                best = log_likelihood;
+                *position = s->candidates[c];
+                *shift = k;
+            } else if (log_likelihood > best - NEGLIGIBLE_LOG_LIKELIHOOD)
+                sum += exp((double)log_likelihood - best);
+        }
+    }
+    *rivals = sum - 1;
+}
+
+static PyObject *search_positions(PyObject *self, PyObject *args)
+{
+    (void)self;
+    Call call = {0};
+    PyObject *scores_array, *positions_array, *rivals_array;
+    CodecArrays arrays;
+    long long n, length, range, smallest_shift, beam_width, misread, ranks;
+    Search s = {0};
+    if (!parse_arguments(args, "OLLOOOOOOOLLLLLfOO:search_positions", &scores_array, &n, &length,
+                         &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
+                         &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
+                         &beam_width, &misread, &ranks, &s.min_probability, &positions_array,
+                         &rivals_array))
+        return NULL;
+    Codec codec = {0};
+    check_range(&call, "n", n, 0, INT_MAX);
+    check_range(&call, "length", length, 1, MAX_SEARCH_LINES);
+    check_range(&call, "beam_width", beam_width, 1, MAX_BEAM);
+    check_range(&call, "misread", misread, 0, MAX_MISREAD);
+    check_range(&call, "ranks", ranks, 2, MAX_RANKS);
+    if (call.failed) return NULL;
+    const float *scores = input(&call, scores_array, "scores", ITEM_FLOAT32, ITEMS(n, length, PERIOD));
+    take_codec(&call, &arrays, range, smallest_shift, length, &codec);
+    int64_t *positions = output(&call, positions_array, "positions", ITEM_INT64, ITEMS(n, 2));
+    double *rivals = output(&call, rivals_array, "rivals", ITEM_FLOAT64, n);
+    if (call.failed) return finish_call(&call, 1);
+    s.width = (int)beam_width;
+    s.misread = (int)misread;
+    s.ranks = (int)ranks;
+    const size_t lines = (size_t)length, width = (size_t)beam_width;
+    const size_t mask_items = (size_t)(SEQUENCES * BASE) * (size_t)codec.widest;
+    size_t combinations = 1;
+    for (int k = 0; k < s.misread; k++) combinations *= (size_t)s.ranks;
+    float *floats =
+        malloc((lines * (DOUBLED + ALL_DIGITS) + MAX_SEQUENCE + 2 * width) * sizeof(float));
+    int *integers = malloc((2 * lines + 2 * width * SEQUENCES) * sizeof(int));
+    uint8_t *bytes = malloc(2 * width * lines + 3 * lines + mask_items
+                            + (SEQUENCES + 1) * MAX_SEQUENCE);
+    s.pool = malloc(2 * width * sizeof(Choice));
+    s.candidates = malloc((width + combinations) * sizeof(int64_t));
+    const int has_memory = floats && integers && bytes && s.pool && s.candidates;
+    if (has_memory) {
+        s.doubled = floats;
+        s.odds = s.doubled + lines * DOUBLED;
+        s.votes = s.odds + lines * ALL_DIGITS;
+        s.sorted = s.votes + MAX_SEQUENCE;
+        s.step = integers;
+        s.phase = s.step + lines;
+        s.residues[0] = s.phase + lines;
+        s.residues[1] = s.residues[0] + width * SEQUENCES;
+        s.digits[0] = bytes;
+        s.digits[1] = s.digits[0] + width * lines;
+        s.chosen = s.digits[1] + width * lines;
+        s.counts = s.chosen + 2 * lines;
+        s.masks = s.counts + (SEQUENCES + 1) * MAX_SEQUENCE;
+        uint8_t *used = s.masks + mask_items;
+        for (size_t k = 0; k < mask_items; k++) s.masks[k] = codec.masks[k] > 0;
+        Py_BEGIN_ALLOW_THREADS
+        for (size_t k = 0; k < (size_t)n; k++)
+            search_position(&codec, &s, scores + k * lines * PERIOD, (int)length, used,
+                            positions + 2 * k, positions + 2 * k + 1, rivals + k);
+        Py_END_ALLOW_THREADS
+    }
+    free(floats);
+    free(integers);
+    free(bytes);
+    free(s.pool);
+    free(s.candidates);
     return finish_call(&call, has_memory);
 }
 
@@ -2206,6 +2616,11 @@ static PyMethodDef methods[] = {
      "read_windows($module, x_bits, y_bits, n, length, lengths, weights, prefixes, crt, signs,"
      " digits, masks, range, smallest_shift, log_hypotheses, positions, evidence, /)\n--\n\n"
      "Read positions from windows of soft bits; twin of locatk.core.dots.identification.phase_voting.estimate_windows_numpy."},
+    {"search_positions", search_positions, METH_VARARGS,
+     "search_positions($module, scores, n, length, lengths, weights, prefixes, crt, signs, digits,"
+     " masks, range, smallest_shift, beam_width, misread, ranks, min_probability, positions, rivals,"
+     " /)\n--\n\n"
+     "Search positions among many candidates; twin of locatk.core.dots.identification.decoding.search_position_numpy."},
     {"poses", poses, METH_VARARGS,
      "poses($module, points, valid, n, m, half_width, lens, prior, windows, lengths, weights,"
      " prefixes, crt, signs, digits, masks, range, smallest_shift, offset, symbol_gate, min_sigma,"

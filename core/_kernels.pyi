@@ -80,6 +80,27 @@ def read_windows(
     evidence: Buffer,
     /,
 ) -> None: ...
+def search_positions(
+    scores: Buffer,
+    n: int,
+    length: int,
+    lengths: Buffer,
+    weights: Buffer,
+    prefixes: Buffer,
+    crt: Buffer,
+    signs: Buffer,
+    digits: Buffer,
+    masks: Buffer,
+    range: int,
+    smallest_shift: int,
+    beam_width: int,
+    misread: int,
+    ranks: int,
+    min_probability: float,
+    positions: Buffer,
+    rivals: Buffer,
+    /,
+) -> None: ...
 def poses(
     points: Buffer,
     valid: Buffer,

@@ -161,6 +161,22 @@ def read_windows() -> Arguments:
     }
 
 
+def search_positions() -> Arguments:
+    n, length = 2, 6
+    return {
+        "scores": floats(n, length, 63),
+        "n": n,
+        "length": length,
+        **codec(length),
+        "beam_width": 7,
+        "misread": 3,
+        "ranks": 2,
+        "min_probability": 1e-4,
+        "positions": np.zeros((n, 2), np.int64),
+        "rivals": np.zeros(n),
+    }
+
+
 def poses() -> Arguments:
     points = lattice_points(2)
     n, m = points.shape[:2]
@@ -346,6 +362,7 @@ CASES: dict[str, Callable[[], Arguments]] = {
         fit_lattices,
         soft_bits,
         read_windows,
+        search_positions,
         poses,
         ddtw,
         bar_fields,
@@ -364,6 +381,7 @@ OUTPUTS = {
     "fit_lattices": ("parameters", "uv", "cells", "sigma", "found"),
     "soft_bits": ("x_bits", "y_bits"),
     "read_windows": ("positions", "evidence"),
+    "search_positions": ("positions", "rivals"),
     "poses": ("parameters", "pose", "covariance"),
     "ddtw": ("cost",),
     "bar_fields": ("field", "slope"),
@@ -383,6 +401,8 @@ ZERO_IS_VALID = {
     ("find_dots", "splits"),
     ("read_windows", "smallest_shift"),
     ("poses", "smallest_shift"),
+    ("search_positions", "smallest_shift"),
+    ("search_positions", "misread"),
     ("search_map", "seed"),
     ("search_map", "steps"),
     ("light_places", "unknown"),

@@ -39,12 +39,20 @@ from locatk.core.dots.identification.phase_voting import (
     estimate_rotated_windows,
     estimate_windows,
     following_phases,
+    kernel_tables,
     phase_scores,
     rotate_to_print,
     rotation_scores,
 )
-from locatk.core.dots.identification.rival_codecs import PrintedWindows, rival_likelihood
+from locatk.core.dots.identification.rival_codecs import (
+    CoreLines,
+    core_lines,
+    has_rivals,
+    other_codecs,
+    rival_likelihood,
+)
 from locatk.core.errors import InputError
+from locatk.core.kernels import kernels
 
 MIN_CONFIDENCE = 0.999
 """Least confidence of an accepted result."""
@@ -124,6 +132,9 @@ class DecodedWindows:
     border : (n,) bool ndarray
         Whether there are dots on both sides of the border of a section; such a window has no
         confidence.
+    rival_odds : (n,) float64 ndarray
+        Odds that the window is one of another codec at another position, included in the
+        confidence.
     """
 
     x: Integers
@@ -134,6 +145,11 @@ class DecodedWindows:
     corrected: Integers
     confidence: NDArray[np.float64]
     border: NDArray[np.bool_]
+    rival_odds: NDArray[np.float64]
+
+    def select(self, indices: NDArray[np.int64]) -> DecodedWindows:
+        """Return the results for some of the windows."""
+        return DecodedWindows(*(getattr(self, f.name)[indices] for f in fields(DecodedWindows)))
 
 
 def identify_windows(
@@ -178,10 +194,9 @@ def identify_windows(
             getattr(result, field.name)[doubtful] = getattr(soft, field.name)
     if other_codec_odds:
         decoded = np.flatnonzero(result.confidence >= MIN_CODE_CONFIDENCE)
-        printed = _as_printed(result, column_bits, row_bits, decoded)
-        rivals = rival_likelihood(printed, result.corrected[decoded], codec)
-        confidence = result.confidence[decoded]
-        result.confidence[decoded] = confidence / (1 + confidence * other_codec_odds * rivals)
+        odds = other_codec_odds * _rival_likelihood(result, column_bits, row_bits, decoded, codec)
+        result.rival_odds[decoded] = odds
+        result.confidence[decoded] /= 1 + result.confidence[decoded] * odds
     return result
 
 
@@ -203,6 +218,7 @@ def _decode_exact(column_bits: Bits, row_bits: Bits, codec: Codec) -> DecodedWin
         corrected=np.zeros(n, np.int64),
         confidence=np.where(exact.ok & (weakest > 0), (1 + np.exp(-log_odds)) ** -2, 0.0),
         border=np.zeros(n, np.bool_),
+        rival_odds=np.zeros(n),
     )
 
 
@@ -217,14 +233,22 @@ def _decode_soft(
     dots = np.count_nonzero(windows[0], axis=(1, 2))
     doubtful = np.flatnonzero((confidence < MIN_CONFIDENCE) & (dots <= MAX_SMALL_WINDOW_DOTS))
     if is_thorough and len(doubtful):
-        part = windows[0][doubtful], windows[1][doubtful]
-        for rotation in np.argsort(-rotation_scores(*part), axis=0)[:2]:
-            other = estimate_rotated_windows(*part, rotation, codec)
+        scores = rotation_scores(windows[0][doubtful], windows[1][doubtful])
+        evidence = 0.5 * scores - sum(_random_evidence(bits[doubtful]) for bits in windows)
+        # Both axes need that much, even if each line had its best phase.
+        is_possible = evidence > 2 * (LOG_HYPOTHESES + MIN_LOG_ODDS)
+        for rotation in np.argsort(-scores, axis=0)[:2]:
+            kept = is_possible[rotation, np.arange(len(doubtful))]
+            if not kept.any():
+                continue
+            chosen = doubtful[kept]
+            part = windows[0][chosen], windows[1][chosen]
+            other = estimate_rotated_windows(*part, rotation[kept], codec)
             other_confidence = resolve_doubts(other, *part, codec, beam_width=SECOND_BEAM_WIDTH)
-            better = other_confidence > confidence[doubtful]
+            better = other_confidence > confidence[chosen]
             for values, other_values in zip(estimates, other, strict=True):
-                values[doubtful[better]] = other_values[better]
-            confidence[doubtful[better]] = other_confidence[better]
+                values[chosen[better]] = other_values[better]
+            confidence[chosen[better]] = other_confidence[better]
     _, rows, columns = column_bits.shape
     return as_decoded(estimates, confidence, dots, (length - rows, length - columns))
 
@@ -319,12 +343,23 @@ def _search_axis(
 def is_decodable(lines: Bits, scores: Bits) -> NDArray[np.bool_]:
     """Return whether windows (n,) could be accepted if each line had its best phase."""
     best = scores.max(axis=2)
-    evidence = 0.5 * best.sum(axis=1) - np.log(np.cosh(0.5 * lines)).sum(axis=(1, 2))
+    evidence = 0.5 * best.sum(axis=1) - _random_evidence(lines)
     likely = (scores > best[..., None] - MAX_LIKELY_PHASE_GAP).sum(axis=2)
     order = np.log(MAIN_SEQUENCE_LENGTH / likely).sum(axis=1)
     result: NDArray[np.bool_] = (evidence > LOG_HYPOTHESES + MIN_LOG_ODDS) & (
         order > LOG_HYPOTHESES + MIN_LOG_ODDS + math.log(OTHER_CODEC_ODDS * AGREEING_AXIS_FRACTION)
     )
+    return result
+
+
+def _random_evidence(bits: Bits) -> NDArray[np.float64]:
+    """Return the log likelihood (n,) of windows of random bits, where half the sum of the bits'
+    correlation with a pattern is that of the pattern.
+    """
+    flat = bits.reshape(len(bits), -1)
+    window, dot = np.nonzero(flat)
+    evidence = np.log(np.cosh(0.5 * flat[window, dot]))
+    result: NDArray[np.float64] = np.bincount(window, evidence, len(flat)).astype(np.float64)
     return result
 
 
@@ -353,26 +388,45 @@ def as_decoded(
         corrected=estimates.wrong.sum(axis=1),
         confidence=np.where(border, 0.0, confidence),
         border=border,
+        rival_odds=np.zeros(len(dots)),
     )
 
 
-def _as_printed(
-    decoded: DecodedWindows, column_bits: Bits, row_bits: Bits, chosen: NDArray[np.intp]
-) -> PrintedWindows:
-    """Return the ``chosen`` (m,) windows as printed, squared, with the phases of their corner."""
+def _rival_likelihood(
+    decoded: DecodedWindows,
+    column_bits: Bits,
+    row_bits: Bits,
+    chosen: NDArray[np.intp],
+    codec: Codec,
+) -> NDArray[np.float64]:
+    """Return how likely other codecs are, relative to the ``chosen`` (m,) decoded windows.
+
+    It is the mean over the other known codecs, so that its product with the prior odds that the
+    sheet is one of these are the posterior odds against the decoded position.
+    """
+    result = np.zeros(len(chosen))
+    if not len(chosen):
+        return result
     _, rows, columns = column_bits.shape
     length = max(rows, columns)
-    rotation = decoded.rotation[chosen]
-    column, row = rotate_to_print(
-        _pad_to_square(column_bits[chosen]), _pad_to_square(row_bits[chosen]), rotation
-    )
-    corner = np.column_stack([decoded.x[chosen], decoded.y[chosen]])
+    bits = _pad_to_square(column_bits[chosen]), _pad_to_square(row_bits[chosen])
+    rotation, section = decoded.rotation[chosen], decoded.section[chosen]
+    corner = np.stack([decoded.x[chosen], decoded.y[chosen]], axis=1)
     corner -= _printed_padding(rotation, (length - rows, length - columns))
-    return PrintedWindows(
-        lines=(column.transpose(0, 2, 1), row),
-        position=corner % SECTION_LENGTH,
-        shift=(decoded.section[chosen] + corner[:, ::-1]) % MAIN_SEQUENCE_LENGTH,
-    )
+    core = core_lines(bits[0] != 0, rotation, decoded.corrected[chosen])
+    others = other_codecs(codec)
+    for other, is_possible in zip(others, has_rivals(core, corner, codec).T, strict=True):
+        k = np.flatnonzero(is_possible)
+        if len(k):
+            printed = rotate_to_print(bits[0][k], bits[1][k], rotation[k])
+            result[k] += rival_likelihood(
+                np.stack([printed[0].transpose(0, 2, 1), printed[1]], axis=1),
+                corner[k] % SECTION_LENGTH,
+                (section[k] + corner[k, ::-1]) % MAIN_SEQUENCE_LENGTH,
+                CoreLines(*(v[k] for v in core)),
+                (codec, other),
+            ) / len(others)
+    return result
 
 
 def _printed_padding(rotation: Integers, padding: tuple[int, int]) -> Integers:
@@ -420,6 +474,27 @@ def search_position(
     rivals : (n,) float64 ndarray
         Likelihood of the other candidates relative to this one.
     """
+    if kernels is None:
+        return search_position_numpy(
+            scores, codec, try_misread_columns=try_misread_columns, beam_width=beam_width
+        )
+    n, length, _ = scores.shape
+    positions, rivals = np.empty((n, 2), np.int64), np.empty(n)
+    kernels.search_positions(
+        np.ascontiguousarray(scores),
+        *(n, length),
+        *kernel_tables(codec),
+        *(SECTION_LENGTH, sequences.MIN_SHIFT),
+        *(beam_width, MISREAD_COLUMNS if try_misread_columns else 0, PHASES_PER_MISREAD_COLUMN),
+        *(MIN_MARGINAL_PROBABILITY, positions, rivals),
+    )
+    return positions[:, 0], positions[:, 1], rivals
+
+
+def search_position_numpy(
+    scores: Bits, codec: Codec, *, try_misread_columns: bool, beam_width: int = FIRST_BEAM_WIDTH
+) -> tuple[Integers, Integers, NDArray[np.float64]]:
+    """Search positions as :func:`search_position`, without the compiled kernel."""
     n, length, _ = scores.shape
     candidates = _likely_candidates(scores, codec, beam_width)
     if try_misread_columns:
@@ -485,11 +560,17 @@ def _likely_candidates(scores: Bits, codec: Codec, beam_width: int) -> Integers:
 
 
 def _candidates_from_misread_columns(scores: Bits, codec: Codec) -> Integers:
-    """Return positions (n, candidates) for all combinations of phases of uncertain columns."""
+    """Return positions (n, candidates) for all combinations of phases of uncertain columns.
+
+    Columns without dots are not uncertain but unknown; they do not vote.
+    """
     n, length, _ = scores.shape
-    ranked = np.argsort(-scores, axis=2)[:, :, :PHASES_PER_MISREAD_COLUMN]
+    ranked = np.argsort(-scores, axis=2, kind="stable")[:, :, :PHASES_PER_MISREAD_COLUMN]
     score = np.take_along_axis(scores, ranked, axis=2)
-    uncertain = np.argsort(score[..., 0] - score[..., 1], axis=1)[:, :MISREAD_COLUMNS]
+    has_dots = (scores != 0).any(axis=2)
+    lead = np.where(has_dots, score[..., 0] - score[..., 1], np.inf)
+    uncertain = np.argsort(lead, axis=1, kind="stable")[:, :MISREAD_COLUMNS]
+    is_step = (has_dots[:, 1:] & has_dots[:, :-1])[:, None, :, None]
     rank = np.indices((PHASES_PER_MISREAD_COLUMN,) * MISREAD_COLUMNS)
     rank = rank.reshape(MISREAD_COLUMNS, -1).T
     phases = np.repeat(ranked[:, None, :, 0], len(rank), axis=1)
@@ -499,7 +580,7 @@ def _candidates_from_misread_columns(scores: Bits, codec: Codec) -> Integers:
     ]
     shift = (phases[..., 1:] - phases[..., :-1]) % MAIN_SEQUENCE_LENGTH
     residues = [
-        (digits[shift].reshape(n, len(rank), -1) @ ballots).argmax(axis=2)
+        ((digits[shift] * is_step).reshape(n, len(rank), -1) @ ballots).argmax(axis=2)
         for digits, ballots in zip(digit_tables(), ballot_tables(codec, length - 1), strict=True)
     ]
     return codec.position(np.stack(residues, axis=2))

@@ -10,13 +10,18 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.dots.codec import CODEC_NAMES, MAIN_SEQUENCE_LENGTH, SECTION_LENGTH, Codec, codec
+from locatk.core.dots.codec import (
+    CODEC_NAMES,
+    MAIN_SEQUENCE_LENGTH,
+    SECTION_LENGTH,
+    Codec,
+    codec,
+)
 from locatk.core.dots.codec.lookup import BITS_PER_STRING
 from locatk.core.dots.codec.sequences import DIGIT_WEIGHTS
 from locatk.core.dots.identification.phase_voting import (
@@ -38,113 +43,108 @@ MAX_LOG_LIKELIHOOD_RATIO = 50.0
 """Largest log likelihood of a rival relative to the decoded position; more has no effect."""
 
 
-@dataclass(frozen=True)
-class PrintedWindows:
-    """Bits of n windows as printed, with their decoded positions.
+class CoreLines(NamedTuple):
+    """Lines of n windows whose dots determine their phases, of columns and rows (n, 2) as printed.
 
     Attributes
     ----------
-    lines : pair of (n, length, length) float32 ndarray
-        Soft bits of the columns, and of the rows; 0 without a dot.
+    first, lines : (n, 2) int64 ndarray
+        The first one, and the number of lines up to the last one.
+    needed : (n, 2) int64 ndarray
+        Number of lines that a rival explains.
+    """
+
+    first: Integers
+    lines: Integers
+    needed: Integers
+
+
+def core_lines(has_dot: NDArray[np.bool_], rotation: Integers, wrong: Integers) -> CoreLines:
+    """Return the core lines of square windows (n, length, length), as observed.
+
+    ``wrong`` (n,) is the number of wrong bits of each window.
+    """
+    length = has_dot.shape[1]
+    dots = np.stack([has_dot.sum(axis=1), has_dot.sum(axis=2)], axis=1)
+    is_core = dots >= BITS_PER_STRING
+    count = is_core.sum(axis=2)
+    first = is_core.argmax(axis=2)
+    last = np.where(count > 0, length - 1 - is_core[:, :, ::-1].argmax(axis=2), 0)
+    dots_per_line = np.maximum((dots * is_core).sum(axis=2) // np.maximum(count, 1), 1)
+    hidden = -(-DOTS_PER_WRONG_BIT * wrong[:, None] // dots_per_line)
+    lines = last - first + 1
+    # A quarter turn makes columns of rows, and one of both axes is reversed.
+    is_reversed = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], np.bool_)[rotation]
+    first = np.where(is_reversed, length - 1 - last, first)
+    result = np.stack([first, lines, np.maximum(count - hidden, 1)])
+    quarter = rotation % 2 > 0
+    result[:, quarter] = result[:, quarter, ::-1]
+    return CoreLines(*result)
+
+
+def has_rivals(core: CoreLines, position: Integers, own: Codec) -> NDArray[np.bool_]:
+    """Return which other codecs (n, others) may have windows at ``position`` (n, 2) elsewhere.
+
+    They explain enough core lines of both axes, and those of one of them at another position.
+    """
+    residue = (position + core.first) % len(own.digits[-1])
+    pairs = zip(core.lines.ravel().tolist(), residue.ravel().tolist(), strict=True)
+    common = np.array([_common_lines(own, count)[k] for count, k in pairs])
+    common = common.reshape(*residue.shape, -1, 2)
+    is_explained = common >= core.needed[..., None, None]
+    return np.logical_and(is_explained[..., 0].all(axis=1), is_explained[..., 1].any(axis=1))
+
+
+def rival_likelihood(
+    lines: Bits, position: Integers, shift: Integers, core: CoreLines, codecs: tuple[Codec, Codec]
+) -> NDArray[np.float64]:
+    """Return how likely another codec at other positions is, relative to the decoded ones (n,).
+
+    Parameters
+    ----------
+    lines : (n, 2, length, length) float32 ndarray
+        Soft bits of the columns, and of the rows, as printed; 0 without a dot.
     position, shift : (n, 2) int64 ndarray
         Of the first column and row, and of the phases, as in
         :class:`~.phase_voting.WindowEstimates`.
-    """
-
-    lines: tuple[Bits, Bits]
-    position: Integers
-    shift: Integers
-
-
-def rival_likelihood(windows: PrintedWindows, wrong: Integers, own: Codec) -> NDArray[np.float64]:
-    """Return how likely other codecs at other positions are, relative to the decoded ones (n,).
-
-    It is the mean over the other known codecs, so that its product with the prior odds that the
-    sheet is one of these are the posterior odds against the decoded position. ``wrong`` (n,) is
-    the number of wrong bits of each window.
-    """
-    result = np.zeros(len(wrong))
-    first, count, needed = np.stack([_core_lines(lines, wrong) for lines in windows.lines], axis=2)
-    residue = (windows.position + first) % len(own.digits[-1])
-    others = [codec(name) for name in CODEC_NAMES if name != own.name]
-    for other in others:
-        anywhere, elsewhere = np.zeros_like(count), np.zeros_like(count)
-        for lines in np.unique(count):
-            chosen = count == lines
-            tables = _common_lines(own, other, int(lines))
-            anywhere[chosen], elsewhere[chosen] = (table[residue[chosen]] for table in tables)
-        has_any, has_other = (anywhere >= needed).all(axis=1), (elsewhere >= needed).any(axis=1)
-        for k in np.flatnonzero(has_any & has_other):
-            same, every = np.transpose(
-                [
-                    _rival_likelihoods(
-                        windows.lines[axis][k],
-                        int(windows.position[k, axis]),
-                        int(windows.shift[k, axis]),
-                        CoreLines(*(int(v[k, axis]) for v in (first, count, needed))),
-                        (own, other),
-                    )
-                    for axis in range(2)
-                ]
-            )
-            result[k] += (every.prod() - same.prod()) / len(others)
-    return result
-
-
-class CoreLines(NamedTuple):
-    """Lines whose dots determine their phases: first and number; and how many a rival explains."""
-
-    first: int
-    lines: int
-    needed: int
-
-
-def _core_lines(lines: Bits, wrong: Integers) -> Integers:
-    """Return :class:`CoreLines` (3, n) of windows with ``wrong`` bits."""
-    dots = np.count_nonzero(lines, axis=2)
-    is_core = dots >= BITS_PER_STRING
-    first = is_core.argmax(axis=1)
-    count = np.where(
-        is_core.any(axis=1), lines.shape[1] - is_core[:, ::-1].argmax(axis=1) - first, 1
-    )
-    dots_per_line = np.maximum(
-        (dots * is_core).sum(axis=1) // np.maximum(is_core.sum(axis=1), 1), 1
-    )
-    missing = np.arange(lines.shape[1])
-    missing = ((missing >= first[:, None]) & (missing < (first + count)[:, None]) & ~is_core).sum(
-        axis=1
-    )
-    hidden = -(-DOTS_PER_WRONG_BIT * wrong // dots_per_line)
-    return np.stack([first, count, np.maximum(count - missing - hidden, 1)])
-
-
-def _rival_likelihoods(
-    lines: Bits, position: int, shift: int, core: CoreLines, codecs: tuple[Codec, Codec]
-) -> tuple[float, float]:
-    """Return likelihoods of another codec on one axis, relative to that of the decoded position.
-
-    The first is that of the same position, the second the sum over all positions that explain the
-    needed number of core lines.
+    core : CoreLines
+    codecs : pair of Codec
+        The one in which the windows were decoded, and the other one.
     """
     own, other = codecs
     length = len(own.digits[-1])
-    start = (position + core.first) % length
-    difference = _phase_differences(own, other)[:, start : start + core.lines]
-    agrees = difference[:, None] == np.arange(PHASE_DIFFERENCES)[:, None]
-    candidate, value = np.nonzero(agrees.sum(axis=2) >= core.needed)
-    residues = np.empty((len(candidate), 4), np.int64)
-    residues[:, :3] = [position % len(digits) for digits in own.digits[:3]]
-    residues[:, 3] = (position + candidate) % length
+    lines = lines.reshape(-1, *lines.shape[2:])
+    position, shift, first, count, needed = (v.ravel() for v in (position, shift, *core))
+    start = (position + first) % length
+    counts = _difference_counts(own, other)
+    common = counts[:, :, start + count] - counts[:, :, start]
+    candidate, value, axis = np.nonzero(common >= needed)
+    residues = np.empty((len(axis), 4), np.int64)
+    for k, digits in enumerate(own.digits):
+        residues[:, k] = position[axis] % len(digits)
+    residues[:, 3] = (residues[:, 3] + candidate) % length
     positions = other.position(residues)
     # On a line that both explain they have the same phase.
-    line = core.first + agrees[candidate, value].argmax(axis=1)
-    phase = own.phases((position + line) % SECTION_LENGTH) + shift
+    steps = np.arange(count.max())
+    difference = _phase_differences(own, other)[candidate[:, None], start[axis, None] + steps]
+    line = first[axis] + (difference == value[:, None]).argmax(axis=1)
+    phase = own.phases((position[axis] + line) % SECTION_LENGTH) + shift[axis]
     shifts = (phase - other.phases((positions + line) % SECTION_LENGTH)) % MAIN_SEQUENCE_LENGTH
-    repeated = np.broadcast_to(lines, (len(candidate), *lines.shape))
-    rival_log_odds, _ = compare_with_pattern(positions, shifts, repeated, other)
-    log_odds, _ = compare_with_pattern(np.array([position]), np.array([shift]), lines[None], own)
-    likelihood = np.exp(np.minimum(rival_log_odds - log_odds, MAX_LOG_LIKELIHOOD_RATIO))
-    return float(likelihood[candidate == 0].sum()), float(likelihood.sum())
+    rival_log_odds, _ = compare_with_pattern(positions, shifts, lines[axis], other)
+    log_odds, _ = compare_with_pattern(position, shift, lines, own)
+    ratio = np.exp(np.minimum(rival_log_odds - log_odds[axis], MAX_LOG_LIKELIHOOD_RATIO))
+    same, every = (
+        np.bincount(axis, weights, len(position)).reshape(-1, 2).prod(axis=1)
+        for weights in (ratio * (candidate == 0), ratio)
+    )
+    result: NDArray[np.float64] = every - same
+    return result
+
+
+@functools.cache
+def other_codecs(own: Codec) -> tuple[Codec, ...]:
+    """Return the other known codecs."""
+    return tuple(codec(name) for name in CODEC_NAMES if name != own.name)
 
 
 @functools.lru_cache(8)
@@ -177,13 +177,16 @@ def _difference_counts(own: Codec, other: Codec) -> NDArray[np.int16]:
 
 
 @functools.lru_cache(256)
-def _common_lines(own: Codec, other: Codec, count: int) -> tuple[Integers, Integers]:
-    """Return how many of ``count`` lines from each residue (241,) on another codec explains.
+def _common_lines(own: Codec, count: int) -> Integers:
+    """Return how many of ``count`` lines from each residue (241, others, 2) on others explain.
 
-    The first table is of the best position of the other codec, the second of the best one that is
-    not the same position.
+    The first number is that of the best position of the other codec, the second that of the best
+    one that is not the same position.
     """
-    counts = _difference_counts(own, other)
     length = len(own.digits[-1])
-    common = (counts[:, :, count : count + length] - counts[:, :, :length]).max(axis=1)
-    return common.max(axis=0).astype(np.int64), common[1:].max(axis=0).astype(np.int64)
+    numbers = []
+    for other in other_codecs(own):
+        counts = _difference_counts(own, other)
+        common = (counts[:, :, count : count + length] - counts[:, :, :length]).max(axis=1)
+        numbers.append([common.max(axis=0), common[1:].max(axis=0)])
+    return np.array(numbers, np.int64).transpose(2, 0, 1)

@@ -29,7 +29,7 @@ from locatk.core.dots.identification.decoding import (
     identify_windows,
 )
 from locatk.core.dots.identification.soft_bits import soft_bits, window_half_width
-from locatk.core.dots.localization.pose import assign_dots, localize_windows
+from locatk.core.dots.localization.pose import GridPoses, assign_dots, localize_windows
 from locatk.core.errors import InputError
 
 Images = NDArray[np.uint8]
@@ -47,6 +47,10 @@ size, those of twice their size at half size, and so on."""
 MIN_TRIED_LEVELS = 4
 """Number of sizes that are tried, each half of the previous one; more if the preferred one is
 smaller still."""
+
+SETTLED_FRACTION = 0.9
+"""Fraction of the detected dots of a frame beyond which other dots do not decide between codecs:
+windows of two codecs that are the same go on to be the same for tens of columns."""
 
 TOO_FEW_DOTS = "too_few_dots"
 NO_GRID = "no_grid"
@@ -77,6 +81,9 @@ class LocalizedFrames:
         Probability that the position is right.
     rejected : (n,) object ndarray of str
         Reason of rejection; ``""`` if the frame is localized.
+    ambiguous : (n,) bool ndarray
+        Whether only another codec, which has nearly all of the frame's dots at another position,
+        limits the confidence.
     """
 
     grid: NDArray[np.float64]
@@ -87,6 +94,7 @@ class LocalizedFrames:
     corrected: NDArray[np.int64]
     confidence: NDArray[np.float64]
     rejected: NDArray[np.object_]
+    ambiguous: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.rejected)
@@ -96,6 +104,11 @@ class LocalizedFrames:
         """Whether each frame (n,) is localized."""
         result: NDArray[np.bool_] = self.rejected == ""
         return result
+
+    @property
+    def settled(self) -> NDArray[np.bool_]:
+        """Whether no other size of the frame and no other lattice improve the result (n,)."""
+        return self.accepted | self.ambiguous
 
     def update(self, indices: NDArray[np.int64], part: LocalizedFrames) -> None:
         """Store ``part`` for the ``indices`` that it localizes or has no less confidence in."""
@@ -120,6 +133,7 @@ def unlocalized_frames(n: int, reason: str) -> LocalizedFrames:
         corrected=np.zeros(n, np.int64),
         confidence=np.zeros(n),
         rejected=np.full(n, reason, object),
+        ambiguous=np.zeros(n, np.bool_),
     )
 
 
@@ -156,11 +170,11 @@ def localize_frames(
             part, _, _ = _localize_dots(
                 points, dots, codec, camera is None, min_confidence, other_codec_odds
             )
-            # Strong tilt, strong distortion and covered frames take longer than all others.
-            if part.accepted.all():
+            if part.settled.all():
                 result.update(remaining, part)
                 break
-            again = np.flatnonzero(~part.accepted & (part.rejected != TOO_FEW_DOTS))
+            # Strong tilt, strong distortion and covered frames take longer than all others.
+            again = np.flatnonzero(~part.settled & (part.rejected != TOO_FEW_DOTS))
             if len(again):
                 thorough, _, _ = _localize_dots(
                     points[again],
@@ -173,7 +187,7 @@ def localize_frames(
                 )
                 part.update(again, thorough)
             result.update(remaining, part)
-            remaining = remaining[~result.accepted[remaining]]
+            remaining = remaining[~result.settled[remaining]]
             if not len(remaining):
                 break
     return result
@@ -243,11 +257,13 @@ def _localize_lattices(
     windows = identify_windows(
         *bits, codec, is_thorough=is_thorough, other_codec_odds=other_codec_odds
     )
-    poses = localize_windows(lattices, half, windows, codec)
     rejected = np.full(len(windows.confidence), "", object)
     rejected[windows.confidence < min_confidence] = LOW_CONFIDENCE
     rejected[windows.confidence < MIN_CODE_CONFIDENCE] = NO_CODE
     rejected[(rejected != "") & windows.border] = SECTION_BORDER
+    certain = windows.confidence >= min_confidence * (1 - windows.confidence * windows.rival_odds)
+    is_covered = windows.dots > SETTLED_FRACTION * lattices.valid.sum(axis=1)
+    poses = _localize_decoded(lattices, half, windows, codec)
     frames = LocalizedFrames(
         grid=poses.grid,
         section=windows.section,
@@ -257,8 +273,26 @@ def _localize_lattices(
         corrected=windows.corrected,
         confidence=windows.confidence,
         rejected=rejected,
+        ambiguous=certain & is_covered & (rejected != ""),
     )
     return frames, lattices, windows
+
+
+def _localize_decoded(
+    lattices: DotLattices, half: int, windows: DecodedWindows, codec: Codec
+) -> GridPoses:
+    """Estimate the poses of windows that contain the code; those of others are nan."""
+    has_code = windows.confidence >= MIN_CODE_CONFIDENCE
+    if has_code.all():
+        return localize_windows(lattices, half, windows, codec)
+    n = len(has_code)
+    poses = GridPoses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
+    decoded = np.flatnonzero(has_code)
+    if len(decoded):
+        part = localize_windows(lattices.select(decoded), half, windows.select(decoded), codec)
+        for field in fields(GridPoses):
+            getattr(poses, field.name)[decoded] = getattr(part, field.name)
+    return poses
 
 
 def _levels(height: int, width: int) -> list[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -26,6 +27,8 @@ needs_kernels = pytest.mark.skipif(
 )
 
 ANOTO = codec("anoto")
+
+Search = Callable[..., tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]
 
 
 def drawn(seed: int, n: int = 6) -> NDArray[np.uint8]:
@@ -196,6 +199,72 @@ def test_readings_are_the_same(name: str, side: int, missing: float, wrong: floa
         assert same.mean() > 0.99, field  # the sums are rounded differently; ties may fall apart
     agree = (mine.position == twin.position).all(axis=1)
     np.testing.assert_allclose(mine.log_odds[agree], twin.log_odds[agree], atol=1e-3)
+
+
+def across_sections(x: int, side: int, name: str) -> NDArray[np.uint8]:
+    """Symbols from column ``x`` on, continued at the first column."""
+    first = min(side, SECTION_LENGTH - x)
+    parts = [codec(name).symbols((x, 7), (first, side))]
+    if first < side:
+        parts.append(codec(name).symbols((0, 7), (side - first, side)))
+    return np.concatenate(parts, axis=1)
+
+
+def column_scores(
+    seed: int, n: int, side: int, missing: float, wrong: float, name: str = "anoto"
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Scores of the columns of windows with wrong bits, and the positions of their first ones."""
+    rng = np.random.default_rng(seed)
+    position = rng.integers(0, SECTION_LENGTH - side, n)
+    position[::2] = SECTION_LENGTH - rng.integers(1, side, n // 2)  # on into the next section
+    windows = [across_sections(int(x), side, name) for x in position]
+    bits = np.where(np.array(windows) & 1, 1, -1) * rng.uniform(2, 8, (n, side, side))
+    bits[rng.random(bits.shape) < wrong] *= -1
+    bits[rng.random(bits.shape) < missing] = 0
+    lines = bits.transpose(0, 2, 1).astype(np.float32)
+    return reading.phase_scores(lines), position
+
+
+@needs_kernels
+@pytest.mark.parametrize("try_misread_columns", [True, False])
+@pytest.mark.parametrize(
+    ("name", "side", "missing", "wrong"),
+    [("anoto", 12, 0, 0.03), ("libdots", 20, 0.7, 0.05), ("microdots", 34, 0.8, 0.1)],
+)
+def test_searches_are_the_same(
+    name: str, side: int, missing: float, wrong: float, try_misread_columns: bool
+) -> None:
+    scores, position = column_scores(side, 40, side, missing, wrong, name)
+    scores[:, side - 2] = 0
+    mine, twin = (
+        search(scores, codec(name), try_misread_columns=try_misread_columns)
+        for search in (decode.search_position, decode.search_position_numpy)
+    )
+    assert (mine[0] == position).mean() > 0.3
+    agree = mine[0] == twin[0]
+    assert agree.mean() > 0.95  # at the edge of the beam, sums are rounded differently
+    assert np.array_equal(mine[1][agree], twin[1][agree])
+    np.testing.assert_allclose(mine[2][agree], twin[2][agree], rtol=1e-3, atol=1e-6)
+
+
+@needs_kernels
+@pytest.mark.parametrize("search", [decode.search_position, decode.search_position_numpy])
+def test_misread_columns_are_found_between_columns_without_dots(search: Search) -> None:
+    scores, position = column_scores(3, 60, 10, 0, 0.03)
+    padded = np.zeros((60, 20, 63), np.float32)
+    padded[:, 5:15] = scores
+    alone, among = (
+        search(s, ANOTO, try_misread_columns=True, beam_width=1) for s in (scores, padded)
+    )
+    assert (alone[0] == position).mean() > 0.8
+    assert (alone[0] == (among[0] + 5) % SECTION_LENGTH).mean() > 0.95
+
+
+@needs_kernels
+def test_a_search_without_evidence_is_no_error() -> None:
+    for scores in (np.zeros((2, 8, 63), np.float32), np.full((2, 8, 63), np.nan, np.float32)):
+        _, _, rivals = decode.search_position(scores, ANOTO, try_misread_columns=True)
+        assert (rivals > 1).all()
 
 
 @pytest.mark.slow

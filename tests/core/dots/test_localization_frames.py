@@ -348,6 +348,30 @@ def test_the_last_positions_of_the_pattern(shot: Shots) -> None:
     assert judge(localize_frames(last.take()[None], codec("anoto")), [last]).fate == {"right": 1}
 
 
+def test_a_frame_of_two_codecs_is_not_tried_again(
+    shot: Shots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From residue 220 on, the fourth sequences of anoto and libdots differ by a digit."""
+    image = shot(at=(241_000_100.0, 241_000_230.0), heading=0.0).take()[None]
+    fits = []
+    fit = localization.fit_lattices
+    monkeypatch.setattr(
+        localization, "fit_lattices", lambda *a, **k: fits.append(k) or fit(*a, **k)
+    )
+    actual = localization.localize_frames(image, codec("anoto"))
+    assert actual.ambiguous[0]
+    assert actual.rejected[0] == "low_confidence"
+    assert len(fits) == 1
+    certain = localize_frames(image, codec("anoto"))
+    assert certain.accepted[0]
+    assert not certain.ambiguous[0]
+    np.testing.assert_allclose(actual.grid, certain.grid)
+    # If most of its dots are not on the lattice, it may be.
+    monkeypatch.setattr(localization, "SETTLED_FRACTION", 2.0)
+    assert not localization.localize_frames(image, codec("anoto")).ambiguous[0]
+    assert len(fits) > 3
+
+
 @pytest.mark.parametrize("beyond", [-4, -2, 0, 2, 4])
 def test_a_border_of_sections_is_rejected_with_a_reason(shot: Shots, beyond: int) -> None:
     """Two sections side by side, with ``beyond`` pitches of the second left of the middle."""
