@@ -1788,7 +1788,7 @@ static PyObject *read_windows(PyObject *self, PyObject *args)
 
 /* Constants of the robust fit; those of locatk.core.dots.localization.pose. */
 typedef struct {
-    int half_width, lens, max_steps;
+    int half_width, lens, max_steps, fitted_parameters;
     const double *prior;
     double offset, symbol_gate, min_sigma, second_lens_sigma, second_lens_odds, gate_sigmas,
         gated_variance, square_radius, square_radius_sigma;
@@ -1832,14 +1832,14 @@ static void match_pattern(const Codec *codec, const PoseOptions *options, const 
 }
 
 /* Variance of the dots per axis from the median of their squared residuals (-1: no residual). */
-static double median_variance(const float *squares, int m, float *ordered)
+static double median_variance(const float *squares, int m, int parameters, float *ordered)
 {
     int count = 0;
     for (int i = 0; i < m; i++)
         if (squares[i] >= 0) ordered[count++] = squares[i];
     if (!count) return 0;
     const double median = nth_smallest(ordered, count, (count - 1) / 2);
-    const int degrees = 2 * count - 8 > 1 ? 2 * count - 8 : 1;
+    const int degrees = 2 * count - parameters > 1 ? 2 * count - parameters : 1;
     return median / (2 * log(2.0)) * (2.0 * count / degrees);
 }
 
@@ -1906,11 +1906,48 @@ static int fit_second_lens(const double *parameters, const Dots *d, double norma
     return 1;
 }
 
+/* Index of the cell of a dot among the grid positions of the window with a margin. */
+static int cell_of(const Dots *d, int i, int half_width)
+{
+    const int column = (int)rintf(d->u[i]) + half_width + 1;
+    const int row = (int)rintf(d->v[i]) + half_width + 1;
+    return row * (2 * half_width + 3) + column;
+}
+
+/* Sum of the correlations of the error of a dot in use with those of its eight neighbours on the
+ * grid; see locatk.core.dots.localization.pose. `cells` are scratch, three for each cell. */
+static double neighbour_correlation(const Dots *d, int m, int half_width, int parameters,
+                                    double variance, float *cells)
+{
+    const int width = 2 * half_width + 3;
+    const int steps[4] = {1, width - 1, width, width + 1};
+    memset(cells, 0, 3 * (size_t)width * (size_t)width * sizeof(float));
+    for (int i = 0; i < m; i++) {
+        if (d->use[i] == 0) continue;
+        float *cell = cells + 3 * cell_of(d, i, half_width);
+        cell[0] += d->residual[0][i];
+        cell[1] += d->residual[1][i];
+        cell[2] += 1;
+    }
+    double products = 0, pairs = 0, count = 0;
+    for (int i = 0; i < m; i++) {
+        if (d->use[i] == 0) continue;
+        const float *cell = cells + 3 * cell_of(d, i, half_width);
+        for (int k = 0; k < 4; k++) {
+            const float *other = cell + 3 * steps[k];
+            products += d->residual[0][i] * other[0] + d->residual[1][i] * other[1];
+            pairs += other[2];
+        }
+        count++;
+    }
+    return count > 0 ? products / (count * variance) + parameters * pairs / (count * count) : 0;
+}
+
 /* Refit the lattice robustly to the dots that agree with the decoded pattern, and derive the pose
  * and its covariance from it. Return 0 if the equations are singular. */
 static int estimate_pose(const Codec *codec, const PoseOptions *options, const int64_t *window,
                          const float *points, const Dots *d, int m, int64_t *phases, float *scratch,
-                         double *parameters, double *pose, double *covariance)
+                         float *cells, double *parameters, double *pose, double *covariance)
 {
     static const double no_prior[PARAMETERS] = {0};
     const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
@@ -1931,7 +1968,7 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
     for (int k = 0; k < options->max_steps; k++) {
         project(parameters, d);
         match_pattern(codec, options, phases, rows, (int)window[4], d, m, squares);
-        variance = median_variance(squares, m, ordered);
+        variance = median_variance(squares, m, options->fitted_parameters, ordered);
         if (!(variance > min_variance)) variance = min_variance;
         gate_square = options->gate_sigmas * options->gate_sigmas * variance;
         int is_changed = 0;
@@ -1962,18 +1999,43 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
     }
     int inliers = 0;
     double sum = 0;
-    /* Outliers count as if at the gate: in directions of their own, and all together. */
-    for (int i = 0; i < m; i++) {
+    for (int i = 0; i < m; i++)
         if (d->use[i] != 0) {
             inliers++;
             sum += squares[i];
-            d->use[i] = 0;
-        } else if (squares[i] >= 0) {
-            const float scale = (float)sqrt(gate_square / squares[i]);
-            d->residual[0][i] *= scale;
-            d->residual[1][i] *= scale;
-            d->use[i] = 1;
         }
+    const int fitted = options->fitted_parameters;
+    const int degrees = 2 * inliers - fitted > 1 ? 2 * inliers - fitted : 1;
+    double inlier_variance = sum / (options->gated_variance * degrees);
+    if (!(inlier_variance > min_variance)) inlier_variance = min_variance;
+    const double correlation =
+        neighbour_correlation(d, m, half_width, fitted, inlier_variance, cells);
+    if (correlation > 0) inlier_variance *= 1 + correlation;
+    /* Outliers count as if at the gate: in directions of their own, and all together. Along the
+     * displacement by a lens that the model does not follow they do not count. */
+    for (int i = 0; i < m; i++) d->use[i] = squares[i] >= 0 && d->use[i] == 0;
+    if (lens.is_fitted) {
+        float *along[2] = {columns, columns + d->count};
+        double unused[2] = {0};
+        for (int axis = 0; axis < 2; axis++)
+            second_lens_column(parameters, d, axis, along[axis], unused, unused + 1);
+        for (int i = 0; i < m; i++) {
+            if (d->use[i] == 0) continue;
+            const float c = along[0][i], s = along[1][i], square = c * c + s * s;
+            const float share = (d->residual[0][i] * c + d->residual[1][i] * s)
+                                / (square > 1e-30f ? square : 1e-30f);
+            d->residual[0][i] -= share * c;
+            d->residual[1][i] -= share * s;
+            squares[i] = d->residual[0][i] * d->residual[0][i]
+                         + d->residual[1][i] * d->residual[1][i];
+            d->use[i] = squares[i] >= gate_square;
+        }
+    }
+    for (int i = 0; i < m; i++) {
+        if (d->use[i] == 0) continue;
+        const float scale = (float)sqrt(gate_square / squares[i]);
+        d->residual[0][i] *= scale;
+        d->residual[1][i] *= scale;
     }
     double outliers[PARAMETERS][PARAMETERS], together[PARAMETERS];
     normal_equations(parameters, d, 0, options->lens, no_prior, outliers, together);
@@ -2017,9 +2079,6 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
         for (int k = 0; k < PARAMETERS; k++)
             solved[3 * k + side] += lens.coupling[k] * along / lens.weight;
     }
-    const int degrees = 2 * inliers - 8 > 1 ? 2 * inliers - 8 : 1;
-    double inlier_variance = sum / (options->gated_variance * degrees);
-    if (!(inlier_variance > min_variance)) inlier_variance = min_variance;
     double coherent[3] = {0}, apart[PARAMETERS * 3] = {0};
     for (int k = 0; k < PARAMETERS; k++)
         for (int side = 0; side < 3; side++) {
@@ -2047,13 +2106,13 @@ static PyObject *poses(PyObject *self, PyObject *args)
     PyObject *points_array, *valid_array, *prior_array, *windows_array, *parameters_array,
         *pose_array, *covariance_array;
     CodecArrays arrays;
-    long long n, m, half_width, range, smallest_shift, steps;
+    long long n, m, half_width, range, smallest_shift, steps, fitted;
     PoseOptions options = {0};
-    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLddddddOOO:poses", &points_array, &valid_array,
+    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLLddddddOOO:poses", &points_array, &valid_array,
                          &n, &m, &half_width, &options.lens, &prior_array, &windows_array,
                          &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
                          &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
-                         &options.offset, &options.symbol_gate, &options.min_sigma, &steps,
+                         &options.offset, &options.symbol_gate, &options.min_sigma, &steps, &fitted,
                          &options.second_lens_sigma, &options.second_lens_odds,
                          &options.gate_sigmas, &options.gated_variance, &options.square_radius,
                          &options.square_radius_sigma, &parameters_array, &pose_array,
@@ -2064,6 +2123,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "half_width", half_width, 1, MAX_WINDOW_CELLS / 2);
     check_range(&call, "max_steps", steps, 1, MAX_REFIT_STEPS);
+    check_range(&call, "fitted_parameters", fitted, 0, PARAMETERS);
     if (call.failed) return NULL;
     const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
     const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
@@ -2082,20 +2142,23 @@ static PyObject *poses(PyObject *self, PyObject *args)
     if (call.failed) return finish_call(&call, 1);
     options.half_width = (int)half_width;
     options.max_steps = (int)steps;
+    options.fitted_parameters = (int)fitted;
     Dots d;
     const int has_dots = new_dots(&d, (int)m);
     int64_t *phases = malloc(4 * (size_t)half_width * sizeof(int64_t));
     const size_t scratch_items = 2 * ((size_t)m + 1) + 2 * (size_t)d.count;
     float *scratch = has_dots ? malloc(scratch_items * sizeof(float)) : NULL;
-    const int has_memory = has_dots && phases && scratch;
+    const size_t width = 2 * (size_t)half_width + 3;
+    float *cells = malloc(3 * width * width * sizeof(float));
+    const int has_memory = has_dots && phases && scratch && cells;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             load_dots(&d, points + 2 * dot, valid + dot, (int)m);
             if (!estimate_pose(&codec, &options, windows + k * WINDOW_COLUMNS, points + 2 * dot, &d,
-                               (int)m, phases, scratch, parameters + k * PARAMETERS, pose + 3 * k,
-                               covariance + 9 * k)) {
+                               (int)m, phases, scratch, cells, parameters + k * PARAMETERS,
+                               pose + 3 * k, covariance + 9 * k)) {
                 for (int i = 0; i < 3; i++) pose[3 * k + i] = NAN;
                 for (int i = 0; i < 9; i++) covariance[9 * k + i] = NAN;
             }
@@ -2104,6 +2167,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     }
     if (has_dots) free(d.x);
     free(phases);
+    free(cells);
     free(scratch);
     return finish_call(&call, has_memory);
 }

@@ -7,7 +7,13 @@ from the fit. (Hostettler et al. 2016, II-B.8, use one corner of the decoded win
 Near hands, ink and reflections some dots are displaced. Those beyond a gate, whose width follows
 from the median residual of the frame, are not used. They show that others within the gate are
 displaced as well, which no residual reveals: the covariance therefore contains them as if they were
-at the gate, in directions of their own and all together.
+at the gate, in directions of their own and all together. Neighbours that are displaced alike count
+as fewer dots: the correlation of their residuals widens the covariance.
+
+The model of an unknown lens ends with its second radial coefficient. Strong lenses displace dots
+near the corners further, but only towards the centre or away from it, which moves no pose (the
+radial alignment constraint, Tsai 1987). In such frames an outlier counts by what remains of its
+residual across this direction.
 
 In tilted frames the image of a disc is displaced from the image of its centre. To second order of
 its radius r, in pitches, the displacement on the paper is r^2 times the slope of the logarithm of
@@ -71,6 +77,14 @@ residuals are beyond it (chi-square with two degrees of freedom)."""
 
 GATED_VARIANCE_RATIO = 1 - 0.5 * INLIER_GATE_SIGMAS**2 / math.expm1(0.5 * INLIER_GATE_SIGMAS**2)
 """Variance of Gaussian residuals within the gate, relative to that of all."""
+
+FITTED_PARAMETERS = 8
+"""Parameters of a homography, which the residuals of a frame have fewer degrees of freedom than
+coordinates; the priors determine the lens as much as the dots do."""
+
+NEIGHBOUR_STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
+"""Steps from a grid position to one half of its eight neighbours; it is one of the other half of
+theirs."""
 
 SQUARED_DOT_RADIUS = 0.0174
 SQUARED_DOT_RADIUS_SIGMA = 0.007
@@ -144,7 +158,7 @@ def localize_windows(
         *(n, m, half, lattices.lens, prior_weights(True), decoded),
         *kernel_tables(codec),
         *(SECTION_LENGTH, MIN_SHIFT, DOT_OFFSET_PITCHES, SYMBOL_GATE_PITCHES, MIN_SIGMA_PITCHES),
-        *(MAX_REFIT_STEPS, SECOND_LENS_SIGMA, MIN_SECOND_LENS_SIGMAS**2),
+        *(MAX_REFIT_STEPS, FITTED_PARAMETERS, SECOND_LENS_SIGMA, MIN_SECOND_LENS_SIGMAS**2),
         *(INLIER_GATE_SIGMAS, GATED_VARIANCE_RATIO),
         *(SQUARED_DOT_RADIUS, SQUARED_DOT_RADIUS_SIGMA),
         *(lattices.parameters.copy(), pose, covariance),
@@ -240,18 +254,64 @@ def _fit_robustly(
         previous = is_inlier
     count = is_inlier.sum(axis=1)
     squares = (squared * is_inlier).sum(axis=1, dtype=np.float64)
-    inlier_variance = np.maximum(
-        squares / (GATED_VARIANCE_RATIO * np.maximum(2 * count - 8, 1)), MIN_SIGMA_PITCHES**2
-    )
+    degrees = np.maximum(2 * count - FITTED_PARAMETERS, 1)
+    inlier_variance = np.maximum(squares / (GATED_VARIANCE_RATIO * degrees), MIN_SIGMA_PITCHES**2)
+    correlation = _neighbour_correlation(current, half, dots.residual, is_inlier, inlier_variance)
+    inlier_variance *= 1 + np.maximum(correlation, 0)
     # Outliers count as if at the gate: in directions of their own, and all together.
     is_outlier = dots.used & ~is_inlier
     gate = INLIER_GATE_SIGMAS * np.sqrt(variance)
-    clipped = dots.residual * (gate[:, None] / np.sqrt(np.maximum(squared, 1e-12)))[..., None]
+    clipped = dots.residual
+    if has_second_lens.any():
+        across = _across_lens(current, dots.residual)
+        clipped = np.where(has_second_lens[:, None, None], across, clipped)
+        squared = (clipped * clipped).sum(axis=2)
+        is_outlier &= squared >= (gate * gate)[:, None]
+    clipped = clipped * (gate[:, None] / np.sqrt(np.maximum(squared, 1e-12)))[..., None]
     outlier_normal, outlier_sum = sum_equations(current, clipped.astype(np.float32), is_outlier)
     hidden = 0.5 * (gate * gate)[:, None, None] * outlier_normal
     hidden += outlier_sum[:, :, None] * outlier_sum[:, None]
     covariance = inlier_variance[:, None, None] * inverse + inverse @ hidden @ inverse
     return _RobustFit(fitted, covariance)
+
+
+def _across_lens(lattices: DotLattices, residual: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return residuals (n, m, 2) without their component along the displacement by the lens."""
+    along = second_lens_columns(lattices)
+    squared = np.maximum((along * along).sum(axis=2), np.float32(1e-30))
+    share = (residual * along).sum(axis=2) / squared
+    result: NDArray[np.float32] = residual - share[..., None] * along
+    return result
+
+
+def _neighbour_correlation(
+    lattices: DotLattices,
+    half: int,
+    residual: NDArray[np.float32],
+    used: NDArray[np.bool_],
+    variance: Array,
+) -> Array:
+    """Return the sum (n,) of the correlations of a dot's error with those of its eight neighbours.
+
+    A sum of n such errors has 1 plus this times the variance of independent ones. Residuals have
+    negative correlations even if the errors are independent, because the fit takes a part of each
+    that its neighbours share: 8 / n of their variance on average, which is added again.
+    """
+    n = len(used)
+    cells = np.zeros((n, 2 * half + 3, 2 * half + 3, 3))
+    frame, dot = np.nonzero(used)
+    column, row = lattices.nodes[frame, dot].astype(np.int64).T + half + 1
+    values = np.concatenate([residual[frame, dot], np.ones((len(frame), 1))], axis=1)
+    np.add.at(cells, (frame, row, column), values)
+    sums = np.zeros((n, 3))
+    middle = cells[:, 1:-1, 1:-1]
+    for down, right in NEIGHBOUR_STEPS:
+        neighbours = cells[:, 1 + down : 2 * half + 2 + down, 1 + right : 2 * half + 2 + right]
+        sums += (middle * neighbours).sum(axis=(1, 2))
+    count = np.maximum(used.sum(axis=1), 1)
+    result: Array = (sums[:, 0] + sums[:, 1]) / (count * variance)
+    result += FITTED_PARAMETERS * sums[:, 2] / count**2
+    return result
 
 
 def _median_variance(squared: NDArray[np.float32], used: NDArray[np.bool_]) -> Array:
@@ -260,7 +320,7 @@ def _median_variance(squared: NDArray[np.float32], used: NDArray[np.bool_]) -> A
     ordered = np.sort(np.where(used, squared, np.float32(np.inf)), axis=1)
     middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[:, None] // 2, axis=1)[:, 0]
     middle = np.where(count > 0, middle, 0).astype(np.float64)
-    degrees = 2 * count / np.maximum(2 * count - 8, 1)
+    degrees = 2 * count / np.maximum(2 * count - FITTED_PARAMETERS, 1)
     result: Array = middle / (2 * math.log(2)) * degrees
     return result
 
