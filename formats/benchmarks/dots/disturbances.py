@@ -342,7 +342,7 @@ def _blurred(disturbance: Disturbance, ink: Image, rng: Random) -> Image:
         sigmas = np.linspace(disturbance.blur_px, disturbance.defocus_px, 6)
         level = weight * (len(sigmas) - 1)
         parts = [ink * np.clip(1 - np.abs(level - k), 0, 1) for k in range(len(sigmas))]
-        spread = [cv2.GaussianBlur(part, (0, 0), float(s)) for part, s in zip(parts, sigmas)]
+        spread = [cv2.GaussianBlur(parts[k], (0, 0), float(sigmas[k])) for k in range(len(parts))]
         result = np.sum(spread, axis=0)
     if disturbance.motion_px:
         angle = rng.uniform(0, math.tau)
