@@ -153,7 +153,7 @@ def test_a_lens_beyond_the_model_hardly_widens_the_covariance(decoded: Decoded) 
     lattices, half, windows = decoded
     points = lattices.points
     squared = (points**2).sum(axis=2, keepdims=True)
-    # A term of the tenth power, which moves the corners by 15 %; a seventh of the dots is displaced.
+    # A term of the tenth power moves the corners by 15 %; a seventh of the dots is displaced.
     strong_bend = points * (0.15 * squared**2 - 0.3 * squared**5)
     rng = np.random.default_rng(5)
     displaced = (rng.random(points.shape[:2]) < 0.15)[..., None]
@@ -169,7 +169,7 @@ def test_a_lens_beyond_the_model_hardly_widens_the_covariance(decoded: Decoded) 
 
 
 @pytest.mark.skipif(pose.kernels is None, reason="no compiled kernels")
-@pytest.mark.parametrize("bend", [0.0, 0.3])
+@pytest.mark.parametrize("bend", [0.2, 0.3])
 def test_compiled_poses_of_a_strong_lens_are_those_of_numpy(decoded: Decoded, bend: float) -> None:
     lattices, half, windows = decoded
     squared = (lattices.points**2).sum(axis=2, keepdims=True)
