@@ -2198,9 +2198,9 @@ static PyObject *search_positions(PyObject *self, PyObject *args)
 
 /* Constants of the robust fit; those of locatk.core.dots.localization.pose. */
 typedef struct {
-    int half_width, lens, max_steps;
+    int half_width, lens, max_steps, fitted_parameters;
     const double *prior;
-    double offset, symbol_gate, min_sigma, second_lens_sigma, second_lens_odds, gate_sigmas,
+    double offset, symbol_gate, min_sigma, higher_lens_sigma, higher_lens_odds, gate_sigmas,
         gated_variance, square_radius, square_radius_sigma;
 } PoseOptions;
 
@@ -2242,85 +2242,174 @@ static void match_pattern(const Codec *codec, const PoseOptions *options, const 
 }
 
 /* Variance of the dots per axis from the median of their squared residuals (-1: no residual). */
-static double median_variance(const float *squares, int m, float *ordered)
+static double median_variance(const float *squares, int m, int parameters, float *ordered)
 {
     int count = 0;
     for (int i = 0; i < m; i++)
         if (squares[i] >= 0) ordered[count++] = squares[i];
     if (!count) return 0;
     const double median = nth_smallest(ordered, count, (count - 1) / 2);
-    const int degrees = 2 * count - 8 > 1 ? 2 * count - 8 : 1;
+    const int degrees = 2 * count - parameters > 1 ? 2 * count - parameters : 1;
     return median / (2 * log(2.0)) * (2.0 * count / degrees);
 }
 
-/* Second radial coefficient c of an unknown lens, which moves the points p to p (1 + c |p|^4), and
- * its part of the normal equations. */
+/* Second and third radial coefficients c, e of an unknown lens, which move the points p to
+ * p (1 + c |p|^4 + e |p|^6), and their part of the solved normal equations. */
+enum { HIGHER_TERMS = 2 };
+/* Least part of the third coefficient's effect that is not one of the second; below it, single
+ * precision does not distinguish them. */
+static const double MIN_DISTINCTION = 1e-6;
 typedef struct {
     int is_fitted;
-    double value, coupling[PARAMETERS], weight;
-} SecondLens;
+    double value[HIGHER_TERMS], coupling[HIGHER_TERMS][PARAMETERS];
+    double inverse[HIGHER_TERMS][HIGHER_TERMS];
+} HigherLens;
 
-/* Derivatives by the second radial coefficient along an axis, negative; write the sums of their
- * squares and of their products with the residuals. */
+/* Derivatives by the second radial coefficient along an axis, negative. */
 HOT static void second_lens_column(const double *parameters, const Dots *d, int axis,
-                                   float *restrict column, double *squares, double *products)
+                                   float *restrict column)
 {
     const float a0 = (float)parameters[3 * axis], a1 = (float)parameters[3 * axis + 1];
     const float g0 = (float)parameters[PERSPECTIVE], g1 = (float)parameters[PERSPECTIVE + 1];
-    const float *restrict value = axis ? d->v : d->u, *restrict residual = d->residual[axis];
+    const float *restrict value = axis ? d->v : d->u;
     const float *restrict x = d->x, *restrict y = d->y, *restrict q0 = d->q[0];
     const float *restrict q1 = d->q[1], *restrict lens_slope = d->lens_slope;
     const float *restrict depth = d->depth, *restrict use = d->use;
-    float sums[2][LANES] = {{0}};
-    for (int i = 0; i < d->count; i += LANES)
-        for (int l = 0; l < LANES; l++) {
-            const int k = i + l;
-            const float slope = a0 * q0[k] + a1 * q1[k] - value[k] * (g0 * q0[k] + g1 * q1[k]);
-            column[k] = -slope * lens_slope[k] * depth[k] * (x[k] * x[k] + y[k] * y[k]) * use[k];
-            sums[0][l] += column[k] * column[k];
-            sums[1][l] += column[k] * residual[k];
-        }
-    *squares += sum_lanes(sums[0]);
-    *products += sum_lanes(sums[1]);
+    for (int k = 0; k < d->count; k++) {
+        const float slope = a0 * q0[k] + a1 * q1[k] - value[k] * (g0 * q0[k] + g1 * q1[k]);
+        column[k] = -slope * lens_slope[k] * depth[k] * (x[k] * x[k] + y[k] * y[k]) * use[k];
+    }
 }
 
-/* Add the second radial coefficient to solved normal equations of the dots in use: correct the step
- * `solved`, and change the coefficient. It is fitted if a first change is beyond `threshold`, in
- * squares of residuals. `columns` are scratch (2 d->count). */
-static int fit_second_lens(const double *parameters, const Dots *d, double normal[][PARAMETERS],
+/* Sum of the products of two arrays. */
+HOT static double sum_products(const float *restrict a, const float *restrict b, int count)
+{
+    float sums[LANES] = {0};
+    for (int i = 0; i < count; i += LANES)
+        for (int l = 0; l < LANES; l++) sums[l] += a[i + l] * b[i + l];
+    return sum_lanes(sums);
+}
+
+/* Add the higher radial coefficients to solved normal equations of the dots in use: correct the
+ * step `solved`, and change the coefficients. They are fitted if a first change of the second alone
+ * is beyond `threshold`, in squares of residuals. `columns` are scratch (4 d->count). */
+static int fit_higher_lens(const double *parameters, const Dots *d, double normal[][PARAMETERS],
                            double prior, double threshold, float *columns, double *step,
-                           SecondLens *lens)
+                           HigherLens *lens)
 {
     static const double no_prior[PARAMETERS] = {0};
-    double weight = prior, gain = -prior * lens->value;
-    Dots other = *d;
-    for (int axis = 0; axis < 2; axis++) {
-        other.residual[axis] = columns + axis * d->count;
-        second_lens_column(parameters, d, axis, other.residual[axis], &weight, &gain);
+    double weight[HIGHER_TERMS][HIGHER_TERMS], gain[HIGHER_TERMS];
+    for (int term = 0; term < HIGHER_TERMS; term++) {
+        float *own = columns + 2 * term * d->count;
+        Dots other = *d;
+        gain[term] = -prior * lens->value[term];
+        for (int other_term = 0; other_term <= term; other_term++)
+            weight[term][other_term] = other_term == term ? prior : 0;
+        for (int axis = 0; axis < 2; axis++) {
+            float *column = own + axis * d->count;
+            if (term == 0)
+                second_lens_column(parameters, d, axis, column);
+            else
+                for (int k = 0; k < d->count; k++)
+                    column[k] = columns[axis * d->count + k]
+                                * (d->x[k] * d->x[k] + d->y[k] * d->y[k]);
+            other.residual[axis] = column;
+            gain[term] += sum_products(column, d->residual[axis], d->count);
+            for (int other_term = 0; other_term <= term; other_term++)
+                weight[term][other_term] += sum_products(
+                    column, columns + (2 * other_term + axis) * d->count, d->count);
+        }
+        double unused[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], cross[PARAMETERS];
+        normal_equations(parameters, &other, 0, 1, no_prior, unused, cross);
+        memcpy(copy, normal, sizeof(copy));
+        memcpy(lens->coupling[term], cross, sizeof(cross));
+        if (!solve_linear(copy, lens->coupling[term], 1)) return 0;
+        for (int k = 0; k < PARAMETERS; k++) {
+            gain[term] -= cross[k] * step[k];
+            for (int other_term = 0; other_term <= term; other_term++)
+                weight[term][other_term] -= cross[k] * lens->coupling[other_term][k];
+        }
+        lens->is_fitted = lens->is_fitted || gain[0] * gain[0] > threshold * weight[0][0];
+        if (!lens->is_fitted) return 1;
     }
-    double unused[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], cross[PARAMETERS];
-    normal_equations(parameters, &other, 0, 1, no_prior, unused, cross);
-    memcpy(copy, normal, sizeof(copy));
-    memcpy(lens->coupling, cross, sizeof(cross));
-    if (!solve_linear(copy, lens->coupling, 1)) return 0;
-    for (int k = 0; k < PARAMETERS; k++) {
-        weight -= cross[k] * lens->coupling[k];
-        gain -= cross[k] * step[k];
+    const double product = weight[0][0] * weight[1][1];
+    const double area = product - weight[1][0] * weight[1][0];
+    const int is_distinct = area > MIN_DISTINCTION * product;
+    lens->inverse[0][0] = is_distinct ? weight[1][1] / area : 1 / weight[0][0];
+    lens->inverse[1][1] = is_distinct ? weight[0][0] / area : 0;
+    lens->inverse[0][1] = lens->inverse[1][0] = is_distinct ? -weight[1][0] / area : 0;
+    for (int term = 0; term < HIGHER_TERMS; term++) {
+        const double *row = lens->inverse[term];
+        const double change = row[0] * gain[0] + row[1] * gain[1];
+        lens->value[term] += change;
+        for (int k = 0; k < PARAMETERS; k++) step[k] -= lens->coupling[term][k] * change;
     }
-    const double change = gain / weight;
-    lens->is_fitted = lens->is_fitted || gain * change > threshold;
-    if (!lens->is_fitted) return 1;
-    lens->weight = weight;
-    lens->value += change;
-    for (int k = 0; k < PARAMETERS; k++) step[k] -= lens->coupling[k] * change;
     return 1;
+}
+
+/* Index of the cell of a dot among the grid positions of the window with a margin. */
+static int cell_of(const Dots *d, int i, int half_width)
+{
+    const int column = (int)rintf(d->u[i]) + half_width + 1;
+    const int row = (int)rintf(d->v[i]) + half_width + 1;
+    return row * (2 * half_width + 3) + column;
+}
+
+/* Sum of the correlations of the error of a dot in use with those of its eight neighbours on the
+ * grid; see locatk.core.dots.localization.pose. `cells` are scratch, three for each cell. */
+static double neighbour_correlation(const Dots *d, int m, int half_width, int parameters,
+                                    double variance, float *cells)
+{
+    const int width = 2 * half_width + 3;
+    const int steps[4] = {1, width - 1, width, width + 1};
+    memset(cells, 0, 3 * (size_t)width * (size_t)width * sizeof(float));
+    for (int i = 0; i < m; i++) {
+        if (d->use[i] == 0) continue;
+        float *cell = cells + 3 * cell_of(d, i, half_width);
+        cell[0] += d->residual[0][i];
+        cell[1] += d->residual[1][i];
+        cell[2] += 1;
+    }
+    double products = 0, pairs = 0, count = 0;
+    for (int i = 0; i < m; i++) {
+        if (d->use[i] == 0) continue;
+        const float *cell = cells + 3 * cell_of(d, i, half_width);
+        for (int k = 0; k < 4; k++) {
+            const float *other = cell + 3 * steps[k];
+            products += d->residual[0][i] * other[0] + d->residual[1][i] * other[1];
+            pairs += other[2];
+        }
+        count++;
+    }
+    return count > 0 ? products / (count * variance) + parameters * pairs / (count * count) : 0;
+}
+
+/* Remove the component of residuals along the displacement by the lens, and correct their
+ * `squares`. `columns` are scratch (2 d->count). */
+static void keep_across(const double *parameters, const Dots *d, int m, float *columns,
+                        float *squares)
+{
+    float *along[2] = {columns, columns + d->count};
+    Dots all = *d;
+    all.use = d->valid;
+    for (int axis = 0; axis < 2; axis++) second_lens_column(parameters, &all, axis, along[axis]);
+    for (int i = 0; i < m; i++) {
+        if (squares[i] < 0) continue;
+        const float c = along[0][i], s = along[1][i], square = c * c + s * s;
+        const float ratio = (d->residual[0][i] * c + d->residual[1][i] * s)
+                            / (square > 1e-30f ? square : 1e-30f);
+        const float du = d->residual[0][i] - ratio * c, dv = d->residual[1][i] - ratio * s;
+        d->residual[0][i] = du;
+        d->residual[1][i] = dv;
+        squares[i] = du * du + dv * dv;
+    }
 }
 
 /* Refit the lattice robustly to the dots that agree with the decoded pattern, and derive the pose
  * and its covariance from it. Return 0 if the equations are singular. */
 static int estimate_pose(const Codec *codec, const PoseOptions *options, const int64_t *window,
                          const float *points, const Dots *d, int m, int64_t *phases, float *scratch,
-                         double *parameters, double *pose, double *covariance)
+                         float *cells, double *parameters, double *pose, double *covariance)
 {
     static const double no_prior[PARAMETERS] = {0};
     const int64_t x = window[0], y = window[1], section[2] = {window[2], window[3]};
@@ -2336,12 +2425,12 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
     double normal[PARAMETERS][PARAMETERS], copy[PARAMETERS][PARAMETERS], step[PARAMETERS];
     double variance = min_variance, gate_square = 0;
     float *squares = scratch, *ordered = squares + m, *columns = ordered + m;
-    SecondLens lens = {0};
+    HigherLens lens = {0};
     memset(d->use, 0, (size_t)d->count * sizeof(float));
     for (int k = 0; k < options->max_steps; k++) {
         project(parameters, d);
         match_pattern(codec, options, phases, rows, (int)window[4], d, m, squares);
-        variance = median_variance(squares, m, ordered);
+        variance = median_variance(squares, m, options->fitted_parameters, ordered);
         if (!(variance > min_variance)) variance = min_variance;
         gate_square = options->gate_sigmas * options->gate_sigmas * variance;
         int is_changed = 0;
@@ -2356,34 +2445,47 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
         if (!solve_linear(copy, step, 1)) return 0;
         if (options->lens && (k == 0 || lens.is_fitted)) {
             const double prior =
-                variance / (options->second_lens_sigma * options->second_lens_sigma);
-            const double threshold = options->second_lens_odds * variance;
-            if (!fit_second_lens(parameters, d, normal, prior, threshold, columns, step, &lens))
+                variance / (options->higher_lens_sigma * options->higher_lens_sigma);
+            const double threshold = options->higher_lens_odds * variance;
+            if (!fit_higher_lens(parameters, d, normal, prior, threshold, columns, step, &lens))
                 return 0;
         }
         if (!is_changed || k + 1 == options->max_steps) break;
         for (int j = 0; j < PARAMETERS; j++) parameters[j] += step[j];
         for (int i = 0; lens.is_fitted && i < m; i++) {
             const double px = points[2 * i], py = points[2 * i + 1], square = px * px + py * py;
-            const double factor = 1 + lens.value * square * square;
+            const double factor =
+                1 + square * square * (lens.value[0] + lens.value[1] * square);
             d->x[i] = (float)(px * factor);
             d->y[i] = (float)(py * factor);
         }
     }
+    /* Across the displacement by the lens, residuals have half of their degrees of freedom. */
+    if (lens.is_fitted) keep_across(parameters, d, m, columns, squares);
+    const double dimensions_ratio = lens.is_fitted ? 2 : 1;
+    const int fitted = options->fitted_parameters;
     int inliers = 0;
     double sum = 0;
-    /* Outliers count as if at the gate: in directions of their own, and all together. */
-    for (int i = 0; i < m; i++) {
+    for (int i = 0; i < m; i++)
         if (d->use[i] != 0) {
             inliers++;
-            sum += squares[i];
-            d->use[i] = 0;
-        } else if (squares[i] >= 0) {
-            const float scale = (float)sqrt(gate_square / squares[i]);
-            d->residual[0][i] *= scale;
-            d->residual[1][i] *= scale;
-            d->use[i] = 1;
+            sum += dimensions_ratio * squares[i];
         }
+    const int degrees = 2 * inliers - fitted > 1 ? 2 * inliers - fitted : 1;
+    double inlier_variance = sum / (options->gated_variance * degrees);
+    if (!(inlier_variance > min_variance)) inlier_variance = min_variance;
+    const double correlation =
+        neighbour_correlation(d, m, half_width, fitted, inlier_variance / dimensions_ratio,
+                             cells);
+    if (correlation > 0) inlier_variance *= 1 + correlation;
+    /* Outliers count as if at the gate: in directions of their own, and all together. */
+    for (int i = 0; i < m; i++) {
+        const int is_outlier = d->use[i] == 0 && squares[i] >= gate_square;
+        d->use[i] = is_outlier;
+        if (!is_outlier) continue;
+        const float scale = (float)sqrt(gate_square / squares[i]);
+        d->residual[0][i] *= scale;
+        d->residual[1][i] *= scale;
     }
     double outliers[PARAMETERS][PARAMETERS], together[PARAMETERS];
     normal_equations(parameters, d, 0, options->lens, no_prior, outliers, together);
@@ -2422,14 +2524,17 @@ static int estimate_pose(const Codec *codec, const PoseOptions *options, const i
         for (int side = 0; side < 3; side++) solved[3 * k + side] = jacobian[side][k];
     if (!solve_linear(normal, solved, 3)) return 0;
     for (int side = 0; lens.is_fitted && side < 3; side++) {
-        double along = 0;
-        for (int k = 0; k < PARAMETERS; k++) along += jacobian[side][k] * lens.coupling[k];
-        for (int k = 0; k < PARAMETERS; k++)
-            solved[3 * k + side] += lens.coupling[k] * along / lens.weight;
+        double along[HIGHER_TERMS] = {0};
+        for (int term = 0; term < HIGHER_TERMS; term++)
+            for (int k = 0; k < PARAMETERS; k++)
+                along[term] += jacobian[side][k] * lens.coupling[term][k];
+        for (int term = 0; term < HIGHER_TERMS; term++) {
+            const double *row = lens.inverse[term];
+            const double change = row[0] * along[0] + row[1] * along[1];
+            for (int k = 0; k < PARAMETERS; k++)
+                solved[3 * k + side] += lens.coupling[term][k] * change;
+        }
     }
-    const int degrees = 2 * inliers - 8 > 1 ? 2 * inliers - 8 : 1;
-    double inlier_variance = sum / (options->gated_variance * degrees);
-    if (!(inlier_variance > min_variance)) inlier_variance = min_variance;
     double coherent[3] = {0}, apart[PARAMETERS * 3] = {0};
     for (int k = 0; k < PARAMETERS; k++)
         for (int side = 0; side < 3; side++) {
@@ -2457,14 +2562,14 @@ static PyObject *poses(PyObject *self, PyObject *args)
     PyObject *points_array, *valid_array, *prior_array, *windows_array, *parameters_array,
         *pose_array, *covariance_array;
     CodecArrays arrays;
-    long long n, m, half_width, range, smallest_shift, steps;
+    long long n, m, half_width, range, smallest_shift, steps, fitted;
     PoseOptions options = {0};
-    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLddddddOOO:poses", &points_array, &valid_array,
+    if (!parse_arguments(args, "OOLLLpOOOOOOOOOLLdddLLddddddOOO:poses", &points_array, &valid_array,
                          &n, &m, &half_width, &options.lens, &prior_array, &windows_array,
                          &arrays.lengths, &arrays.weights, &arrays.prefixes, &arrays.crt,
                          &arrays.signs, &arrays.digits, &arrays.masks, &range, &smallest_shift,
-                         &options.offset, &options.symbol_gate, &options.min_sigma, &steps,
-                         &options.second_lens_sigma, &options.second_lens_odds,
+                         &options.offset, &options.symbol_gate, &options.min_sigma, &steps, &fitted,
+                         &options.higher_lens_sigma, &options.higher_lens_odds,
                          &options.gate_sigmas, &options.gated_variance, &options.square_radius,
                          &options.square_radius_sigma, &parameters_array, &pose_array,
                          &covariance_array))
@@ -2474,6 +2579,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     check_range(&call, "m", m, 0, MAX_DOTS);
     check_range(&call, "half_width", half_width, 1, MAX_WINDOW_CELLS / 2);
     check_range(&call, "max_steps", steps, 1, MAX_REFIT_STEPS);
+    check_range(&call, "fitted_parameters", fitted, 1, PARAMETERS);
     if (call.failed) return NULL;
     const float *points = input(&call, points_array, "points", ITEM_FLOAT32, ITEMS(n, m, 2));
     const uint8_t *valid = input(&call, valid_array, "valid", ITEM_FLAG, ITEMS(n, m));
@@ -2492,20 +2598,23 @@ static PyObject *poses(PyObject *self, PyObject *args)
     if (call.failed) return finish_call(&call, 1);
     options.half_width = (int)half_width;
     options.max_steps = (int)steps;
+    options.fitted_parameters = (int)fitted;
     Dots d;
     const int has_dots = new_dots(&d, (int)m);
     int64_t *phases = malloc(4 * (size_t)half_width * sizeof(int64_t));
-    const size_t scratch_items = 2 * ((size_t)m + 1) + 2 * (size_t)d.count;
+    const size_t scratch_items = 2 * ((size_t)m + 1) + 2 * HIGHER_TERMS * (size_t)d.count;
     float *scratch = has_dots ? malloc(scratch_items * sizeof(float)) : NULL;
-    const int has_memory = has_dots && phases && scratch;
+    const size_t width = 2 * (size_t)half_width + 3;
+    float *cells = malloc(3 * width * width * sizeof(float));
+    const int has_memory = has_dots && phases && scratch && cells;
     if (has_memory) {
         Py_BEGIN_ALLOW_THREADS
         for (size_t k = 0; k < (size_t)n; k++) {
             const size_t dot = k * (size_t)m;
             load_dots(&d, points + 2 * dot, valid + dot, (int)m);
             if (!estimate_pose(&codec, &options, windows + k * WINDOW_COLUMNS, points + 2 * dot, &d,
-                               (int)m, phases, scratch, parameters + k * PARAMETERS, pose + 3 * k,
-                               covariance + 9 * k)) {
+                               (int)m, phases, scratch, cells, parameters + k * PARAMETERS,
+                               pose + 3 * k, covariance + 9 * k)) {
                 for (int i = 0; i < 3; i++) pose[3 * k + i] = NAN;
                 for (int i = 0; i < 9; i++) covariance[9 * k + i] = NAN;
             }
@@ -2514,6 +2623,7 @@ static PyObject *poses(PyObject *self, PyObject *args)
     }
     if (has_dots) free(d.x);
     free(phases);
+    free(cells);
     free(scratch);
     return finish_call(&call, has_memory);
 }
@@ -2624,8 +2734,8 @@ static PyMethodDef methods[] = {
     {"poses", poses, METH_VARARGS,
      "poses($module, points, valid, n, m, half_width, lens, prior, windows, lengths, weights,"
      " prefixes, crt, signs, digits, masks, range, smallest_shift, offset, symbol_gate, min_sigma,"
-     " max_steps, second_lens_sigma, second_lens_odds, gate_sigmas, gated_variance, square_radius, square_radius_sigma, parameters, pose,"
-     " covariance, /)\n--\n\n"
+     " max_steps, fitted_parameters, higher_lens_sigma, higher_lens_odds, gate_sigmas, gated_variance,"
+     " square_radius, square_radius_sigma, parameters, pose, covariance, /)\n--\n\n"
      "Estimate poses from decoded dots; twin of locatk.core.dots.localization.pose.localize_windows_numpy."},
     {"ddtw", ddtw, METH_VARARGS,
      "ddtw($module, query, slopes, n, length, count, cost, /)\n--\n\n"

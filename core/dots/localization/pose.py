@@ -7,7 +7,13 @@ from the fit. (Hostettler et al. 2016, II-B.8, use one corner of the decoded win
 Near hands, ink and reflections some dots are displaced. Those beyond a gate, whose width follows
 from the median residual of the frame, are not used. They show that others within the gate are
 displaced as well, which no residual reveals: the covariance therefore contains them as if they were
-at the gate, in directions of their own and all together.
+at the gate, in directions of their own and all together. Neighbours that are displaced alike count
+as fewer dots: the correlation of their residuals widens the covariance.
+
+The model of an unknown lens has at most three radial coefficients. Strong lenses displace dots near
+the corners further, but only towards the centre or away from it, which hardly moves a pose (the
+radial alignment constraint, Tsai 1987). In frames that show more than the first coefficient, the
+covariance therefore follows from the components of the residuals across this direction.
 
 In tilted frames the image of a disc is displaced from the image of its centre. To second order of
 its radius r, in pitches, the displacement on the paper is r^2 times the slope of the logarithm of
@@ -57,13 +63,17 @@ MAX_REFIT_STEPS = 8
 """Maximum number of Gauss-Newton steps after decoding, each with its own inliers. Sharp frames need
 three until no dot changes its side of the gate, strongly bent ones more."""
 
-SECOND_LENS_SIGMA = 0.15
-"""Prior standard deviation of the second radial coefficient at the corner of the frame, as that of
-the first."""
+HIGHER_LENS_SIGMA = 0.15
+"""Prior standard deviation of the second and the third radial coefficient at the corner of the
+frame, as that of the first."""
 
-MIN_SECOND_LENS_SIGMAS = 5.0
+MIN_HIGHER_LENS_SIGMAS = 5.0
 """Least first estimate of the second radial coefficient, in its standard deviations; below it, the
 first coefficient suffices."""
+
+MIN_DISTINCTION = 1e-6
+"""Least part of the third coefficient's effect that is not one of the second; below it, single
+precision does not distinguish them."""
 
 INLIER_GATE_SIGMAS = 3.0
 """Radius of the gate of a dot's residual, in standard deviations of an axis; 1.1 % of Gaussian
@@ -71,6 +81,14 @@ residuals are beyond it (chi-square with two degrees of freedom)."""
 
 GATED_VARIANCE_RATIO = 1 - 0.5 * INLIER_GATE_SIGMAS**2 / math.expm1(0.5 * INLIER_GATE_SIGMAS**2)
 """Variance of Gaussian residuals within the gate, relative to that of all."""
+
+FITTED_PARAMETERS = 8
+"""Number of parameters of a homography, by which residuals have fewer degrees of freedom than
+coordinates; the priors determine the lens as much as the dots do."""
+
+NEIGHBOUR_STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
+"""Steps from a grid position to one half of its eight neighbours; it is one of the other half of
+theirs."""
 
 SQUARED_DOT_RADIUS = 0.0174
 SQUARED_DOT_RADIUS_SIGMA = 0.007
@@ -144,7 +162,7 @@ def localize_windows(
         *(n, m, half, lattices.lens, prior_weights(True), decoded),
         *kernel_tables(codec),
         *(SECTION_LENGTH, MIN_SHIFT, DOT_OFFSET_PITCHES, SYMBOL_GATE_PITCHES, MIN_SIGMA_PITCHES),
-        *(MAX_REFIT_STEPS, SECOND_LENS_SIGMA, MIN_SECOND_LENS_SIGMAS**2),
+        *(MAX_REFIT_STEPS, FITTED_PARAMETERS, HIGHER_LENS_SIGMA, MIN_HIGHER_LENS_SIGMAS**2),
         *(INLIER_GATE_SIGMAS, GATED_VARIANCE_RATIO),
         *(SQUARED_DOT_RADIUS, SQUARED_DOT_RADIUS_SIGMA),
         *(lattices.parameters.copy(), pose, covariance),
@@ -199,11 +217,11 @@ def _fit_robustly(
 ) -> _RobustFit:
     """Fit lattices to the dots of decoded windows within the gate of each frame.
 
-    If the lens is unknown, a second radial coefficient is fitted to the frames that show one.
+    If the lens is unknown, higher radial coefficients are fitted to the frames that show them.
     """
     n = len(lattices.parameters)
     squared_radius = (lattices.points.astype(np.float64) ** 2).sum(axis=2)
-    bend, has_second_lens = np.zeros(n), np.full(n, lattices.lens)
+    bend, is_bent = np.zeros((n, 2)), np.full(n, lattices.lens)
     fitted, previous = lattices, np.zeros_like(lattices.valid)
     for _ in range(MAX_REFIT_STEPS):
         current = fitted
@@ -215,43 +233,116 @@ def _fit_robustly(
         add_prior(normal, right, current.parameters, np.sqrt(variance), lens=lattices.lens)
         inverse = np.linalg.inv(normal)
         step = np.einsum("nij,nj->ni", inverse, right)
-        if has_second_lens.any():
-            columns = second_lens_columns(current) * is_inlier[..., None]
-            _, cross = sum_equations(current, -columns, is_inlier)
-            coupling = np.einsum("nij,nj->ni", inverse, cross)
-            prior = variance * SECOND_LENS_SIGMA**-2.0
-            weight = (columns.astype(np.float64) ** 2).sum(axis=(1, 2)) + prior
-            weight -= np.einsum("ni,ni->n", cross, coupling)
-            gain = -(columns.astype(np.float64) * dots.residual).sum(axis=(1, 2)) - prior * bend
-            gain -= np.einsum("ni,ni->n", cross, step)
+        if is_bent.any():
+            columns = _higher_lens_columns(current) * is_inlier[:, None, :, None]
+            cross = np.stack(
+                [sum_equations(current, -columns[:, term], is_inlier)[1] for term in (0, 1)],
+                axis=2,
+            )
+            coupling = inverse @ cross
+            columns = columns.astype(np.float64)
+            prior = variance * HIGHER_LENS_SIGMA**-2.0
+            weight = np.einsum("nsma,ntma->nst", columns, columns)
+            weight += prior[:, None, None] * np.eye(2) - cross.transpose(0, 2, 1) @ coupling
+            gain = -np.einsum("ntma,nma->nt", columns, dots.residual) - prior[:, None] * bend
+            gain -= np.einsum("nit,ni->nt", cross, step)
             if current is lattices:
-                has_second_lens = gain * gain > MIN_SECOND_LENS_SIGMAS**2 * variance * weight
-            change = np.where(has_second_lens, gain / weight, 0)
+                threshold = MIN_HIGHER_LENS_SIGMAS**2 * variance
+                is_bent = is_bent & (gain[:, 0] ** 2 > threshold * weight[:, 0, 0])
+            solution = _invert_pairs(weight) * is_bent[:, None, None]
+            change = np.einsum("nst,nt->ns", solution, gain)
             bend = bend + change
-            step -= coupling * change[:, None]
-            coupling = np.where(has_second_lens[:, None], coupling, 0)
-            inverse += coupling[:, :, None] * (coupling / weight[:, None])[:, None]
-        factor = 1 + bend[:, None] * squared_radius**2
+            step -= np.einsum("nit,nt->ni", coupling, change)
+            inverse += coupling @ solution @ coupling.transpose(0, 2, 1)
+        factor = 1 + squared_radius**2 * (bend[:, :1] + bend[:, 1:] * squared_radius)
         fitted = project_lattices(
             lattices, current.parameters + step, lattices.points * factor[..., None]
         )
         if (is_inlier == previous).all():
             break
         previous = is_inlier
-    count = is_inlier.sum(axis=1)
-    squares = (squared * is_inlier).sum(axis=1, dtype=np.float64)
-    inlier_variance = np.maximum(
-        squares / (GATED_VARIANCE_RATIO * np.maximum(2 * count - 8, 1)), MIN_SIGMA_PITCHES**2
+    residual = dots.residual
+    if is_bent.any():
+        across = _across_lens(current, residual)
+        residual = np.where(is_bent[:, None, None], across, residual)
+        squared = (residual * residual).sum(axis=2)
+    # Across the displacement by the lens, residuals have half of their degrees of freedom.
+    dimensions_ratio = np.where(is_bent, 2.0, 1.0)
+    squares = dimensions_ratio * (squared * is_inlier).sum(axis=1, dtype=np.float64)
+    degrees = np.maximum(2 * is_inlier.sum(axis=1) - FITTED_PARAMETERS, 1)
+    inlier_variance = np.maximum(squares / (GATED_VARIANCE_RATIO * degrees), MIN_SIGMA_PITCHES**2)
+    correlation = _neighbour_correlation(
+        current, half, residual, is_inlier, inlier_variance / dimensions_ratio
     )
+    inlier_variance *= 1 + np.maximum(correlation, 0)
     # Outliers count as if at the gate: in directions of their own, and all together.
-    is_outlier = dots.used & ~is_inlier
     gate = INLIER_GATE_SIGMAS * np.sqrt(variance)
-    clipped = dots.residual * (gate[:, None] / np.sqrt(np.maximum(squared, 1e-12)))[..., None]
+    is_outlier = dots.used & ~is_inlier & (squared >= (gate * gate)[:, None])
+    clipped = residual * (gate[:, None] / np.sqrt(np.maximum(squared, 1e-12)))[..., None]
     outlier_normal, outlier_sum = sum_equations(current, clipped.astype(np.float32), is_outlier)
     hidden = 0.5 * (gate * gate)[:, None, None] * outlier_normal
     hidden += outlier_sum[:, :, None] * outlier_sum[:, None]
     covariance = inlier_variance[:, None, None] * inverse + inverse @ hidden @ inverse
     return _RobustFit(fitted, covariance)
+
+
+def _higher_lens_columns(lattices: DotLattices) -> NDArray[np.float32]:
+    """Return the derivatives (n, 2, m, 2) by the second and the third radial coefficient."""
+    second = second_lens_columns(lattices)
+    squared_radius = (lattices.points * lattices.points).sum(axis=2)
+    return np.stack([second, second * squared_radius[..., None]], axis=1)
+
+
+def _invert_pairs(weight: Array) -> Array:
+    """Invert symmetric matrices (n, 2, 2); only their first element if they are nearly singular."""
+    product = weight[:, 0, 0] * weight[:, 1, 1]
+    area = product - weight[:, 1, 0] ** 2
+    is_distinct = area > MIN_DISTINCTION * product
+    divisor = np.where(is_distinct, area, 1)
+    result = np.zeros_like(weight)
+    result[:, 0, 0] = np.where(is_distinct, weight[:, 1, 1] / divisor, 1 / weight[:, 0, 0])
+    result[:, 1, 1] = np.where(is_distinct, weight[:, 0, 0] / divisor, 0)
+    result[:, 0, 1] = result[:, 1, 0] = np.where(is_distinct, -weight[:, 1, 0] / divisor, 0)
+    return result
+
+
+def _across_lens(lattices: DotLattices, residual: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return residuals (n, m, 2) without their component along the displacement by the lens."""
+    along = second_lens_columns(lattices)
+    squared = np.maximum((along * along).sum(axis=2), np.float32(1e-30))
+    ratio = (residual * along).sum(axis=2) / squared
+    result: NDArray[np.float32] = residual - ratio[..., None] * along
+    return result
+
+
+def _neighbour_correlation(
+    lattices: DotLattices,
+    half: int,
+    residual: NDArray[np.float32],
+    used: NDArray[np.bool_],
+    variance: Array,
+) -> Array:
+    """Return the sum (n,) of the correlations of a dot's error with those of its eight neighbours.
+
+    A sum of n such errors has 1 plus this times the variance of independent ones. Residuals have
+    negative correlations even if the errors are independent, because the fit takes a part of each
+    that its neighbours share: parameters / n of their variance on average, added again here.
+    """
+    n = len(used)
+    cells = np.zeros((n, 2 * half + 3, 2 * half + 3, 3))
+    frame, dot = np.nonzero(used)
+    column, row = lattices.nodes[frame, dot].astype(np.int64).T + half + 1
+    values = np.concatenate([residual[frame, dot], np.ones((len(frame), 1))], axis=1)
+    np.add.at(cells, (frame, row, column), values)
+    sums = np.zeros((n, 3))
+    middle = cells[:, 1:-1, 1:-1]
+    for down, right in NEIGHBOUR_STEPS:
+        neighbours = cells[:, 1 + down : 2 * half + 2 + down, 1 + right : 2 * half + 2 + right]
+        sums += (middle * neighbours).sum(axis=(1, 2))
+    count = np.maximum(used.sum(axis=1), 1)
+    result: Array = (sums[:, 0] + sums[:, 1]) / (count * variance)
+    result += FITTED_PARAMETERS * sums[:, 2] / count**2
+    return result
 
 
 def _median_variance(squared: NDArray[np.float32], used: NDArray[np.bool_]) -> Array:
@@ -260,7 +351,7 @@ def _median_variance(squared: NDArray[np.float32], used: NDArray[np.bool_]) -> A
     ordered = np.sort(np.where(used, squared, np.float32(np.inf)), axis=1)
     middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[:, None] // 2, axis=1)[:, 0]
     middle = np.where(count > 0, middle, 0).astype(np.float64)
-    degrees = 2 * count / np.maximum(2 * count - 8, 1)
+    degrees = 2 * count / np.maximum(2 * count - FITTED_PARAMETERS, 1)
     result: Array = middle / (2 * math.log(2)) * degrees
     return result
 

@@ -337,12 +337,13 @@ def _blurred(disturbance: Disturbance, ink: Image, rng: Random) -> Image:
     result = cv2.GaussianBlur(ink, (0, 0), disturbance.blur_px)
     if disturbance.defocus_px:
         weight = _direction_field(disturbance.size, rng)
-        # Of several blurred images, the two next to the local blur are mixed.
+        # Each point of the paper is spread by its own blur, so that its light keeps its centre. A
+        # blur chosen by the pixel that receives the light would move all dots to the sharp side.
         sigmas = np.linspace(disturbance.blur_px, disturbance.defocus_px, 6)
-        images = [cv2.GaussianBlur(ink, (0, 0), float(sigma)) for sigma in sigmas]
         level = weight * (len(sigmas) - 1)
-        weights = [np.clip(1 - np.abs(level - k), 0, 1) for k in range(len(sigmas))]
-        result = np.sum(np.multiply(weights, images), axis=0)
+        parts = [ink * np.clip(1 - np.abs(level - k), 0, 1) for k in range(len(sigmas))]
+        spread = [cv2.GaussianBlur(parts[k], (0, 0), float(sigmas[k])) for k in range(len(parts))]
+        result = np.sum(spread, axis=0)
     if disturbance.motion_px:
         angle = rng.uniform(0, math.tau)
         steps = np.linspace(-0.5, 0.5, 13) * disturbance.motion_px

@@ -32,6 +32,18 @@ def test_disturbed_frames_are_read(name: str, least: int) -> None:
     assert not result.wrong.any()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "limits"),
+    [("defocus on one side", (0.5, 2.7)), ("pincushion of 30 %", (0.15, 2.0))],
+)
+def test_covariances_agree_with_the_errors(name: str, limits: tuple[float, float]) -> None:
+    frames = render(DISTURBANCES[name], 16, 35)
+    result = score(frames, localize_frames(frames.images, codec("anoto"), other_codec_odds=0))
+    assert result.correct.all()
+    assert limits[0] < result.nees[:2].mean() < limits[1]
+
+
 def test_frames_of_a_level_camera_agree_with_the_truth() -> None:
     """The truth of the renderer is that of the solver within a hundredth of a pitch."""
     frames = render(Disturbance(noise=0.0), 3, 32)

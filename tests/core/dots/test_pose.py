@@ -131,3 +131,51 @@ def test_a_lens_of_another_model_is_followed(shoot: Any) -> None:
         sigmas.append(np.sqrt(np.trace(poses.covariance[0, :2, :2])))
     # 13 times with one coefficient.
     assert sigmas[1] < 4 * sigmas[0]
+
+
+@pytest.mark.usefixtures("implementation")
+def test_displacements_that_neighbours_share_widen_the_covariance(decoded: Decoded) -> None:
+    """The same displacements, in any order, leave the scatter of the frame as it is."""
+    points, valid = decoded[0].points[0].astype(np.float64), decoded[0].valid
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        waves, phases = rng.normal(0, 8, (3, 2, 2)), rng.uniform(0, 6.3, (3, 2))
+        smooth = 0.006 * np.sin(np.einsum("mi,kci->mkc", points, waves) + phases).sum(axis=1)
+        sigmas = []
+        for order in (np.arange(len(points)), rng.permutation(len(points))):
+            moved = with_displaced(decoded, valid, smooth[order][None])
+            sigmas.append(np.sqrt(np.trace(moved.covariance[0, :2, :2])))
+        assert sigmas[0] > 1.2 * sigmas[1]
+
+
+@pytest.mark.usefixtures("implementation")
+def test_a_lens_beyond_the_model_hardly_widens_the_covariance(decoded: Decoded) -> None:
+    lattices, half, windows = decoded
+    points = lattices.points
+    squared = (points**2).sum(axis=2, keepdims=True)
+    # A term of the tenth power moves the corners by 15 %; a seventh of the dots is displaced.
+    strong_bend = points * (0.15 * squared**2 - 0.3 * squared**5)
+    rng = np.random.default_rng(5)
+    displaced = (rng.random(points.shape[:2]) < 0.15)[..., None]
+    displacement = displaced * rng.normal(0, 0.006, points.shape)
+    sigmas = []
+    for moved in (points * 0.15 * squared**2, strong_bend, strong_bend + displacement):
+        refitted = fit_lattices((points + moved).astype(np.float32), lattices.valid, lens=True)
+        poses = localize_windows(refitted, half, windows, ANOTO)
+        assert np.abs(poses.grid[0] - AT).max() < 2e-3
+        sigmas.append(np.sqrt(np.trace(poses.covariance[0, :2, :2])))
+    assert sigmas[1] < 1.5 * sigmas[0]
+    assert sigmas[2] > 1.3 * sigmas[1]
+
+
+@pytest.mark.skipif(pose.kernels is None, reason="no compiled kernels")
+@pytest.mark.parametrize("bend", [0.2, 0.3])
+def test_compiled_poses_of_a_strong_lens_are_those_of_numpy(decoded: Decoded, bend: float) -> None:
+    lattices, half, windows = decoded
+    squared = (lattices.points**2).sum(axis=2, keepdims=True)
+    bent = lattices.points * (1 + 0.15 * squared**2 - bend * squared**5)
+    refitted = fit_lattices(bent.astype(np.float32), lattices.valid, lens=True)
+    compiled = localize_windows(refitted, half, windows, ANOTO)
+    expected = pose.localize_windows_numpy(refitted, half, windows, ANOTO)
+    np.testing.assert_allclose(compiled.grid - AT, expected.grid - AT, atol=2e-5)
+    np.testing.assert_allclose(compiled.covariance, expected.covariance, rtol=0.02, atol=1e-10)
