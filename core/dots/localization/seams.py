@@ -105,7 +105,8 @@ def localize_view(
         decoded.dots,
         np.where(is_same, decoded.corrected, 2 * len(view.misread_pixels)),
         np.where(is_refuted, 0.0, confidence),
-        np.zeros(1, np.bool_),
+        border=np.zeros(1, np.bool_),
+        rival_odds=np.zeros(1),
     )
     pose = localize_windows(lattice, half, windows, code)
     return LocalizedFrames(
@@ -117,6 +118,7 @@ def localize_view(
         windows.corrected,
         windows.confidence,
         np.where(is_refuted, LOW_CONFIDENCE, "").astype(object),
+        ambiguous=np.zeros(1, np.bool_),
     )
 
 
