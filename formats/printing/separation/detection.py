@@ -149,8 +149,8 @@ class BlackFinder:
             return False
         if layer.get("/Type") != "/OCMD":
             return layer.objgen in self._hidden_layers
-        groups = layer.get("/OCGs", Array())
-        groups = [group for group in (groups if isinstance(groups, Array) else [groups]) if group]
+        members: Any = layer.get("/OCGs", Array())
+        groups = [item for item in (members if isinstance(members, Array) else [members]) if item]
         if "/VE" in layer or not groups:
             return False
         hidden = [group.objgen in self._hidden_layers for group in groups]
