@@ -49,8 +49,8 @@ PATH_ENDS = {*FILLING, *STROKING, "n"}
 TEXT_POSITIONS = {"BT", "Tm", "Td", "TD", "T*", "'", '"'}
 SHOWING = {"Tj", "TJ", "'", '"'}
 
-FILLED_TEXT, STROKED_TEXT = {0, 2, 4, 6}, {1, 2, 5, 6}
-"""Text rendering modes (ISO 32000-1 table 106); 3 is invisible, as of recognized text on scans."""
+FILLED_TEXT, STROKED_TEXT, INVISIBLE_TEXT = {0, 2, 4, 6}, {1, 2, 5, 6}, 3
+"""Text rendering modes (ISO 32000-1 table 106); recognized text on scans is invisible."""
 
 MAX_IMAGE_PIXELS = 50_000_000
 """Largest image that is decoded, in 0.4 GB; larger ones count as black."""
@@ -145,10 +145,12 @@ class BlackFinder:
 
     def is_hidden(self, layer: Any) -> bool:
         """Return True if a layer (optional content group or membership) is not printed."""
-        if layer is None or layer.get("/Type") != "/OCMD":
-            return layer is not None and layer.objgen in self._hidden_layers
-        groups = layer.get("/OCGs", Array())
-        groups = [group for group in (groups if isinstance(groups, Array) else [groups]) if group]
+        if not isinstance(layer, Dictionary):
+            return False
+        if layer.get("/Type") != "/OCMD":
+            return layer.objgen in self._hidden_layers
+        members: Any = layer.get("/OCGs", Array())
+        groups = [item for item in (members if isinstance(members, Array) else [members]) if item]
         if "/VE" in layer or not groups:
             return False
         hidden = [group.objgen in self._hidden_layers for group in groups]
@@ -200,12 +202,13 @@ class BlackFinder:
     def text(self, state: _State, resources: Any) -> bool:
         """Return True if text is black."""
         font = state.font
-        fill, stroke = (state.text_mode in modes for modes in (FILLED_TEXT, STROKED_TEXT))
         if font is None or font.get("/Subtype") != "/Type3":
+            fill, stroke = (state.text_mode in modes for modes in (FILLED_TEXT, STROKED_TEXT))
             return state.paints(fill=fill, stroke=stroke)
+        if state.text_mode == INVISIBLE_TEXT:
+            return False
+        # These glyphs are drawings, on which other modes have no effect.
         inner = state.inherited()
-        # Glyphs of this kind are drawings, which the mode only hides as a whole.
-        inner.visible = (inner.visible[0] and fill, inner.visible[1] and fill)
         glyphs = [glyph for _, glyph in font.CharProcs.items()]
         resources = font.get("/Resources", resources)
         return any(self._content(glyph, resources, inner) for glyph in glyphs)

@@ -78,7 +78,7 @@ def test_margins_that_leave_nothing_are_rejected(margin: float) -> None:
     with pytest.raises(InputError, match="margin"):
         check_margin(A4, margin)
     check_margin(A4, 104.9, min_content_mm=0.0)
-    with pytest.raises(InputError, match="margin of 105 mm on 210 x 297 mm"):
+    with pytest.raises(InputError, match="margin of 105 mm leaves too little of a paper of 210 x"):
         check_margin(A4, 105.0, min_content_mm=0.0)
 
 

@@ -14,6 +14,7 @@ from pikepdf import Array, Dictionary, Name, Pdf
 
 from locatk.formats.benchmarks.dots.rasterisers import rasterise_inks
 from locatk.formats.printing.overlay import overlay
+from locatk.formats.printing.separation.detection import BlackFinder
 
 SIZE = 72.0
 
@@ -67,6 +68,12 @@ def resources(pdf: Pdf) -> Dictionary:
             made[f"/{key}"] = value
         return made
 
+    glyph = pdf.make_stream(b"500 0 0 0 500 500 d1 0 0 500 500 re f")
+    drawn = Dictionary(
+        Type=Name.Font, Subtype=Name.Type3, FontBBox=[0, 0, 500, 500], Resources=Dictionary(),
+        FontMatrix=[0.001, 0, 0, 0.001, 0, 0], CharProcs=Dictionary(H=glyph),
+        Encoding=Dictionary(Differences=[72, Name.H]), FirstChar=72, LastChar=72, Widths=[500],
+    )  # fmt: skip
     tile = {"PatternType": 1, "TilingType": 1, "XStep": 8, "YStep": 8}
     mask = image(pdf, bytes([255, 0, 255, 0]), Name.DeviceGray)
     return Dictionary(
@@ -83,7 +90,8 @@ def resources(pdf: Pdf) -> Dictionary:
             Light=form(b"1 0 0 rg 0 0 4 4 re f", PaintType=1, Resources=Dictionary(), **tile),
             Stencil=form(b"0 0 4 4 re f", PaintType=2, Resources=Dictionary(), **tile),
         ),
-        Font=Dictionary(F=Dictionary(Type=Name.Font, Subtype=Name.Type1, BaseFont=Name.Helvetica)),
+        Font=Dictionary(F=Dictionary(Type=Name.Font, Subtype=Name.Type1, BaseFont=Name.Helvetica),
+                        Drawn=drawn),
         XObject=Dictionary(
             Inherits=form(b"0 0 50 50 re f"),
             Dark=form(b"0.3 g 0 0 50 50 re f"),
@@ -162,6 +170,10 @@ CASES = {
     "1 0 0 rg BT /F 30 Tf 5 5 Td (H) Tj ET": False,
     "1 0 0 rg BT 1 Tr /F 30 Tf 5 5 Td (H) Tj ET": True,
     "BT 3 Tr /F 30 Tf 5 5 Td (H) Tj ET": False,
+    "BT 0 Tr /Drawn 60 Tf 5 5 Td (H) Tj ET": True,
+    "BT 1 Tr /Drawn 60 Tf 5 5 Td (H) Tj ET": True,
+    "BT 3 Tr /Drawn 60 Tf 5 5 Td (H) Tj ET": False,
+    "1 0 0 rg BT /Drawn 60 Tf 5 5 Td (H) Tj ET": False,
     "q 9 0 0 9 0 0 cm BI /W 1 /H 1 /CS /G /BPC 8 ID \x10 EI Q": True,
     "q 9 0 0 9 0 0 cm BI /W 1 /H 1 /CS /RGB /BPC 8 ID \xf0\x80\x80 EI Q": False,
     "q 9 0 0 9 0 0 cm BI /W 1 /H 1 /IM true /BPC 1 /D [1 0] ID \xf0 EI Q": True,
@@ -258,6 +270,30 @@ def test_the_cases_are_those_of_a_printer(tmp_path: Path) -> None:
     for content, plates in zip(CASES, rasterise_inks(source, 36, folder), strict=True):
         black = 1 - plates["Black"].min() / 255
         assert (black > 0.04) == CASES[content], content
+
+
+@pytest.mark.parametrize(
+    ("policy", "hidden_of"),
+    [
+        (None, ["off"]),
+        ("/AnyOn", ["off"]),
+        ("/AllOn", ["off", "both"]),
+        ("/AnyOff", ["on"]),
+        ("/AllOff", ["on", "both"]),
+    ],
+)
+def test_memberships_of_layers(policy: str | None, hidden_of: list[str]) -> None:
+    """See ISO 32000-1, table 99."""
+    pdf = Pdf.new()
+    on, off, _ = layers(pdf)
+    finder = BlackFinder(pdf)
+    for name, groups in {"on": [on], "off": [off], "both": [on, off], "none": []}.items():
+        member = Dictionary(Type=Name.OCMD, OCGs=Array(groups))
+        if policy is not None:
+            member.P = Name(policy)
+        assert finder.is_hidden(member) == (name in hidden_of), name
+    pdf.Root.OCProperties.D = Dictionary(BaseState=Name.OFF, ON=Array([off]))
+    assert [BlackFinder(pdf).is_hidden(layer) for layer in (on, off)] == [True, False]
 
 
 def test_layers_for_the_screen_are_printed(tmp_path: Path) -> None:
