@@ -21,7 +21,7 @@ from locatk.formats.importers.trajectory_csv import SIGMA_AXES, read_csv
 from locatk.formats.importers.tum import read_tum
 from locatk.formats.tables import delimited, timestamps
 
-FINITE = st.floats(allow_nan=False, allow_infinity=False)
+FINITE = st.floats(-1e9, 1e9)
 NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
 
 
