@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import quaternion_from_matrix
-from locatk.core.trajectory import Trajectory
+from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.importers.trajectory_csv import MAX_NORM_ERROR, unknown_covariance
 from locatk.formats.tables.delimited import read_number_rows
 
@@ -40,7 +40,9 @@ def read_kitti(path: Path, *, device: str | None = None, frame: str = "floor") -
         A matrix is far from a rotation.
     """
     table = read_number_rows(path, KITTI_COLUMNS, hint=KITTI_HINT)
-    numbers = np.stack([table.floats(name) for name in KITTI_COLUMNS], axis=1)
+    numbers = np.stack(
+        [table.floats(name, -MAX_ODOMETRY, MAX_ODOMETRY) for name in KITTI_COLUMNS], axis=1
+    )
     matrix = numbers.reshape(-1, 3, 4)
     rotation = matrix[:, :, :3]
     with np.errstate(over="ignore", invalid="ignore"):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.printable import text_of_spreadsheet
-from locatk.core.trajectory import Trajectory
+from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.tables.delimited import Table, read_table
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     table = read_table(path)
     table.require(*COLUMNS[:5])
     n = len(table)
-    position = np.stack([table.floats(name) for name in POSITION_COLUMNS], axis=1)
+    position = read_positions(table)
     quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
     if any(name in table.columns for name in QUATERNION_COLUMNS):
         table.require(*QUATERNION_COLUMNS)
@@ -117,6 +117,18 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
             )
         )
     return trajectories
+
+
+def read_positions(table: Table) -> Array:
+    """Return the positions (n, 3) in the columns :data:`POSITION_COLUMNS`.
+
+    Raises
+    ------
+    InputError
+        A cell is not a number up to :data:`MAX_ODOMETRY`, which includes damaged exponents.
+    """
+    columns = [table.floats(name, -MAX_ODOMETRY, MAX_ODOMETRY) for name in POSITION_COLUMNS]
+    return np.stack(columns, axis=1)
 
 
 def unit_quaternions(table: Table, names: Sequence[str], *, allow_missing: bool = False) -> Array:

@@ -11,6 +11,7 @@ from locatk.formats.importers.trajectory_csv import (
     POSITION_COLUMNS,
     QUATERNION_COLUMNS,
     check_ascending,
+    read_positions,
     unit_quaternions,
     unknown_covariance,
 )
@@ -42,7 +43,7 @@ def read_tum(path: Path, *, device: str | None = None, frame: str = "floor") -> 
         A quaternion is far from unit length, or time stamps do not ascend.
     """
     table = read_number_rows(path, TUM_COLUMNS, hint=TUM_HINT, time_column=TIME_COLUMN)
-    position = np.stack([table.floats(name) for name in POSITION_COLUMNS], axis=1)
+    position = read_positions(table)
     quaternion = unit_quaternions(table, QUATERNION_COLUMNS)
     time_ns = table.epoch_times_ns(TIME_COLUMN)
     check_ascending(table, time_ns, np.arange(len(table)))

@@ -148,9 +148,9 @@ class Table:
             if not np.isfinite(values[row]):
                 expected = "a finite number"
             elif values[row] < low:
-                expected = f"{low:g} or more"
+                expected = f"{low:.9g} or more"
             else:
-                expected = f"{high:g} or less"
+                expected = f"{high:.9g} or less"
             self._fail_cell(row, name, expected)
         return values
 

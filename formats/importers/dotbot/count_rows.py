@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError
 from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
+from locatk.core.lighthouse.lfsr import SEQUENCE_LENGTH
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.formats.tables.delimited import Table
 
@@ -45,6 +46,9 @@ TRUTH_COLUMNS = ("real_x_mm", "real_y_mm", "real_z_mm")
 PLANE_COLUMNS = ("x", "y")
 
 MILLIMETRES_PER_METRE = 1000
+
+MAX_TRUTH_MM = 1e6
+"""Largest coordinate of the truth, 1 km: larger ones are damaged or in another unit."""
 
 
 class CountColumn(NamedTuple):
@@ -162,7 +166,7 @@ def read_rows(table: Table, layout: str) -> CountRows:
     Raises
     ------
     InputError
-        A cell is not a number or time, a count is negative, or a polynomial is unknown.
+        A cell is not a number or time, or a count or polynomial does not exist.
     """
     n = len(table)
     sources = [name.strip() for name in table.columns.get("source", [DEFAULT_DEVICE] * n)]
@@ -172,7 +176,8 @@ def read_rows(table: Table, layout: str) -> CountRows:
     index = {name: i for i, name in enumerate(devices)}
     count, channel, polynomial = [], [], []
     for column in LAYOUTS[layout]:
-        count.append(table.floats(column.count_name, low=0))
+        # Positions in a bit sequence; fractions come from averages.
+        count.append(table.floats(column.count_name, 0, SEQUENCE_LENGTH))
         if column.polynomial_name in table.columns:
             polynomial.append(table.integers(column.polynomial_name, 0, POLYNOMIAL_COUNT - 1))
             channel.append(channel_of(polynomial[-1]))
@@ -182,7 +187,9 @@ def read_rows(table: Table, layout: str) -> CountRows:
     truth_m = None
     if any(name in table.columns for name in TRUTH_COLUMNS):
         table.require(*TRUTH_COLUMNS)
-        truth_mm = np.stack([table.floats(name) for name in TRUTH_COLUMNS], axis=1)
+        truth_mm = np.stack(
+            [table.floats(name, -MAX_TRUTH_MM, MAX_TRUTH_MM) for name in TRUTH_COLUMNS], axis=1
+        )
         truth_m = truth_mm / MILLIMETRES_PER_METRE
     plane = None
     if all(name in table.columns for name in PLANE_COLUMNS):

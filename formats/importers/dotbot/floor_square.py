@@ -54,6 +54,9 @@ MIN_CORNERS = 4
 
 CENTIMETRES_PER_METRE = 100
 
+MAX_PIXELS = 1e5
+"""Largest coordinate in a video: no frame is that wide."""
+
 
 @dataclass(frozen=True)
 class FloorSquare:
@@ -336,7 +339,9 @@ def read_tracks(
                 hint="Add the column, with the names of the devices",
             )
         times.append(table.iso_times_ns(TIME_COLUMN))
-        pixels = np.stack([table.floats(name) for name in PLANE_COLUMNS], axis=1)
+        pixels = np.stack(
+            [table.floats(name, -MAX_PIXELS, MAX_PIXELS) for name in PLANE_COLUMNS], axis=1
+        )
         positions.append(apply_homography(to_floor, pixels))
     return _tracks(
         np.concatenate(times), np.concatenate(positions), sources, devices, facts, warnings

@@ -348,8 +348,8 @@ class ColumnCollector:
             name, kind, rest = b"", name, kind + rest
         if kind in _POSES:
             try:
-                words = (time + b" " + rest).decode("latin-1").split()[:8]
-                values = tuple(map(parse_number, words))
+                texts = (time + b" " + rest).decode("latin-1").split()[:8]
+                values = tuple(map(parse_number, texts))
             except ValueError:
                 values = ()
             if (

@@ -308,6 +308,13 @@ def test_swapped_and_repeated_stamps_are_mended_and_told(write: Write) -> None:
         ("timestamp,c0,c1,poly_0,poly_1\n2023-07-27T15:34:22Z,1,2,0,32\n", 2, "31 or less"),
         ("timestamp,c0,c1,poly_0,poly_1\n2023-07-27T15:34:22Z,1,2,0,-1\n", 2, "0 or more"),
         ("timestamp,c0,c1,poly_0,poly_1\n2023-07-27T15:34:22Z,1,2,0,1.5\n", 2, "whole"),
+        ("timestamp,c0,c1\n2023-07-27T15:34:22Z,1,131072\n", 2, "131071 or less"),
+        ("timestamp,c0,c1\n2023-07-27T15:34:22Z,1e30,2\n", 2, "131071 or less"),
+        (
+            "timestamp,c0,c1,real_x_mm,real_y_mm,real_z_mm\n2023-07-27T15:34:22Z,1,2,0,1e30,0\n",
+            2,
+            "1000000 or less",
+        ),
         ("timestamp,c0,c1,real_x_mm\n2023-07-27T15:34:22Z,1,2,0\n", 1, "'real_y_mm'"),
     ],
 )

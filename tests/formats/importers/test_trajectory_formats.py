@@ -21,7 +21,7 @@ from locatk.formats.importers.trajectory_csv import SIGMA_AXES, read_csv
 from locatk.formats.importers.tum import read_tum
 from locatk.formats.tables import delimited, timestamps
 
-FINITE = st.floats(allow_nan=False, allow_infinity=False)
+FINITE = st.floats(-1e9, 1e9)
 NAMES = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12)
 
 
@@ -244,6 +244,7 @@ ROW = "1.0,a,0,0,0,0,0,0,1,,,,\n"
         (HEADER + ROW + "2.0,a,zero,0,0,0,0,0,1,,,,\n", 3, "'zero'"),
         (HEADER + ROW + "2.0,a,,0,0,0,0,0,1,,,,\n", 3, "empty cell"),
         (HEADER + ROW + "2.0,a,nan,0,0,0,0,0,1,,,,\n", 3, "finite"),
+        (HEADER + ROW + "2.0,a,-1e30,0,0,0,0,0,1,,,,\n", 3, "-1e+09 or more"),
         (HEADER + ROW + "2.0,a,0,0,0,0,0,0,1,-1,,,\n", 3, "0 or more"),
         (HEADER + ROW + "\n2.0,a,0,0,0,0,0,0,1,,x,,\n", 4, "'x'"),
         (HEADER + ROW + "2.0,a,0,0,0,0,0,0,0.5,,,,\n", 3, "quaternion"),
@@ -272,6 +273,8 @@ def test_bad_csv_names_the_line(tmp_path: Path, text: str, where: object, what: 
         ("1 0 0 0 0 0 0\n", 1, "7 words"),
         ("1 0 0 0 0 0 0 1\n2 0 0 a 0 0 0 1\n", 2, "'a'"),
         ("1 0 0 0 0 0 0 1\n2 0 0 inf 0 0 0 1\n", 2, "finite"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 1e30 0 0 0 1\n", 2, "1e+09 or less"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 1_0 0 0 0 1\n", 2, "'1_0'"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", 2, "ascend"),
         ("1 0 0 0 0 0 0 2\n", 1, "quaternion"),
         ("t 0 0 0 0 0 0 1\n", 1, "'t'"),
