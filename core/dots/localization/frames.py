@@ -49,8 +49,8 @@ MIN_TRIED_LEVELS = 4
 smaller still."""
 
 SETTLED_FRACTION = 0.9
-"""Fraction of the detected dots of a frame beyond which other dots do not decide between codecs:
-windows of two codecs that are the same go on to be the same for tens of columns."""
+"""Fraction of the detected dots of a frame in its window beyond which another lattice of the same
+dots does not decide between codecs."""
 
 TOO_FEW_DOTS = "too_few_dots"
 NO_GRID = "no_grid"
@@ -83,7 +83,7 @@ class LocalizedFrames:
         Reason of rejection; ``""`` if the frame is localized.
     ambiguous : (n,) bool ndarray
         Whether only another codec, which has nearly all of the frame's dots at another position,
-        limits the confidence.
+        limits the confidence, so that another lattice of these dots is of no use.
     """
 
     grid: NDArray[np.float64]
@@ -104,11 +104,6 @@ class LocalizedFrames:
         """Whether each frame (n,) is localized."""
         result: NDArray[np.bool_] = self.rejected == ""
         return result
-
-    @property
-    def settled(self) -> NDArray[np.bool_]:
-        """Whether no other size of the frame and no other lattice improve the result (n,)."""
-        return self.accepted | self.ambiguous
 
     def update(self, indices: NDArray[np.int64], part: LocalizedFrames) -> None:
         """Store ``part`` for the ``indices`` that it localizes or has no less confidence in."""
@@ -170,11 +165,12 @@ def localize_frames(
             part, _, _ = _localize_dots(
                 points, dots, codec, camera is None, min_confidence, other_codec_odds
             )
-            if part.settled.all():
+            if part.accepted.all():
                 result.update(remaining, part)
                 break
             # Strong tilt, strong distortion and covered frames take longer than all others.
-            again = np.flatnonzero(~part.settled & (part.rejected != TOO_FEW_DOTS))
+            is_tried = part.accepted | part.ambiguous | (part.rejected == TOO_FEW_DOTS)
+            again = np.flatnonzero(~is_tried)
             if len(again):
                 thorough, _, _ = _localize_dots(
                     points[again],
@@ -187,7 +183,7 @@ def localize_frames(
                 )
                 part.update(again, thorough)
             result.update(remaining, part)
-            remaining = remaining[~result.settled[remaining]]
+            remaining = remaining[~result.accepted[remaining]]
             if not len(remaining):
                 break
     return result
@@ -263,6 +259,7 @@ def _localize_lattices(
     rejected[(rejected != "") & windows.border] = SECTION_BORDER
     certain = windows.confidence >= min_confidence * (1 - windows.confidence * windows.rival_odds)
     is_covered = windows.dots > SETTLED_FRACTION * lattices.valid.sum(axis=1)
+    is_covered &= windows.corrected == 0  # wrong bits may be those of a poor lattice
     poses = _localize_decoded(lattices, half, windows, codec)
     frames = LocalizedFrames(
         grid=poses.grid,
