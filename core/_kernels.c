@@ -2347,12 +2347,12 @@ static int fit_higher_lens(const double *parameters, const Dots *d, double norma
     return 1;
 }
 
-/* Index of the cell of a dot among the grid positions of the window with a margin. */
+/* Index of the cell of a dot among the grid positions of the window with a margin. Coordinates from
+ * the margin's corner are positive, so that a conversion to int rounds down. */
 static int cell_of(const Dots *d, int i, int half_width)
 {
-    const int column = (int)rintf(d->u[i]) + half_width + 1;
-    const int row = (int)rintf(d->v[i]) + half_width + 1;
-    return row * (2 * half_width + 3) + column;
+    const float corner = (float)half_width + 1.5f;
+    return (int)(d->v[i] + corner) * (2 * half_width + 3) + (int)(d->u[i] + corner);
 }
 
 /* Sum of the correlations of the error of a dot in use with those of its eight neighbours on the

@@ -84,6 +84,8 @@ class Disturbance:
         Radius of their saturated part.
     gradient : float
         Loss of light from one side of the frame to the other.
+    overexposure : float
+        Gain of light from one side of the frame to the other, beyond white.
     motion_px : float
         Length of the motion blur, in a random direction.
     defocus_px : float
@@ -108,6 +110,7 @@ class Disturbance:
     glare: tuple[int, int] = (0, 0)
     glare_px: tuple[float, float] = (15.0, 90.0)
     gradient: float = 0.0
+    overexposure: float = 0.0
     motion_px: float = 0.0
     defocus_px: float = 0.0
     blur_px: float = 0.6
@@ -141,6 +144,7 @@ DISTURBANCES: dict[str, Disturbance] = {
     "light falls by 90 %": Disturbance(gradient=0.9, target=99.0),
     "motion of 4 px": Disturbance(motion_px=4.0, target=99.0),
     "defocus on one side": Disturbance(defocus_px=3.5, target=99.0),
+    "overexposed side": Disturbance(overexposure=0.8, target=99.0),
     "mirrored": Disturbance(is_mirrored=True),
     "inverted": Disturbance(is_inverted=True),
 }  # fmt: skip
@@ -192,6 +196,8 @@ def _render_frame(
     if disturbance.gradient:
         along = _direction_field(disturbance.size, rng)
         grey *= 1 - disturbance.gradient * along
+    if disturbance.overexposure:
+        grey *= 1 + disturbance.overexposure * _direction_field(disturbance.size, rng)
     if disturbance.hand:
         grey = _cover_by_hand(grey, disturbance.hand, rng)
     for _ in range(int(rng.integers(disturbance.glare[0], disturbance.glare[1] + 1))):
