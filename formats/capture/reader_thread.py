@@ -113,6 +113,8 @@ class PortReader:
         """
         if not self._stop.is_set():
             self._stop.set()
+            if self._thread.ident is None:
+                self._thread.start()  # Only the thread reads and closes the port.
             self._thread.join(MAX_STOP_WAIT_S)
         return not self._thread.is_alive()
 

@@ -135,14 +135,14 @@ class Recorder:
         """
         self._start_ns = self._part_ns = self._last_data_ns = self._clock.now()
         self._silent = False
-        self._files.flush()
-        self._reader.start()
         syncing = threading.Event()
         syncer = threading.Thread(
             target=self._sync, args=(syncing,), name="locatk-sync", daemon=True
         )
         syncer.start()
         try:
+            self._files.flush()  # A program killed after the first byte leaves a readable file.
+            self._reader.start()
             ended, failed = self._write_until_end(stop)
             if not self._reader.stop():
                 self._report("the driver of the port hangs: bytes in its buffer are not recorded")

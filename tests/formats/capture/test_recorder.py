@@ -671,6 +671,17 @@ def test_a_disk_without_space_leaves_a_complete_file(
     assert recorded.file_bytes == recorded.paths[0].stat().st_size
 
 
+def test_a_disk_without_space_for_the_first_chunk(
+    port: Any, start: Any, raw_bytes: Any, small_disk: Path
+) -> None:
+    (small_disk / "other").write_bytes(bytes(8 << 20))
+    recorded = start(output=small_disk / "run.mcap", reserve_bytes=1).result()
+    assert recorded.failed
+    assert "no space left" in recorded.ended
+    assert raw_bytes(*recorded.paths) == b""
+    assert "no space left" in Session.open(recorded.paths[0]).metadata()["capture"]["ended"]
+
+
 def test_parts_on_a_disk_without_space(
     port: Any, start: Any, raw_bytes: Any, small_disk: Path
 ) -> None:
