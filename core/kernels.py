@@ -11,14 +11,12 @@ an index does not agree with the other arguments; it never reads or writes beyon
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
 from types import ModuleType
 
 kernels: ModuleType | None = None
 if not os.environ.get("LOCATK_NUMPY"):
-    try:
-        from locatk.core import _kernels
-
-        kernels = _kernels
-    except ImportError:
-        pass
+    with contextlib.suppress(ImportError):
+        kernels = importlib.import_module("locatk.core._kernels")

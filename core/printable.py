@@ -19,6 +19,12 @@ _FIRST_BYTE_SURROGATE = 0xDC00
 _NOT_IN_FILE_NAMES = frozenset('/\\:*?"<>|')
 """Characters that Linux, macOS or Windows do not allow in a file name."""
 
+_DEVICE_NAME = re.compile(
+    "(con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]|con(in|out)\\$) *(?=[.]|$)", re.I
+)
+"""Names of devices of Windows, also with an ending, which opens the device. Source: Microsoft,
+Naming Files, Paths, and Namespaces, https://learn.microsoft.com/windows/win32/fileio/naming-a-file."""
+
 MAX_NAME_BYTES = 150
 """Longest part of a file name that is made of a text; most file systems allow 255 in all."""
 
@@ -55,12 +61,18 @@ def file_name_part(text: str) -> str:
     """Return ``text`` as a part of a file name on any system.
 
     Characters that are invisible or not allowed become ``_``, as does a ``.`` or ``-`` at the
-    beginning, which hides a file or looks like an option. Long texts are cut.
+    beginning, which hides a file or looks like an option, and a ``.`` or blank at the end, which
+    Windows removes. Names of its devices begin with ``_``. Long texts are cut.
     """
     name = "".join("_" if _is_hidden(c) or c in _NOT_IN_FILE_NAMES else c for c in text)
     if name[:1] in (".", "-"):
         name = "_" + name[1:]
-    return name.encode()[:MAX_NAME_BYTES].decode(errors="ignore") or "_"
+    if _DEVICE_NAME.match(name):
+        name = "_" + name
+    name = name.encode()[:MAX_NAME_BYTES].decode(errors="ignore")
+    if name[-1:] in (".", " ", ""):
+        name = name[:-1] + "_"
+    return name
 
 
 def spreadsheet_text(text: str) -> str:

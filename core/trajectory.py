@@ -129,8 +129,8 @@ def has_orientation(trajectory: Trajectory, *, trust_identity: bool = False) -> 
     """Return a mask (n,) of the poses that report an orientation.
 
     A pose reports none if its position has a covariance and its heading has none (a single
-    photodiode). Nor do the poses of a trajectory without rotation covariances whose orientations
-    are all the identity (a point), unless ``trust_identity`` is set.
+    photodiode). Nor do the poses of a trajectory without any variance of the heading whose
+    orientations are all the identity (a point), unless ``trust_identity`` is set.
     """
     has_heading_variance = np.isfinite(trajectory.covariance[:, 5, 5])
     is_point = not has_heading_variance.any() and bool(np.all(trajectory.quaternion[:, :3] == 0.0))

@@ -261,8 +261,7 @@ def test_imported_names_exist(root: Path) -> None:
             defined = defined_names(package / "__init__.py")
             for alias in node.names:
                 is_module = any((package / f"{alias.name}{end}").exists() for end in (".py", ""))
-                is_extension = alias.name == "_kernels"
-                assert is_module or is_extension or alias.name in defined, (
+                assert is_module or alias.name in defined, (
                     f"{path}: no {alias.name} in {node.module}"
                 )
 

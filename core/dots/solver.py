@@ -115,15 +115,17 @@ def solve(
     detections: list[DotDetection] = []
     trajectories: list[Trajectory] = []
     off_sheet: list[NDArray[np.float64]] = []
-    other_codecs: Counter[str] = Counter()
+    other_codecs: tuple[Counter[str], Counter[str]] = (Counter(), Counter())
     for camera_frames in frames:
         localized = localize_recording(camera_frames, manifest, code, options.camera, localize)
         sheet = find_sheets(localized, manifest)
         if options.method != "paper" and manifest.has_seams:
             relocalize_at_seams(camera_frames, localized, sheet, manifest, code, options.camera)
-        other_codecs += count_frames_of_other_codecs(
+        counts = count_frames_of_other_codecs(
             camera_frames, localized.rejected, manifest, options.camera
         )
+        for total, count in zip(other_codecs, counts, strict=True):
+            total.update(count)
         off_sheet += list(localized.grid[localized.rejected == OFF_SHEET])
         poses = _sheet_poses(localized, sheet, manifest)
         outcomes += _outcomes(camera_frames, localized)
@@ -260,12 +262,12 @@ def _warnings(
     manifest: Manifest,
     rejected: Counter[str],
     off_sheet: list[NDArray[np.float64]],
-    other_codecs: Counter[str],
+    other_codecs: tuple[Counter[str], Counter[str]],
 ) -> tuple[SolverWarning, ...]:
     """Return the warnings of a session.
 
     ``off_sheet`` are grid coordinates of rejected frames, and ``other_codecs`` are numbers of
-    rejected frames that another codec locates on the sheets.
+    frames for and against other codecs, see :func:`.count_frames_of_other_codecs`.
     """
     warnings = []
     if options.method == "paper":
@@ -287,16 +289,22 @@ def _warnings(
         if count := rejected[reason]:
             message = f"{count} frames are {appearance} and have no pose: {remedy}"
             warnings.append(SolverWarning(code, message))
-    if other_codecs:
-        ((name, count),) = other_codecs.most_common(1)
-        warnings.append(
-            SolverWarning(
-                "other_codec",
+    located, contradicted = other_codecs
+    if located:
+        ((name, count),) = located.most_common(1)
+        if count > contradicted[name]:
+            message = (
                 f"the sheets were printed with the codec {name!r}, not {manifest.codec!r} as in "
                 f"the manifest: with it, {count} of the rejected frames that were tried are on "
-                "the sheets. Correct the codec in the manifest",
+                "the sheets. Correct the codec in the manifest"
             )
-        )
+        else:
+            message = (
+                f"with the codec {name!r}, {count} of the rejected frames that were tried are on "
+                f"the sheets, but {contradicted[name]} of those with a pose are not: do these "
+                "frames show a sheet of another manifest?"
+            )
+        warnings.append(SolverWarning("other_codec", message))
     elif off_sheet:
         x, y = off_sheet[0]
         warnings.append(

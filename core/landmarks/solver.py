@@ -147,6 +147,7 @@ def solve(
             visit.estimate if robot.trajectories else None,
             floor,
             robot.identified.map_probability,
+            is_lost=any(visit is lost for lost in robot.lost_visits),
         )
         for robot in robots
         for visit in robot.identified.visits
@@ -234,6 +235,8 @@ class LocalizedRobot:
         One on the map, or none if the robot is not localized.
     lag_s : float
         Time lag of the odometry; 0 if it is not significant.
+    lost_visits : tuple of IdentifiedVisit
+        Visits on the map during which the robot has no poses, although it has others.
     """
 
     identified: IdentifiedRecording
@@ -241,6 +244,7 @@ class LocalizedRobot:
     warnings: tuple[SolverWarning, ...]
     trajectories: tuple[Trajectory, ...] = ()
     lag_s: float = 0.0
+    lost_visits: tuple[IdentifiedVisit, ...] = ()
 
 
 def solve_recording(
@@ -327,7 +331,10 @@ def localize_robot(
     trajectory = smoothed.trajectory(identified.odometry)
     if trajectory is None:
         return replace(robot, facts=replace(facts, localised=False, provisional=False))
-    on_map_ids, used_ids = ({id(one) for one in some} for some in (on_map, smoothed.visits))
+    lost = tuple(smoothed.lost_visits)
+    on_map_ids, used_ids = (
+        {id(one) for one in some} for some in (on_map, [*smoothed.visits, *lost])
+    )
     unused = [visit for visit in visits if id(visit) not in on_map_ids]
     slipped = [visit for visit in on_map if id(visit) not in used_ids]
     trajectory, contradictions = without_contradicted_ends(
@@ -344,7 +351,11 @@ def localize_robot(
         identified.map_probability,
     )
     return _with_warnings(
-        replace(robot, trajectories=(replace(trajectory, probability=probability),)),
+        replace(
+            robot,
+            trajectories=(replace(trajectory, probability=probability),),
+            lost_visits=lost,
+        ),
         *(warn_of_cause(each).about(identified.device) for each in displaced),
         *(warning.about(identified.device) for warning in contradictions),
     )

@@ -8,22 +8,26 @@ its zero. The zeros of one rotor are whole rotations apart; those of two rotors 
 arbitrary phase. A reflection has the phase of its rotor. This needs the times of single sweeps,
 as reported by a Lighthouse deck or a logic analyser.
 
-**Counts.** If all sweeps of a report have the time of the report, their phase is unknown. A
-photodiode that moves slowly then has one count for each light plane of a station, which repeats
-from report to report. One rotor has two planes: four counts that repeat are of two stations, or of
-one and its reflection, which is as wrong.
+**Counts.** If all sweeps of a report have the time of the report, their phase is unknown. The angle
+of a light plane then jumps between two levels, one for each station (or for a station and its
+reflection, which is as wrong), and is never between them. A photodiode that oscillates passes
+through the angles between its turning points: all sweeps together decide if they are empty.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.channels import CHANNELS, TICK_HZ, TICKS_PER_COUNT, period_ticks
-from locatk.core.lighthouse.epochs import MIN_PLANE_DELAY_TURNS
-from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.epochs import (
+    MAX_PLANE_DELAY_TURNS,
+    MIN_PLANE_DELAY_TURNS,
+)
+from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,40 +47,81 @@ MAX_PHASE_DRIFT_PPM = 250.0
 PHASE_WINDOW_S = 1.0
 """Longest time between two rotations whose phases are compared [s]: two reports at 3 Hz."""
 
-COUNT_WINDOW_S = 0.5
-"""Longest time between two sweeps whose counts are compared [s]: five reports at 10 Hz."""
-
-SAME_COUNT_RAD = float(np.radians(3.0))
-"""Largest difference between counts of one plane [rad]: a robot that moves by 0.5 m/s at 2 m from a
-station changes its angle by this much in 0.2 s. Of faster motion nothing is concluded."""
-
 NEIGHBOURS = 8
-"""Number of sweeps, or of rotations, before and after that one is compared with: two reports about
-two stations, and a margin."""
+"""Number of rotations before and after that one is compared with."""
 
 MIN_CONFLICTS = 4
-"""Smallest number of sweeps that show a second station."""
+"""Smallest number of sweeps whose phases show a second station."""
 
 MAX_PHASE_CONFLICT_FRACTION = 0.02
 """Fraction of sweeps with another phase than those around them above which a second station sends.
 If 10 % of the sweeps have random counts, 0.1 % have such a phase, by chance."""
 
-MAX_COUNT_CONFLICT_FRACTION = 0.2
-"""Fraction of sweeps among more than two pairs of repeating counts above which a second station
-sends. In simulated recordings (six seeds, reports at 3 to 10 Hz) it is up to 0.05 with 10 % of
-outliers and 0.14 with 30 %, and 0.4 to 0.97 with a second station; in the published recordings of
-one and two stations it is below 0.001, and 0.29 or more if both stations get one channel."""
+WINDOW_SWEEPS = 9
+"""Number of successive angles of a light plane in which two levels are looked for."""
+
+MAX_ANGLE_INTERVAL_S = 0.5
+"""Longest time between two angles of a window [s]: reports at 2 Hz. In a longer time a robot can
+be carried elsewhere and back."""
+
+MIN_LEVEL_SWITCHES, MIN_LEVEL_SWEEPS = 3, 3
+"""Smallest number of changes of level in a window, and of angles on each level. A robot that turns
+around between two places changes twice. Of 10 % of outliers, two are in one window of five."""
+
+MIN_LEVEL_GAP_RAD = float(np.radians(3.0))
+"""Smallest gap between two levels [rad], above the errors of single angles."""
+
+MIN_GAP_RATIO = 2.0
+"""Smallest gap between two levels, relative to the range of angles on each. The middle half of all
+angles is then empty, in which a harmonic oscillation is for a third of the time."""
+
+ALIASED_PERIODS = (4, 6)
+"""Periods [reports], with their divisors, in which an oscillation can appear at two levels: its
+frequency is a multiple of 1/2, 1/3, 1/4, or 1/6 of that of the reports. With other periods the
+angles are at three levels or more."""
+
+ONE_STATION_WINDOW_FRACTION, TWO_STATION_WINDOW_FRACTION = 0.05, 0.4
+"""Expected fractions of windows with two levels. One photodiode and one station: of independent
+draws from a harmonic oscillation, which is the worst case, 3.8 % of the windows have two levels; of
+random positions (uniform draws) 1.0 %. Two stations that are received equally often in random
+order: 66 %, of which the robot's motion and outliers blur about a half."""
+
+MIN_LOG_EVIDENCE = float(np.log(1e6))
+"""Logarithm of the likelihood ratio from which two stations are taken for proven: a million to one,
+since a false alarm costs the whole channel."""
 
 DOUBLED_CHANNEL_HINT = "Set each station to a channel of its own"
 
 
-def find_doubled_channels(sweeps: Sweeps) -> tuple[int, ...]:
-    """Find the channels on which more than one station sends, ascending."""
-    return tuple(
-        channel
-        for channel in np.unique(sweeps.channel).tolist()
-        if channel in CHANNELS and _is_doubled(sweeps, channel)
-    )
+@dataclass(frozen=True)
+class DoubledChannels:
+    """Channels on which more than one station sends, ascending.
+
+    Attributes
+    ----------
+    proven : tuple of int
+        All sweeps of the channel together prove a second station.
+    possible : tuple of int
+        Some sweeps look like those of a second station, which may be hidden most of the time. So
+        do sweeps of a photodiode that moves to and fro between two places within a report.
+    """
+
+    proven: tuple[int, ...]
+    possible: tuple[int, ...]
+
+
+def find_doubled_channels(sweeps: Sweeps) -> DoubledChannels:
+    """Find the channels on which more than one station sends."""
+    proven, possible = [], []
+    for channel in np.unique(sweeps.channel).tolist():
+        if channel not in CHANNELS:
+            continue
+        has_phases, evidence, alternating_evidence = _compare_hypotheses(sweeps, channel)
+        if has_phases or evidence > MIN_LOG_EVIDENCE:
+            proven.append(channel)
+        elif alternating_evidence > MIN_LOG_EVIDENCE:
+            possible.append(channel)
+    return DoubledChannels(tuple(proven), tuple(possible))
 
 
 def doubled_channel_message(channels: Sequence[int]) -> str:
@@ -85,32 +130,51 @@ def doubled_channel_message(channels: Sequence[int]) -> str:
     return f"more than one station sends on channel {listed}; its sweeps are not used"
 
 
-def _is_doubled(sweeps: Sweeps, channel: int) -> bool:
-    """Return True if the sweeps of a channel, over all devices, show a second station."""
-    phases = counts = (0, 0)
+def possible_doubled_channel_message(channels: Sequence[int]) -> str:
+    """Format the message about channels that may have more than one station."""
+    listed = ", ".join(map(str, channels))
+    return (
+        f"more than one station may send on channel {listed}: in part of the recording its angles "
+        "jump between two levels"
+    )
+
+
+def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, float]:
+    """Compare the hypotheses of two stations and of one, over all devices.
+
+    Returns
+    -------
+    has_phases : bool
+        True if the sweeps have two phases.
+    evidence, alternating_evidence : float
+        Logarithm of the likelihood ratio from the angles, of all windows and of those that change
+        between two ranges of angles. Photodiodes of a device share its motion and hence count as
+        one; so do its two light planes, of which the more conclusive one counts.
+    """
+    conflicts = paired = 0
+    evidence = np.zeros(2)
     rows = np.flatnonzero((sweeps.channel == channel) & np.isfinite(sweeps.count))
     period_s = float(period_ticks(channel)) / TICK_HZ
     for device in np.unique(sweeps.device[rows]).tolist():
         own = rows[sweeps.device[rows] == device]
-        own = own[np.lexsort((sweeps.count[own], sweeps.time_ns[own]))]
+        own = own[np.argsort(sweeps.time_ns[own], kind="stable")]
         time_s = (sweeps.time_ns[own] - sweeps.time_ns[own[0]]) * 1e-9
         count_s = sweeps.count[own] * (TICKS_PER_COUNT / TICK_HZ)
-        conflicts, paired = count_phase_conflicts(time_s, time_s - count_s, period_s)
-        if paired >= MIN_PAIRED_FRACTION * len(own):
-            phases = phases[0] + conflicts, phases[1] + paired
+        device_conflicts, device_paired = count_phase_conflicts(time_s, time_s - count_s, period_s)
+        if device_paired >= MIN_PAIRED_FRACTION * len(own):
+            conflicts, paired = conflicts + device_conflicts, paired + device_paired
             continue
+        sensor_evidence = []
         for sensor in np.unique(sweeps.sensor[own]):
             is_own = sweeps.sensor[own] == sensor
             angle_rad = count_s[is_own] / period_s * 2 * np.pi
-            conflicts, repeating = _count_angle_conflicts(time_s[is_own], angle_rad)
-            counts = counts[0] + conflicts, counts[1] + repeating
-    return any(
-        conflicts >= max(MIN_CONFLICTS, fraction * total)
-        for (conflicts, total), fraction in (
-            (phases, MAX_PHASE_CONFLICT_FRACTION),
-            (counts, MAX_COUNT_CONFLICT_FRACTION),
-        )
-    )
+            plane = _assign_planes(time_s[is_own], angle_rad, sweeps.sweep[own[is_own]])
+            sensor_evidence.append(
+                [_angle_evidence(time_s[is_own][plane == k], angle_rad[plane == k]) for k in (0, 1)]
+            )
+        evidence += np.max(np.mean(sensor_evidence, axis=0), axis=0)
+    has_phases = conflicts >= max(MIN_CONFLICTS, MAX_PHASE_CONFLICT_FRACTION * paired)
+    return has_phases, float(evidence[0]), float(evidence[1])
 
 
 def _is_paired(time_s: Array, zero_s: Array, period_s: float) -> Mask:
@@ -170,22 +234,91 @@ def count_phase_conflicts(time_s: Array, zero_s: Array, period_s: float) -> tupl
     return int(size[is_conflict].sum()), paired
 
 
-def _count_angle_conflicts(time_s: Array, angle_rad: Array) -> tuple[int, int]:
-    """Count the sweeps of one photodiode among four or more angles that repeat.
+def _assign_planes(
+    time_s: Array, angle_rad: Array, reported_plane: NDArray[np.int32]
+) -> NDArray[np.int64]:
+    """Return the light plane, 0, 1 or ``UNKNOWN``, of each sweep (n,) of one photodiode.
 
-    An angle repeats if a sweep before and one after have it.
-
-    Returns
-    -------
-    conflicts, total
-        ``total`` are the sweeps among any angles that repeat.
+    The largest gap between the angles of a report separates its planes if it is as large as one
+    between planes. An outlier can thus exchange planes, a report of a single angle has none.
     """
-    (angle_before, angle_after), (before_s, after_s) = _neighbours(angle_rad), _neighbours(time_s)
-    angle_before = np.where(time_s[:, None] - before_s < COUNT_WINDOW_S, angle_before, np.nan)
-    angle_after = np.where(after_s - time_s[:, None] < COUNT_WINDOW_S, angle_after, np.nan)
-    repeats = np.zeros(angle_before.shape, bool)
-    for k in range(NEIGHBOURS):
-        repeats |= np.abs(angle_before - angle_after[:, k, None]) < SAME_COUNT_RAD
-    repeated = np.sort(np.where(repeats, angle_before, np.nan), axis=1)
-    groups = np.any(repeats, axis=1) + np.sum(np.diff(repeated, axis=1) > SAME_COUNT_RAD, axis=1)
-    return int(np.count_nonzero(groups >= 4)), int(np.count_nonzero(groups))
+    report = np.cumsum(np.diff(time_s, prepend=time_s[0]) > 0)
+    ordered_rad = angle_rad[np.lexsort((angle_rad, report))]
+    starts_report = np.flatnonzero(np.diff(report, prepend=-1))
+    gap_rad = np.diff(ordered_rad, prepend=0.0)
+    gap_rad[starts_report] = 0.0
+    largest_rad = np.maximum.reduceat(gap_rad, starts_report)
+    above_gap_rad = np.where(gap_rad == largest_rad[report], ordered_rad, -np.inf)
+    first_above_rad = np.maximum.reduceat(above_gap_rad, starts_report)
+    turns = largest_rad / (2 * np.pi)
+    is_known = (turns > MIN_PLANE_DELAY_TURNS) & (turns < MAX_PLANE_DELAY_TURNS)
+    plane = np.where(is_known[report], angle_rad >= first_above_rad[report], UNKNOWN)
+    return np.where(reported_plane == UNKNOWN, plane, reported_plane)
+
+
+def _is_aliased(times_s: Array, is_above: Mask) -> Mask:
+    """Return a mask of the windows (m, k) in which an oscillation in step with reports has levels.
+
+    The level is then a function of the number of the report modulo a small period. Sweeps of one
+    report that differ are not of such a motion.
+    """
+    elapsed_s = times_s - times_s[:, :1]
+    interval_s = np.diff(times_s, axis=1)
+    if not np.any(interval_s > 0):
+        return np.zeros(len(times_s), bool)
+    report = np.rint(elapsed_s / np.median(interval_s[interval_s > 0]))
+    is_aliased = np.zeros(len(times_s), bool)
+    for period in ALIASED_PERIODS:
+        is_function = np.ones(len(times_s), bool)
+        for remainder in range(period):
+            is_chosen = report % period == remainder
+            is_function &= ~(
+                np.any(is_chosen & is_above, axis=1) & np.any(is_chosen & ~is_above, axis=1)
+            )
+        is_aliased |= is_function
+    return is_aliased & np.all(interval_s > 0, axis=1)
+
+
+def _angle_evidence(time_s: Array, angle_rad: Array) -> tuple[float, float]:
+    """Compare two stations with one by the angles (n,) of a light plane, ascending in time.
+
+    Returns the logarithms of the likelihood ratios of all windows of successive angles and of
+    those that change between two ranges of angles, if one station does not make as many by chance.
+    Windows overlap, so that each of them counts as a fraction of an observation.
+    """
+    if len(time_s) < WINDOW_SWEEPS:
+        return 0.0, 0.0
+    angles, times = (
+        np.lib.stride_tricks.sliding_window_view(values, WINDOW_SWEEPS)
+        for values in (angle_rad, time_s)
+    )
+    is_complete = np.max(np.diff(times, axis=1), axis=1) <= MAX_ANGLE_INTERVAL_S
+    angles = angles[is_complete]
+    ordered = np.sort(angles, axis=1)
+    window = np.arange(len(angles))
+    split = np.argmax(np.diff(ordered, axis=1), axis=1)
+    below, above = ordered[window, split], ordered[window, split + 1]
+    gap = above - below
+    level_range = np.maximum(below - ordered[:, 0], ordered[:, -1] - above)
+    is_above = angles > below[:, None]
+    switches = np.count_nonzero(np.diff(is_above, axis=1), axis=1)
+    smaller = np.minimum(split + 1, WINDOW_SWEEPS - 1 - split)
+    is_alternating = (
+        (switches >= MIN_LEVEL_SWITCHES) & (smaller >= MIN_LEVEL_SWEEPS) & (gap > MIN_LEVEL_GAP_RAD)
+    )
+    has_levels = is_alternating & (gap > MIN_GAP_RATIO * level_range)
+    has_levels &= ~_is_aliased(times[is_complete], is_above)
+    two_levels = int(np.count_nonzero(has_levels))
+    one, two = ONE_STATION_WINDOW_FRACTION, TWO_STATION_WINDOW_FRACTION
+
+    def log_ratio(total: int) -> float:
+        others = total - two_levels
+        return float(
+            (two_levels * np.log(two / one) + others * np.log((1 - two) / (1 - one)))
+            / WINDOW_SWEEPS
+        )
+
+    evidence = log_ratio(len(angles))
+    if two_levels < one * len(angles):
+        return evidence, evidence
+    return evidence, log_ratio(int(np.count_nonzero(is_alternating)))

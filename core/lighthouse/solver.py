@@ -17,6 +17,7 @@ from locatk.core.lighthouse.doubled_channels import (
     DOUBLED_CHANNEL_HINT,
     doubled_channel_message,
     find_doubled_channels,
+    possible_doubled_channel_message,
 )
 from locatk.core.lighthouse.epochs import Epochs, group_epochs, rotor_angles
 from locatk.core.lighthouse.localization.photodiodes import detect_stations, track_photodiodes
@@ -110,7 +111,8 @@ def solve(
     """
     scene = scene or Scene()
     options = options or SolveOptions()
-    doubled = find_doubled_channels(sweeps)
+    channels = find_doubled_channels(sweeps)
+    doubled = channels.proven
     is_doubled = np.isin(sweeps.channel, doubled)
     if doubled and np.all(is_doubled):
         raise DegenerateError(doubled_channel_message(doubled), hint=DOUBLED_CHANNEL_HINT)
@@ -140,6 +142,11 @@ def solve(
             rejected=add_counts(solution.rejected, {"sweep_of_doubled_channel": number}),
             warnings=(warning, *solution.warnings),
         )
+    if channels.possible:
+        warning = SolverWarning(
+            "possible_doubled_channel", possible_doubled_channel_message(channels.possible)
+        )
+        solution = replace(solution, warnings=(warning, *solution.warnings))
     return replace(solution, warnings=tuple(dict.fromkeys(solution.warnings)))
 
 

@@ -271,6 +271,8 @@ def _landmarks_reasons() -> dict[str, Reason]:
         "that was read, with too little evidence to call it misread: the robot grazed it.",
         "inconsistent": "Position and code contradict the odometry and the visits before and "
         "after: the visit is not used.",
+        "no_pose": "The position is known, and fields and odometry contradict each other in this "
+        "part of the drive, so that it has no poses.",
         "off_map": "By odometry the landmark is at a position where the map has none.",
         "not_explained": "The residuals of every landmark are "
         f"{hypotheses.MAX_RESIDUAL_SIGMAS:g} standard deviations or more: iron, a tool, broken "

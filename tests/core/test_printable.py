@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ntpath
 import unicodedata
+from pathlib import PureWindowsPath
 
 import pytest
 from hypothesis import given
@@ -16,7 +18,15 @@ from locatk.core.printable import (
     text_of_spreadsheet,
 )
 
+is_reserved = getattr(ntpath, "isreserved", lambda name: PureWindowsPath(name).is_reserved())
+"""Python's own rule; ``PureWindowsPath.is_reserved`` is deprecated from 3.13 on."""
+
 ANY_TEXT = st.text(st.characters(), max_size=30)  # with surrogates
+DEVICES = st.builds(
+    "{}{}".format,
+    st.sampled_from(["CON", "nul", "Aux", "COM1", "LPT\u00b9"]),
+    st.sampled_from(["", " ", ".a"]),
+)
 HOSTILE = st.text(st.sampled_from("a=+-@'\t\r\n\x1b\x9b\u202e\u2066\u200b\udcff./ "), max_size=12)
 
 
@@ -59,18 +69,33 @@ def test_nothing_invisible_is_left(text: str) -> None:
         (".bashrc", "_bashrc"),
         ("a\x1b[2J\u202eb\n\0", "a_[2J_b__"),
         ("", "_"),
+        ("CON", "_CON"),
+        ("nul", "_nul"),
+        ("COM1.txt", "_COM1.txt"),
+        ("lpt\u00b3 .a", "_lpt\u00b3 .a"),
+        ("ConOut$", "_ConOut$"),
+        ("com", "com"),
+        ("com10", "com10"),
+        ("console.con", "console.con"),
+        ("a.", "a_"),
+        ("a ", "a_"),
+        ("a. ", "a._"),
+        (".", "_"),
+        ("a" * 149 + ". b", "a" * 149 + "_"),
     ],
 )
 def test_names_of_files(text: str, name: str) -> None:
     assert file_name_part(text) == name
 
 
-@given(ANY_TEXT | HOSTILE)
-def test_names_of_files_are_possible(text: str) -> None:
-    name = file_name_part(text * 20)
+@given(ANY_TEXT | HOSTILE | DEVICES, st.sampled_from([1, 20]))
+def test_names_of_files_are_possible(text: str, times: int) -> None:
+    name = file_name_part(text * times)
     assert 0 < len(name.encode()) <= MAX_NAME_BYTES
     assert not set(name) & set('/\\:*?"<>|\0\n')
     assert name[0] not in ".-"
+    assert name[-1] not in ". "
+    assert not is_reserved(name)
 
 
 @pytest.mark.parametrize("text", ["=1+1", "+4", "-cmd", "@x", "\t=1", "\r=1", "\n=1", "\uff1d1"])

@@ -94,16 +94,30 @@ def find_sheets(localized: LocalizedFrames, manifest: Manifest) -> NDArray[np.in
 
 def count_frames_of_other_codecs(
     frames: Frames, rejected: NDArray[np.object_], manifest: Manifest, camera: Camera | None
-) -> Counter[str]:
-    """Count the rejected frames of a sample that other codecs locate on a sheet of the manifest."""
-    counts: Counter[str] = Counter()
-    sample = _sample(np.flatnonzero(~np.isin(rejected, EXPLAINED) | (rejected == OFF_SHEET)))
-    for _, images in batches(frames, sample, rejected.copy(), camera):
-        for name in CODEC_NAMES:
-            if name != manifest.codec:
-                part = localize_frames(images, codec(name), camera, other_codec_odds=0)
-                counts[name] += int((find_sheets(part, manifest) >= 0).sum())
-    return +counts
+) -> tuple[Counter[str], Counter[str]]:
+    """Count the frames that are evidence for and against other codecs, in samples.
+
+    Returns
+    -------
+    located : Counter
+        By codec, rejected frames that it locates on a sheet of the manifest.
+    contradicted : Counter
+        By codec of ``located``, localized frames that it does not locate on a sheet.
+    """
+
+    def count_located(sample: NDArray[np.intp], name: str) -> int:
+        return sum(
+            int((find_sheets(part, manifest) >= 0).sum())
+            for _, images in batches(frames, sample, rejected.copy(), camera)
+            for part in [localize_frames(images, codec(name), camera, other_codec_odds=0)]
+        )
+
+    unexplained = _sample(np.flatnonzero(~np.isin(rejected, EXPLAINED) | (rejected == OFF_SHEET)))
+    localized = _sample(np.flatnonzero(rejected == ""))
+    names = [name for name in CODEC_NAMES if name != manifest.codec]
+    located = +Counter({name: count_located(unexplained, name) for name in names})
+    contradicted = {name: len(localized) - count_located(localized, name) for name in located}
+    return located, Counter(contradicted)
 
 
 def _recognize_altered(

@@ -79,6 +79,8 @@ def describe_visit(
     estimate: CellEstimate | None,
     floor: FloorMap | None,
     map_probability: float | None = None,
+    *,
+    is_lost: bool = False,
 ) -> LandmarkDetection:
     """Return the detection that reports one visit.
 
@@ -92,6 +94,8 @@ def describe_visit(
         The map; misread landmarks, and cells without one, are recognized by it.
     map_probability : float, optional
         Probability that the robot is on this floor, if it was estimated.
+    is_lost : bool
+        True if the cell is known, but the robot has no poses during the visit.
     """
     unread = LandmarkDetection(
         time_s=visit.time_ns * 1e-9,
@@ -134,6 +138,8 @@ def describe_visit(
             estimate.outlier_probability >= MIN_OUTLIER_PROBABILITY
         )
         refused = "inconsistent" if is_outlier else "not_localised"
+    if is_lost:
+        refused = refused or "no_pose"
     code = int(rotated(best.code, quarters))
     rotation = quarters * HALF_PI_RAD
     cos, sin = np.cos(rotation), np.sin(rotation)

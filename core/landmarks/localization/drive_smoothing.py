@@ -80,6 +80,11 @@ class SmoothedPart:
         """Rms residual of the fields, in standard deviations."""
         return self.smoothed.result.residual_sigma
 
+    @property
+    def is_credible(self) -> bool:
+        """True if the fields agree well enough for poses to be reported."""
+        return self.residual_sigma <= MAX_CREDIBLE_RESIDUAL_SIGMAS
+
     def trajectory(self, odometry: Trajectory) -> Trajectory:
         """Return the poses during this part."""
         first_ns, last_ns = self.first_ns, self.stop_ns
@@ -118,23 +123,49 @@ class SmoothedPart:
 
 
 @dataclass(frozen=True)
+class LostPart:
+    """Part of a drive without poses, because fields and odometry contradict each other.
+
+    Attributes
+    ----------
+    visits : list of IdentifiedVisit
+        Visits of this part.
+    first_ns, stop_ns : int
+        Times without poses.
+    """
+
+    visits: list[IdentifiedVisit]
+    first_ns: int
+    stop_ns: int
+
+
+@dataclass(frozen=True)
 class SmoothedDrive:
     """All parts of the drive of one robot.
 
     Attributes
     ----------
     parts : list of SmoothedPart
+        Those that have a solution, credible or not.
+    lost_parts : list of LostPart
+        Those that have no solution, or none that is credible.
     drift : OdometryDrift
         Before anything was estimated.
     """
 
     parts: list[SmoothedPart]
+    lost_parts: list[LostPart]
     drift: OdometryDrift
 
     @property
     def visits(self) -> list[IdentifiedVisit]:
         """Visits from which poses were estimated, in order of time."""
         return list({id(visit): visit for part in self.parts for visit in part.visits}.values())
+
+    @property
+    def lost_visits(self) -> list[IdentifiedVisit]:
+        """Visits of the parts without poses, in order of time."""
+        return [visit for part in self.lost_parts for visit in part.visits]
 
     @property
     def displaced_cells(self) -> set[Cell]:
@@ -153,11 +184,7 @@ class SmoothedDrive:
 
     def trajectory(self, odometry: Trajectory) -> Trajectory | None:
         """Return the poses of all parts whose residual is credible; None if there are none."""
-        poses = [
-            part.trajectory(odometry)
-            for part in self.parts
-            if part.residual_sigma <= MAX_CREDIBLE_RESIDUAL_SIGMAS
-        ]
+        poses = [part.trajectory(odometry) for part in self.parts if part.is_credible]
         if len(poses) < 2:
             return poses[0] if poses else None
         return replace(
@@ -175,13 +202,19 @@ class SmoothedDrive:
         for part in self.parts:
             warnings += warn_of_carrying(part.smoothed.measurements)
         warnings += warn_of_scale(self.parts[0].smoothed.result, self.drift)
+        misfits = []
         if self.residual_sigma > MAX_RESIDUAL_SIGMAS:
+            misfits.append(f"fields deviate from the model by {self.residual_sigma:.2g} sigma")
+        misfits += [
+            f"no poses from {1e-9 * part.first_ns:.3f} to {1e-9 * part.stop_ns:.3f} s, where the "
+            "fields and the odometry contradict each other"
+            for part in self.lost_parts
+        ]
+        if misfits:
             message = (
-                f"fields deviate from the model by {self.residual_sigma:.2g} standard deviations; "
-                "check clocks and scale of the odometry, the sensors and the landmarks' geometry"
+                f"{'; '.join(misfits)}: check clocks and scale of the odometry, the sensors and "
+                "the landmarks' geometry"
             )
-            if any(part.residual_sigma > MAX_CREDIBLE_RESIDUAL_SIGMAS for part in self.parts):
-                message += "; where that is largest, there are no poses"
             warnings.append(SolverWarning("field_misfit", message))
         # Neighbouring parts have visits in common.
         return list(dict.fromkeys(warnings))
@@ -225,20 +258,30 @@ def smooth_drive(
     limits = np.iinfo(np.int64)
     bounds_ns = [int(limits.min), *starts_ns, int(limits.max)]
     ranges = zip(pairwise(edges), pairwise(bounds_ns), strict=True)
-    parts = []
+    parts, lost_parts = [], []
     for (start, stop), (first_ns, stop_ns) in ranges:
+        own = list(visits[start:stop])
+        lost = LostPart(
+            own,
+            max(first_ns, int(odometry.time_ns[0])),
+            min(stop_ns, int(odometry.time_ns[-1])),
+        )
         near = visits[max(0, start - NEIGHBOURING_VISITS) : stop + NEIGHBOURING_VISITS]
         try:
             smoothed, used = _smooth_part(
                 near, odometry, floor, priors, estimate_walk=estimate_walk
             )
         except DegenerateError:
+            lost_parts.append(lost)
             continue
-        cells = frozenset(visit.cell for visit in visits[start:stop])
-        parts.append(SmoothedPart(smoothed, used, cells, first_ns, stop_ns))
+        cells = frozenset(visit.cell for visit in own)
+        part = SmoothedPart(smoothed, used, cells, first_ns, stop_ns)
+        parts.append(part)
+        if not part.is_credible:
+            lost_parts.append(lost)
     if not parts:
         raise DegenerateError("the fields and the odometry contradict each other")
-    return SmoothedDrive(parts, priors.drift)
+    return SmoothedDrive(parts, lost_parts, priors.drift)
 
 
 def _smooth_part(

@@ -207,6 +207,24 @@ def test_the_other_codec_is_named_by_frames_off_the_sheet(shoot: Shoot) -> None:
     assert [each.code for each in right.warnings] == ["no_camera_model"]
 
 
+@pytest.mark.parametrize(("right", "others", "printed"), [(6, 2, False), (1, 4, True)])
+def test_a_few_frames_of_another_codec_do_not_rename_the_sheets(
+    shoot: Shoot, right: int, others: int, printed: bool
+) -> None:
+    sheet = Sheet("s", (1000, 2000), (200, 200), (0, 0), (120.0, 120.0), (8.0, 8.0))
+    images = [
+        shoot(at=(1050.0 + 11 * k, 2100.0), codec="anoto" if k < right else "microdots", seed=k)
+        for k in range(right + others)
+    ]
+    solution = solve([frames_of(images)], Manifest((sheet,), codec="anoto"))
+    assert solution.poses == right
+    (warning,) = (each for each in solution.warnings if each.code == "other_codec")
+    assert "'microdots'" in warning.message
+    assert f"{others} of the rejected frames" in warning.message
+    assert ("were printed with" in warning.message) == printed
+    assert (f"{right} of those with a pose are not" in warning.message) != printed
+
+
 ALTERED = {
     "mirrored": lambda image: image[:, ::-1],
     "inverted": lambda image: 255 - image,

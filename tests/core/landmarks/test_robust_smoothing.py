@@ -8,18 +8,21 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from locatk.core.errors import InputError
+from locatk.core.errors import DegenerateError, InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.landmarks.detection.trace import compose, relative
 from locatk.core.landmarks.localization import drive_smoothing
 from locatk.core.landmarks.localization.odometry_path import OdometryPath, without_lag
+from locatk.core.landmarks.localization.robust_smoothing import RobustSmoothing
 from locatk.core.landmarks.map.floor import AsBuiltLandmark, FloorMap
 from locatk.core.landmarks.preprocessing import planar_poses
 from locatk.core.landmarks.simulation.options import Errors, SimulationOptions
@@ -30,6 +33,7 @@ from locatk.core.landmarks.solver import (
     SolveOptions,
     identify_recording,
     lag_of_visits,
+    solve,
     solve_recording,
 )
 from locatk.core.trajectory import Trajectory
@@ -289,6 +293,44 @@ def test_a_drive_in_parts_has_the_same_poses(monkeypatch: pytest.MonkeyPatch) ->
     sigma = first.sigma[:, :2]
     assert np.abs((second.position - first.position)[:, :2] / sigma).max() < 0.5
     np.testing.assert_allclose(second.sigma[:, :2], sigma, rtol=0.35)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("failing", ["raises", "is_incredible"])
+def test_a_part_without_poses_is_reported(failing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = drive()
+    odometry = odometry_of(one, 9)
+    for name, count in (("MAX_PART_VISITS", 8), ("PART_VISITS", 7), ("NEIGHBOURING_VISITS", 6)):
+        monkeypatch.setattr(drive_smoothing, name, count)
+    smooth, calls = drive_smoothing.smooth_robustly, []
+
+    def smooth_first_part_only(*given: Any, **options: Any) -> RobustSmoothing:
+        calls.append(given)
+        if len(calls) == 1:
+            return smooth(*given, **options)
+        if failing == "raises":
+            raise DegenerateError("the fields and the odometry contradict each other")
+        smoothed = smooth(*given, **options)
+        return replace(smoothed, result=replace(smoothed.result, residual_sigma=99.0))
+
+    monkeypatch.setattr(drive_smoothing, "smooth_robustly", smooth_first_part_only)
+    solution = solve(one.samples, FLOOR, odometry=[odometry])
+    assert len(calls) == 2
+    (path,) = solution.trajectories
+    missing_ns = np.setdiff1d(odometry.time_ns, path.time_ns)
+    assert 0.3 < len(missing_ns) / len(odometry) < 0.7
+    (warning,) = solution.warnings
+    assert warning.code == "field_misfit"
+    times = re.search(r"no poses from (\S+) to (\S+) s", warning.message)
+    assert times is not None
+    first_s, last_s = map(float, times.groups())
+    assert 1e-9 * path.time_ns[-1] <= first_s <= 1e-9 * missing_ns[0] + 1e-3
+    assert last_s == pytest.approx(1e-9 * missing_ns[-1], abs=1e-3)
+    lost = [each for each in solution.detections if each.refused == "no_pose"]
+    assert solution.rejected == {"no_pose": len(lost)}
+    assert all(each.cell is not None for each in lost)
+    assert {each.time_s > first_s for each in lost} == {True}
+    assert {each.time_s > first_s for each in solution.detections if not each.refused} == {False}
 
 
 @pytest.mark.slow
