@@ -352,12 +352,12 @@ class _RectifiedFrame:
         rivals = np.logaddexp(
             np.logaddexp.reduce(np.delete(stacked.ravel(), best)), math.log(stacked.size)
         )
-        log_odds = float(stacked.flat[best] - rivals)
-        if log_odds < MIN_LOG_ODDS:
+        lead = float(stacked.flat[best] - rivals)
+        if lead < MIN_LOG_ODDS:
             return None
         candidate, row, column = np.unravel_index(best, stacked.shape)
         number, axes, shift = candidates[int(candidate)]
-        return _SheetPose(number, axes, shift + [column, row], float(expit(log_odds)))
+        return _SheetPose(number, axes, shift + [column, row], float(expit(lead)))
 
     def _nominal_positions(self, number: int, plane: Array) -> Array:
         """Return the grid positions on another sheet at points of the plane, by the manifest."""
@@ -414,7 +414,7 @@ def lattice_of(homography: Array, points: Array, *, lens: bool) -> DotLattices:
     )
     lattice = project_lattices(unscaled, parameters, points[None])
     offset = lattice.uv - lattice.nodes
-    lattice.sigma[:] = robust_sigma(offset - nearest_symbol_offset(offset))
+    lattice.sigma[:] = robust_sigma(np.asarray(offset - nearest_symbol_offset(offset), float))
     return lattice
 
 
@@ -463,7 +463,7 @@ def _rectify(
 
 def _near_median(positions: Array) -> NDArray[np.bool_]:
     """Return which positions (n, 2) are finite and within the area that is compared."""
-    is_finite = np.isfinite(positions).all(axis=1)
+    is_finite = np.asarray(np.isfinite(positions).all(axis=1))
     if not is_finite.any():
         return is_finite
     with np.errstate(invalid="ignore"):
