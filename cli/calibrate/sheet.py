@@ -303,7 +303,7 @@ def _entry(
     sessions: tuple[Path, ...], output: Path, report: FloorReport, left_out: dict[str, str]
 ) -> dict[str, Any]:
     """Return the object of ``--json`` (docs/formats.md)."""
-    noise = report.fit.noise
+    hyperparameters = report.fit.hyperparameters
     has_truth = report.truth_frames > 0
     return {
         "version": 1,
@@ -328,8 +328,8 @@ def _entry(
             for seam in report.seams
         ],
         "unplaced": report.unplaced,
-        "seam_sigma_factor": noise.seam if report.seams else None,
-        "sigma_truth_m": noise.position_mm * 1e-3 if has_truth else None,
+        "seam_sigma_factor": hyperparameters.seam if report.seams else None,
+        "sigma_truth_m": hyperparameters.position_mm * 1e-3 if has_truth else None,
         "scale": report.scale,
         "sigma_scale": report.sigma_scale,
         "rms_rigid_m": report.rms_rigid_mm * 1e-3,

@@ -44,24 +44,24 @@ class Distortion:
         return np.stack([np.array(self.x_mm, float), np.array(self.y_mm, float)], axis=2)
 
     def evaluate(
-        self, place: NDArray[np.float64]
+        self, fraction: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return displacements and their derivatives.
 
         Parameters
         ----------
-        place : (n, 2) ndarray
+        fraction : (n, 2) ndarray
             0 to 1 from the left to the right and from the lower to the upper end of the area.
 
         Returns
         -------
         displacement_mm : (n, 2) ndarray
         slope_mm : (n, 2, 2) ndarray
-            Their derivatives by ``place``.
+            Their derivatives by ``fraction``.
         """
         rows, columns, _ = self.displacement_mm.shape
-        x, x_slope = interpolation_weights(place[:, 0], columns)
-        y, y_slope = interpolation_weights(place[:, 1], rows)
+        x, x_slope = interpolation_weights(fraction[:, 0], columns)
+        y, y_slope = interpolation_weights(fraction[:, 1], rows)
         along_x = np.einsum("nc,rcd->nrd", x, self.displacement_mm)
         by_x = np.einsum("nc,rcd->nrd", x_slope, self.displacement_mm)
         slope = [np.einsum("nr,nrd->nd", y, by_x), np.einsum("nr,nrd->nd", y_slope, along_x)]
@@ -69,11 +69,11 @@ class Distortion:
 
 
 def interpolation_weights(
-    place: NDArray[np.float64], count: int
+    fraction: NDArray[np.float64], count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the weights (n, count) of nodes at places from 0 to 1, and their derivatives."""
+    """Return the weights (n, count) of nodes at fractions from 0 to 1, and their derivatives."""
     step = count - 1
-    position = place * step
+    position = fraction * step
     left = np.clip(np.floor(position), 0, max(step - 1, 0))
     t = np.clip(position - left, 0, 1)
     one, squared = np.ones_like(t), t * t
@@ -96,7 +96,7 @@ def interpolation_weights(
     )
     # Beyond the area, linear.
     cubic += (position - left - t) * slopes
-    weights, derivatives = np.zeros((2, len(place), count + 2))
+    weights, derivatives = np.zeros((2, len(fraction), count + 2))
     index = left.astype(np.int64) + np.arange(4)[:, None]
     np.put_along_axis(weights, index.T, cubic.T, axis=1)
     np.put_along_axis(derivatives, index.T, slopes.T * step, axis=1)
@@ -253,9 +253,9 @@ class Manifest:
         on_paper = self.to_paper(number, grid)
         sheet = self.sheets[number]
         if sheet.distortion is not None:
-            place = self._place(number, grid)
-            displacement, _ = sheet.distortion.evaluate(place.reshape(-1, 2))
-            on_paper += displacement.reshape(place.shape)
+            fraction = self._area_fraction(number, grid)
+            displacement, _ = sheet.distortion.evaluate(fraction.reshape(-1, 2))
+            on_paper += displacement.reshape(fraction.shape)
         if sheet.position_mm is not None:
             on_paper = on_paper @ self._rotation(number).T + sheet.position_mm
         return on_paper * 1e-3
@@ -272,13 +272,13 @@ class Manifest:
         result: NDArray[np.float64] = on_paper
         return result
 
-    def _place(self, number: int, grid: ArrayLike) -> NDArray[np.float64]:
+    def _area_fraction(self, number: int, grid: ArrayLike) -> NDArray[np.float64]:
         """Return positions (..., 2) as fractions of the printed area, x right, y up."""
         sheet = self.sheets[number]
         extent = np.maximum(np.array(sheet.size) - 1, 1)
-        place = (np.asarray(grid, float) - sheet.origin) / extent
-        place[..., 1] = 1 - place[..., 1]
-        return np.asarray(place)
+        fraction = (np.asarray(grid, float) - sheet.origin) / extent
+        fraction[..., 1] = 1 - fraction[..., 1]
+        return np.asarray(fraction)
 
     def _rotation(self, number: int) -> NDArray[np.float64]:
         """Return the rotation (2, 2) from the paper to the frame of poses."""
@@ -303,12 +303,12 @@ class Manifest:
         sheet = self.sheets[number]
         slope = np.diag([self.pitch_mm * self.scale[0], -self.pitch_mm * self.scale[1]])
         if grid is not None:
-            place = self._place(number, grid)
-            slope = np.broadcast_to(slope, (*place.shape, 2))
+            fraction = self._area_fraction(number, grid)
+            slope = np.broadcast_to(slope, (*fraction.shape, 2))
             if sheet.distortion is not None:
-                _, by_place = sheet.distortion.evaluate(place.reshape(-1, 2))
+                _, by_fraction = sheet.distortion.evaluate(fraction.reshape(-1, 2))
                 extent = np.maximum(np.array(sheet.size) - 1, 1) * [1, -1]
-                slope = slope + by_place.reshape(*place.shape, 2) / extent
+                slope = slope + by_fraction.reshape(*fraction.shape, 2) / extent
         if sheet.position_mm is not None:
             slope = self._rotation(number) @ slope
         return np.asarray(slope * 1e-3)
@@ -340,11 +340,11 @@ class Manifest:
         result[..., :2, :2] *= 1e-6
         result[..., 2, 2] = math.radians(sheet.distortion_sigma_deg) ** 2
         if sheet.position_mm is not None and sheet.covariance_mm_deg is not None:
-            lever = position - np.array(sheet.position_mm) * 1e-3
+            lever_arm = position - np.array(sheet.position_mm) * 1e-3
             effect = np.zeros((*position.shape[:-1], 3, 3))
             effect[..., :, :] = np.diag([1e-3, 1e-3, math.radians(1)])
-            effect[..., 0, 2] = -lever[..., 1] * math.radians(1)
-            effect[..., 1, 2] = lever[..., 0] * math.radians(1)
+            effect[..., 0, 2] = -lever_arm[..., 1] * math.radians(1)
+            effect[..., 1, 2] = lever_arm[..., 0] * math.radians(1)
             result += effect @ np.array(sheet.covariance_mm_deg) @ np.swapaxes(effect, -1, -2)
         return result
 

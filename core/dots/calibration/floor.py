@@ -266,7 +266,7 @@ def calibrate_floor(
 class _Examined:
     """Recording with the poses of its frames on the grid.
 
-    ``numbers`` (n,) is the sheet of each frame, -1 if it has none; ``near_seam`` (n,) are the
+    ``sheet_numbers`` (n,) is the sheet of each frame, -1 if it has none; ``near_seam`` (n,) are the
     frames that may show several sheets, without those that were found to show one.
     """
 
@@ -274,7 +274,7 @@ class _Examined:
     recording: FloorRecording
     camera: Camera
     localized: LocalizedFrames
-    numbers: NDArray[np.intp]
+    sheet_numbers: NDArray[np.intp]
     near_seam: NDArray[np.bool_]
 
 
@@ -368,7 +368,7 @@ def _measure_seams(
         if not examined.near_seam[frame]:
             continue
         views = separate_sheets(images[frame], manifest, code, examined.camera)
-        if is_last and len(views) == 1 and views[0].number == examined.numbers[frame]:
+        if is_last and len(views) == 1 and views[0].number == examined.sheet_numbers[frame]:
             examined.near_seam[frame] = False
         seam = measure_seam(views, manifest, examined.camera, examined.index, frame)
         if seam is not None:
@@ -388,11 +388,11 @@ def _truth_observations(
 
 
 def _compare_with_truth(
-    examined: _Examined, true: Trajectory, alignment: int, manifest: Manifest
+    examined: _Examined, truth: Trajectory, alignment: int, manifest: Manifest
 ) -> Iterator[TruthObservations]:
     """Yield the poses on each sheet that have truth."""
     recording, localized = examined.recording, examined.localized
-    is_used = localized.accepted & (examined.numbers >= 0) & ~examined.near_seam
+    is_used = localized.accepted & (examined.sheet_numbers >= 0) & ~examined.near_seam
     frames = np.flatnonzero(is_used)
     stamps = recording.frames.time_ns[frames]
     poses = Trajectory(
@@ -403,14 +403,14 @@ def _compare_with_truth(
         quaternion_from_heading(np.zeros(len(frames))),
         np.full((len(frames), 6, 6), np.nan),
     )
-    match = associate(poses, true, offset_s=recording.offset_s)
+    match = associate(poses, truth, offset_s=recording.offset_s)
     rows = np.unique(np.linspace(0, len(match) - 1, min(len(match), MAX_TRUTH_FRAMES)).astype(int))
-    frames, truth = frames[match.index[rows]], match.truth[rows] * 1e3
+    frames, truth_mm = frames[match.index[rows]], match.truth[rows] * 1e3
     headings = heading_from_quaternion(match.truth_quaternion[rows])
-    if not has_orientation(true).all():
+    if not has_orientation(truth).all():
         headings = np.full(len(rows), np.nan)
-    for number in np.unique(examined.numbers[frames]).tolist():
-        here = examined.numbers[frames] == number
+    for number in np.unique(examined.sheet_numbers[frames]).tolist():
+        here = examined.sheet_numbers[frames] == number
         indices = frames[here]
         nominal = _on_paper(manifest, number)
         position, heading, covariance = nominal.poses_in_metres(
@@ -426,7 +426,7 @@ def _compare_with_truth(
             position * 1e3,
             heading,
             variance,
-            truth[here, :2],
+            truth_mm[here, :2],
             headings[here],
         )
 
@@ -464,7 +464,7 @@ def _visible_sheets(
 
     These are all tiles, and other sheets that a frame shows.
     """
-    visible = {number for each in examined for number in each.numbers.tolist() if number >= 0}
+    visible = {number for each in examined for number in each.sheet_numbers.tolist() if number >= 0}
     visible |= {number for seam in seams for number in seam.numbers}
     tiles = {k for k, sheet in enumerate(manifest.sheets) if sheet.position_mm is not None}
     if not visible:
@@ -729,7 +729,7 @@ def _report(
             sheet.id for number, sheet in enumerate(manifest.sheets) if number not in placed
         ),
         frames=sum(len(each.recording.frames) for each in examined),
-        localized=sum(int((each.numbers >= 0).sum()) for each in examined),
+        localized=sum(int((each.sheet_numbers >= 0).sum()) for each in examined),
         seam_frames=len(problem.seams),
         truth_frames=problem.truth_frames,
         rejected=len(given.seams) - len(problem.seams) + given.truth_frames - problem.truth_frames,
@@ -755,11 +755,11 @@ def notes_of(given: FloorProblem, fit: FloorFit) -> Iterator[str]:
         if rejected and (kept[pair] < MIN_SEAM_FRAMES or kept[pair] <= rejected):
             first, other = (manifest.sheets[number].id for number in sorted(pair))
             yield f"{first} and {other}: {kept[pair]} of {total[pair]} frames at their seam agree"
-    if fit.problem.seams and fit.noise.seam > GROSS_OUTLIER_SIGMAS:
+    if fit.problem.seams and fit.hyperparameters.seam > GROSS_OUTLIER_SIGMAS:
         yield (
-            f"frames at one seam differ {fit.noise.seam:.0f} times as much as the noise of their "
-            "dots explains: is the floor flat, the lens calibrated, and does the floor consist of "
-            "these sheets? Do not trust the standard deviations"
+            f"frames at one seam differ {fit.hyperparameters.seam:.0f} times as much as the noise "
+            "of their dots explains: is the floor flat, the lens calibrated, and does the floor "
+            "consist of these sheets? Do not trust the standard deviations"
         )
     for number in given.layout.sheets:
         if number not in placed:

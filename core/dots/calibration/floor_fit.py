@@ -74,7 +74,7 @@ are wrong; fields are much smaller."""
 SCALE_PRIOR_SIGMA = 0.02
 """Prior standard deviation of a print's scale; more is an error of the user."""
 
-LEVER_PRIOR_SIGMA_MM = 300.0
+LEVER_ARM_PRIOR_SIGMA_MM = 300.0
 """Prior standard deviation of the position of the camera on the tracked body."""
 
 FLAT_SIGMA = 1e5
@@ -155,7 +155,7 @@ class TruthObservations:
 
 
 @dataclass(frozen=True)
-class Noise:
+class Hyperparameters:
     """Hyperparameters of the fit.
 
     Attributes
@@ -164,21 +164,21 @@ class Noise:
         Factor of the standard deviations of seam measurements.
     position_mm, heading : float
         Standard deviations of the truth, mm and rad, besides that of the poses on the sheet.
-    field_mm : (x, y)
+    field_sigma_mm : (x, y)
         Standard deviation of the displacements along the axes of the paper.
-    length_mm : float
+    correlation_length_mm : float
         Their correlation length.
     """
 
     seam: float = 1.0
     position_mm: float = 0.1
     heading: float = 1e-3
-    field_mm: tuple[float, float] = (0.0, 0.0)
-    length_mm: float = CORRELATION_LENGTHS_MM[1]
+    field_sigma_mm: tuple[float, float] = (0.0, 0.0)
+    correlation_length_mm: float = CORRELATION_LENGTHS_MM[1]
 
 
 @dataclass(frozen=True)
-class Layout:
+class UnknownIndices:
     """Indices of the unknowns.
 
     Attributes
@@ -196,13 +196,13 @@ class Layout:
     nodes: dict[int, tuple[int, int]]
 
     @property
-    def rigid(self) -> int:
+    def rigid_size(self) -> int:
         """Number of unknowns that are not those of fields."""
         return 3 * (len(self.sheets) - 1) + (2 + 6 * self.alignments if self.alignments else 0)
 
     @property
     def size(self) -> int:
-        return self.rigid + 2 * sum(columns * rows for columns, rows in self.nodes.values())
+        return self.rigid_size + 2 * sum(columns * rows for columns, rows in self.nodes.values())
 
     def pose(self, number: int) -> Indices | None:
         """Return the unknowns (3,) of a sheet's pose; None for the datum."""
@@ -219,7 +219,7 @@ class Layout:
 
     def field(self, number: int) -> Indices:
         """Return the unknowns (2, nodes) of a field: along x, then along y."""
-        start = self.rigid
+        start = self.rigid_size
         for other, (columns, rows) in self.nodes.items():
             if other == number:
                 return start + np.arange(2 * columns * rows).reshape(2, -1)
@@ -227,14 +227,16 @@ class Layout:
         raise KeyError(number)
 
 
-def lay_out_unknowns(manifest: Manifest, sheets: tuple[int, ...], alignments: int) -> Layout:
+def lay_out_unknowns(
+    manifest: Manifest, sheets: tuple[int, ...], alignments: int
+) -> UnknownIndices:
     """Return the unknowns of a floor; without fields if it is too large for them."""
     for spacing_mm in NODE_SPACINGS_MM:
         nodes = {number: _nodes(manifest, number, spacing_mm) for number in sheets}
-        layout = Layout(sheets, alignments, nodes)
+        layout = UnknownIndices(sheets, alignments, nodes)
         if layout.size <= MAX_UNKNOWNS:
             return layout
-    return Layout(sheets, alignments, {})
+    return UnknownIndices(sheets, alignments, {})
 
 
 def _nodes(manifest: Manifest, number: int, spacing_mm: float) -> tuple[int, int]:
@@ -307,8 +309,8 @@ def field_correlation(points: Array, others: Array, length_mm: float) -> tuple[A
     rate = math.sqrt(3) / length_mm
     offset = points[:, None] - others
     ratio = rate * np.linalg.norm(offset, axis=2)
-    decay = np.exp(-ratio)
-    return (1 + ratio) * decay, -(rate**2) * offset * decay[..., None]
+    decay: Array = np.exp(-ratio)
+    return np.asarray((1 + ratio) * decay), -(rate**2) * offset * decay[..., None]
 
 
 def unresolved_variance(
@@ -371,7 +373,7 @@ class Equations:
     residual : (m,) ndarray
         Predicted minus observed, in standard deviations for seams, otherwise in mm or rad.
     jacobian : (m, size) ndarray
-    owner : (m,) int ndarray
+    observation : (m,) int ndarray
         Index of the observation (a frame) of each row.
     variance : float
         Of the poses on the sheet [mm^2 or rad^2]; 0 for seams.
@@ -379,7 +381,7 @@ class Equations:
 
     residual: Array
     jacobian: Array
-    owner: Indices
+    observation: Indices
     variance: float
 
 
@@ -393,13 +395,13 @@ class FloorProblem:
     Attributes
     ----------
     manifest : Manifest
-    layout : Layout
+    layout : UnknownIndices
     seams : tuple of SeamMeasurement
     truths : tuple of TruthObservations
     """
 
     manifest: Manifest
-    layout: Layout
+    layout: UnknownIndices
     seams: tuple[SeamMeasurement, ...]
     truths: tuple[TruthObservations, ...]
 
@@ -450,22 +452,22 @@ class FloorProblem:
         result = {}
         if self.seams:
             rows = [self._seam_rows(seam, state) for seam in self.seams]
-            owner = np.repeat(np.arange(len(rows)), [len(residual) for residual, _ in rows])
+            observation = np.repeat(np.arange(len(rows)), [len(residual) for residual, _ in rows])
             residual, jacobian = (np.concatenate(part) for part in zip(*rows, strict=True))
-            result[SEAM] = Equations(residual, jacobian, owner, 0.0)
+            result[SEAM] = Equations(residual, jacobian, observation, 0.0)
         start = 0
         parts: dict[str, list[Equations]] = {POSITION: [], HEADING: []}
         for truth in self.truths:
             for kind, equations in self._truth_rows(truth, state):
-                owner = equations.owner + start
-                parts[kind].append(replace(equations, owner=owner))
+                observation = equations.observation + start
+                parts[kind].append(replace(equations, observation=observation))
             start += len(truth.time_ns)
         for kind, each in parts.items():
             if each:
                 result[kind] = Equations(
                     np.concatenate([one.residual for one in each]),
                     np.concatenate([one.jacobian for one in each]),
-                    np.concatenate([one.owner for one in each]),
+                    np.concatenate([one.observation for one in each]),
                     float(np.mean([one.variance for one in each])),
                 )
         return result
@@ -508,7 +510,7 @@ class FloorProblem:
     ) -> Iterator[tuple[str, Equations]]:
         """Compare poses on a sheet with the truth."""
         index = self.layout.alignment(truth.alignment)
-        x, y, angle, lever_x, lever_y, mounting = state[index]
+        x, y, angle, arm_x, arm_y, mounting = state[index]
         on_floor = self.sheet_points(truth.number, truth.points_mm, state)
         rotation = rotation_matrix_2d(angle)
         rotated = on_floor.position @ rotation.T
@@ -518,10 +520,10 @@ class FloorProblem:
         jacobian[:, :, index[2]] = _perpendicular(rotated)
         rows = np.arange(len(predicted))
         if truth.has_heading:
-            # The camera is at the lever on the tracked body, whose position is the truth.
+            # The camera is at the lever arm on the tracked body, whose position is the truth.
             c, s = np.cos(truth.truth_headings), np.sin(truth.truth_headings)
             body = np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], axis=1)
-            predicted = predicted - body @ [lever_x, lever_y]
+            predicted = predicted - body @ [arm_x, arm_y]
             jacobian[:, :, index[3:5]] = -body
             heading = on_floor.heading + truth.headings + angle + mounting
             by_heading = on_floor.by_heading.copy()
@@ -551,7 +553,7 @@ class FloorFit:
         Observations that were used.
     state : (size,) ndarray
     covariance : (size, size) ndarray
-    noise : Noise
+    hyperparameters : Hyperparameters
     log_evidence : float
         Logarithm of the marginal likelihood, up to a constant of the observations.
     """
@@ -559,12 +561,12 @@ class FloorFit:
     problem: FloorProblem
     state: Array
     covariance: Array
-    noise: Noise
+    hyperparameters: Hyperparameters
     log_evidence: float
 
 
 @dataclass(frozen=True)
-class _Grams:
+class _NormalEquations:
     """Products of the equations of each kind, of which the evidence is computed."""
 
     state: Array
@@ -575,7 +577,7 @@ class _Grams:
     variance: dict[str, float]
 
     @classmethod
-    def of(cls, equations: dict[str, Equations], state: Array) -> _Grams:
+    def of(cls, equations: dict[str, Equations], state: Array) -> _NormalEquations:
         items = equations.items()
         return cls(
             state,
@@ -586,14 +588,16 @@ class _Grams:
             {kind: each.variance for kind, each in items},
         )
 
-    def weight(self, kind: str, noise: Noise) -> float:
+    def weight(self, kind: str, hyperparameters: Hyperparameters) -> float:
         """Return the inverse variance of a residual."""
         if kind == SEAM:
-            return float(noise.seam**-2)
-        sigma = noise.position_mm if kind == POSITION else noise.heading
+            return float(hyperparameters.seam**-2)
+        sigma = hyperparameters.position_mm if kind == POSITION else hyperparameters.heading
         return 1 / (self.variance[kind] + sigma**2)
 
-    def posterior(self, prior: Prior, noise: Noise) -> tuple[Array, Array, float]:
+    def posterior(
+        self, prior: Prior, hyperparameters: Hyperparameters
+    ) -> tuple[Array, Array, float]:
         """Return step, factor of the precision, and log evidence.
 
         Raises
@@ -601,12 +605,12 @@ class _Grams:
         LinAlgError
             The precision is not positive.
         """
-        precision, log_determinant = prior.precision(noise)
-        pull = precision @ self.state
-        normal, right = precision, pull.copy()
-        energy = float(self.state @ pull)
+        precision, log_determinant = prior.precision(hyperparameters)
+        prior_gradient = precision @ self.state
+        normal, right = precision, prior_gradient.copy()
+        energy = float(self.state @ prior_gradient)
         for kind, gram in self.normal.items():
-            weight = self.weight(kind, noise)
+            weight = self.weight(kind, hyperparameters)
             normal = normal + weight * gram
             right += weight * self.right[kind]
             energy += weight * self.cost[kind]
@@ -620,13 +624,13 @@ class _Grams:
 class Prior:
     """Gaussian prior of the unknowns."""
 
-    def __init__(self, manifest: Manifest, layout: Layout) -> None:
+    def __init__(self, manifest: Manifest, layout: UnknownIndices) -> None:
         self._layout = layout
         sigma = np.full(layout.size, FLAT_SIGMA)
         if layout.alignments:
             sigma[layout.scale] = SCALE_PRIOR_SIGMA
         for index in range(layout.alignments):
-            sigma[layout.alignment(index)[3:5]] = LEVER_PRIOR_SIGMA_MM
+            sigma[layout.alignment(index)[3:5]] = LEVER_ARM_PRIOR_SIGMA_MM
         self._rigid = np.diag(sigma**-2.0)
         self._positions = {
             number: node_positions(manifest, number, nodes)
@@ -634,13 +638,13 @@ class Prior:
         }
         self._inverse: dict[tuple[int, float], tuple[Array, float]] = {}
 
-    def precision(self, noise: Noise) -> tuple[Array, float]:
+    def precision(self, hyperparameters: Hyperparameters) -> tuple[Array, float]:
         """Return the inverse covariance (size, size), and its log determinant for the fields."""
         result, log_determinant = self._rigid.copy(), 0.0
         for number in self._layout.nodes:
-            inverse, log_one = self._correlation(number, noise.length_mm)
+            inverse, log_one = self._correlation(number, hyperparameters.correlation_length_mm)
             for axis, unknowns in enumerate(self._layout.field(number)):
-                variance = noise.field_mm[axis] ** 2
+                variance = hyperparameters.field_sigma_mm[axis] ** 2
                 result[np.ix_(unknowns, unknowns)] = inverse / variance
                 log_determinant += log_one - len(unknowns) * math.log(variance)
         return result, log_determinant
@@ -650,51 +654,55 @@ class Prior:
         key = number, length_mm
         if key not in self._inverse:
             points = self._positions[number]
-            matrix, _ = field_correlation(points, points, length_mm)
-            matrix += RELATIVE_JITTER * np.eye(len(points))
+            correlation, _ = field_correlation(points, points, length_mm)
+            matrix = correlation + RELATIVE_JITTER * np.eye(len(points))
             _, log_determinant = np.linalg.slogdet(matrix)
             self._inverse[key] = np.linalg.inv(matrix), -float(log_determinant)
         return self._inverse[key]
 
 
-def fit_state(problem: FloorProblem, state: Array, noise: Noise) -> FloorFit:
-    """Estimate the unknowns for known noise by Gauss-Newton steps.
+def fit_state(problem: FloorProblem, state: Array, hyperparameters: Hyperparameters) -> FloorFit:
+    """Estimate the unknowns for known hyperparameters by Gauss-Newton steps.
 
     The equations are nearly linear, so that undamped steps converge.
     """
     prior = Prior(problem.manifest, problem.layout)
     for _ in range(MAX_STEPS):
-        grams = _Grams.of(problem.linearize(state), state)
-        step, factor, evidence = grams.posterior(prior, noise)
+        normal_equations = _NormalEquations.of(problem.linearize(state), state)
+        step, factor, evidence = normal_equations.posterior(prior, hyperparameters)
         state = state + step
         if float(np.abs(factor.T @ step).max(initial=0)) < MAX_LAST_STEP_SIGMAS:
             break
     covariance = cho_solve((factor, True), np.eye(len(state)))
-    return FloorFit(problem, state, covariance, noise, evidence)
+    return FloorFit(problem, state, covariance, hyperparameters, evidence)
 
 
-def fit_noise(
+def fit_hyperparameters(
     problem: FloorProblem,
     state: Array,
-    noise: Noise,
+    hyperparameters: Hyperparameters,
     lengths_mm: Sequence[float] | None = None,
-) -> Noise:
-    """Return the noise of the largest evidence about a state, near a given one.
+) -> Hyperparameters:
+    """Return the hyperparameters of the largest evidence about a state, near a given one.
 
-    Correlation lengths that are compared are ``lengths_mm``, by default that of the given noise.
+    Correlation lengths that are compared are ``lengths_mm``, by default the given one.
     """
-    grams = _Grams.of(problem.linearize(state), state)
+    normal_equations = _NormalEquations.of(problem.linearize(state), state)
     prior = Prior(problem.manifest, problem.layout)
     names = _free_parameters(problem)
     if not names:
-        return noise
-    best: tuple[float, Noise] | None = None
-    for length_mm in lengths_mm or (noise.length_mm,):
-        start = replace(noise if best is None else best[1], length_mm=length_mm)
+        return hyperparameters
+    best: tuple[float, Hyperparameters] | None = None
+    for length_mm in lengths_mm or (hyperparameters.correlation_length_mm,):
+        start = replace(
+            hyperparameters if best is None else best[1], correlation_length_mm=length_mm
+        )
 
-        def loss(logarithms: Array, names: list[str] = names, start: Noise = start) -> float:
+        def loss(
+            logarithms: Array, names: list[str] = names, start: Hyperparameters = start
+        ) -> float:
             try:
-                _, _, evidence = grams.posterior(prior, _with(start, names, logarithms))
+                _, _, evidence = normal_equations.posterior(prior, _with(start, names, logarithms))
             except LinAlgError:
                 return math.inf
             return -evidence
@@ -714,7 +722,7 @@ def fit_noise(
 
 
 def _free_parameters(problem: FloorProblem) -> list[str]:
-    """Return the names of the parameters of the noise that the observations may determine."""
+    """Return the names of the hyperparameters that the observations may determine."""
     names = ["seam"] if problem.seams else []
     if problem.truths:
         names.append("position_mm")
@@ -726,33 +734,42 @@ def _free_parameters(problem: FloorProblem) -> list[str]:
     return names
 
 
-def _get(noise: Noise, name: str) -> float:
+def _get(hyperparameters: Hyperparameters, name: str) -> float:
     if name.startswith("field"):
-        return noise.field_mm[1 if name == "field_y" else 0]
-    return float(getattr(noise, name))
+        return hyperparameters.field_sigma_mm[1 if name == "field_y" else 0]
+    return float(getattr(hyperparameters, name))
 
 
-def _with(noise: Noise, names: list[str], logarithms: Array) -> Noise:
-    """Return the noise with some parameters replaced by the exponentials of ``logarithms``."""
+def _with(hyperparameters: Hyperparameters, names: list[str], logarithms: Array) -> Hyperparameters:
+    """Return the hyperparameters with some replaced by the exponentials of ``logarithms``."""
     values = dict(zip(names, np.exp(np.clip(logarithms, -30, 30)).tolist(), strict=True))
-    x, y = (values.pop(name, noise.field_mm[k]) for k, name in enumerate(("field_x", "field_y")))
+    x, y = (
+        values.pop(name, hyperparameters.field_sigma_mm[k])
+        for k, name in enumerate(("field_x", "field_y"))
+    )
     both = values.pop("field", None)
     # Measurements are never better than their dots.
     if "seam" in values:
         values["seam"] = max(values["seam"], 1.0)
-    return replace(noise, **values, field_mm=(x, y) if both is None else (both, both))
+    return replace(
+        hyperparameters, **values, field_sigma_mm=(x, y) if both is None else (both, both)
+    )
 
 
 def _mean_squares(problem: FloorProblem, state: Array) -> dict[str, Array]:
     """Return the mean square of the residuals of each observation, by kind."""
     result = {}
     for kind, equations in problem.linearize(state).items():
-        count = np.bincount(equations.owner)
-        result[kind] = np.bincount(equations.owner, equations.residual**2) / np.maximum(count, 1)
+        count = np.bincount(equations.observation)
+        result[kind] = np.bincount(equations.observation, equations.residual**2) / np.maximum(
+            count, 1
+        )
     return result
 
 
-def fit_robustly(problem: FloorProblem, state: Array) -> tuple[FloorProblem, Array, Noise]:
+def fit_robustly(
+    problem: FloorProblem, state: Array
+) -> tuple[FloorProblem, Array, Hyperparameters]:
     """Fit without fields and reject gross outliers.
 
     Returns
@@ -760,45 +777,47 @@ def fit_robustly(problem: FloorProblem, state: Array) -> tuple[FloorProblem, Arr
     problem : FloorProblem
         Without outliers.
     state : (size,) ndarray
-    noise : Noise
+    hyperparameters : Hyperparameters
         Of the remaining residuals.
     """
     while True:
-        noise = Noise()
+        hyperparameters = Hyperparameters()
         for _ in range(MAX_STEPS):
             squares = _mean_squares(problem, state)
             scales = {
                 kind: max(SIGMA_PER_MEDIAN_ABSOLUTE * math.sqrt(float(np.median(each))), 1e-9)
                 for kind, each in squares.items()
             }
-            noise = Noise(
+            hyperparameters = Hyperparameters(
                 seam=max(scales.get(SEAM, 1.0), 1.0),
-                position_mm=scales.get(POSITION, noise.position_mm),
-                heading=scales.get(HEADING, noise.heading),
+                position_mm=scales.get(POSITION, hyperparameters.position_mm),
+                heading=scales.get(HEADING, hyperparameters.heading),
             )
             weights = {kind: 1 / (1 + each / scales[kind] ** 2) for kind, each in squares.items()}
             equations = {
                 kind: replace(
                     each,
-                    residual=each.residual * np.sqrt(weights[kind])[each.owner],
-                    jacobian=each.jacobian * np.sqrt(weights[kind])[each.owner, None],
+                    residual=each.residual * np.sqrt(weights[kind])[each.observation],
+                    jacobian=each.jacobian * np.sqrt(weights[kind])[each.observation, None],
                 )
                 for kind, each in problem.linearize(state).items()
             }
-            grams = _Grams.of(equations, state)
-            step, factor, _ = grams.posterior(Prior(problem.manifest, problem.layout), noise)
+            normal_equations = _NormalEquations.of(equations, state)
+            step, factor, _ = normal_equations.posterior(
+                Prior(problem.manifest, problem.layout), hyperparameters
+            )
             state = state + step
             if float(np.abs(factor.T @ step).max(initial=0)) < MAX_LAST_STEP_SIGMAS:
                 break
         squares = _mean_squares(problem, state)
         limits = {
-            SEAM: (GROSS_OUTLIER_SIGMAS * noise.seam) ** 2,
-            POSITION: (GROSS_OUTLIER_SIGMAS * noise.position_mm) ** 2,
-            HEADING: (GROSS_OUTLIER_SIGMAS * noise.heading) ** 2,
+            SEAM: (GROSS_OUTLIER_SIGMAS * hyperparameters.seam) ** 2,
+            POSITION: (GROSS_OUTLIER_SIGMAS * hyperparameters.position_mm) ** 2,
+            HEADING: (GROSS_OUTLIER_SIGMAS * hyperparameters.heading) ** 2,
         }
         kept = _keep(problem, {kind: each <= limits[kind] for kind, each in squares.items()})
         if kept is problem:
-            return problem, state, noise
+            return problem, state, hyperparameters
         problem = kept
 
 
@@ -820,23 +839,27 @@ def _keep(problem: FloorProblem, masks: dict[str, NDArray[np.bool_]]) -> FloorPr
 
 
 def fit_floor(problem: FloorProblem, state: Array) -> FloorFit:
-    """Estimate noise and unknowns; reject observations that contradict the others.
+    """Estimate hyperparameters and unknowns; reject observations that contradict the others.
 
     ``problem`` has fields, which are left out of the result unless there is strong evidence.
     """
     fields = problem.layout.nodes
     rigid = replace(problem, layout=replace(problem.layout, nodes={}))
-    rigid, state, noise = fit_robustly(rigid, state[: rigid.layout.size])
-    without = _fit_gated(rigid, state, noise)
+    rigid, state, hyperparameters = fit_robustly(rigid, state[: rigid.layout.size])
+    without = _fit_gated(rigid, state, hyperparameters)
     if not fields or _is_explained(without):
         return without
-    deviation = max(without.noise.position_mm, MIN_FIELD_MM) if problem.truths else MIN_FIELD_MM
-    noise = replace(without.noise, field_mm=(deviation, deviation))
+    deviation = (
+        max(without.hyperparameters.position_mm, MIN_FIELD_MM) if problem.truths else MIN_FIELD_MM
+    )
+    hyperparameters = replace(without.hyperparameters, field_sigma_mm=(deviation, deviation))
     layout = replace(problem.layout, nodes=fields)
     start = np.concatenate([without.state, np.zeros(layout.size - len(without.state))])
-    with_field = _fit_gated(replace(rigid, layout=layout), start, noise)
+    with_field = _fit_gated(replace(rigid, layout=layout), start, hyperparameters)
     same = replace(with_field.problem, layout=without.problem.layout)
-    reference = fit_state(same, without.state, fit_noise(same, without.state, without.noise))
+    reference = fit_state(
+        same, without.state, fit_hyperparameters(same, without.state, without.hyperparameters)
+    )
     gain = with_field.log_evidence - reference.log_evidence
     return with_field if gain > MIN_FIELD_EVIDENCE else without
 
@@ -852,25 +875,25 @@ def _is_explained(fit: FloorFit) -> bool:
     return excess < MAX_EXCESS_SIGMAS * math.sqrt(2 / len(residual))
 
 
-def _fit_gated(problem: FloorProblem, state: Array, noise: Noise) -> FloorFit:
-    """Fit noise and unknowns in turn, and reject improbable observations."""
+def _fit_gated(problem: FloorProblem, state: Array, hyperparameters: Hyperparameters) -> FloorFit:
+    """Fit hyperparameters and unknowns in turn, and reject improbable observations."""
     lengths_mm = CORRELATION_LENGTHS_MM if problem.layout.nodes else None
     for _ in range(MAX_GATING_ROUNDS):
-        noise = fit_noise(problem, state, noise, lengths_mm)
+        hyperparameters = fit_hyperparameters(problem, state, hyperparameters, lengths_mm)
         lengths_mm = None
-        fit = fit_state(problem, state, noise)
+        fit = fit_state(problem, state, hyperparameters)
         state = fit.state
         masks = {}
         for kind, equations in problem.linearize(state).items():
-            weight = _Grams.of({kind: equations}, state).weight(kind, noise)
-            squares = weight * np.bincount(equations.owner, equations.residual**2)
-            freedom = np.bincount(equations.owner)
+            weight = _NormalEquations.of({kind: equations}, state).weight(kind, hyperparameters)
+            squares = weight * np.bincount(equations.observation, equations.residual**2)
+            freedom = np.bincount(equations.observation)
             masks[kind] = squares <= chdtri(np.maximum(freedom, 1), OUTLIER_PROBABILITY)
         kept = _keep(problem, masks)
         if kept is problem:
             return fit
         problem = kept
-    return fit_state(problem, state, noise)
+    return fit_state(problem, state, hyperparameters)
 
 
 # ---- validation
@@ -880,12 +903,14 @@ def cross_validate(fit: FloorFit) -> tuple[float, float]:
     """Return the rms errors [mm] of held-out poses with truth, without fields and with them.
 
     Each of :data:`FOLDS` successive parts of the recordings is left out once. The fits without
-    fields have noise of their own.
+    fields have hyperparameters of their own.
     """
     problem = fit.problem
     rigid = replace(problem, layout=replace(problem.layout, nodes={}))
     start = fit.state[: rigid.layout.size]
-    rigid_noise = fit_noise(rigid, fit_state(rigid, start, fit.noise).state, fit.noise)
+    rigid_hyperparameters = fit_hyperparameters(
+        rigid, fit_state(rigid, start, fit.hyperparameters).state, fit.hyperparameters
+    )
     squares = []
     for fold in range(FOLDS):
         masks = [_part_of(problem, truth, fold) for truth in problem.truths]
@@ -900,8 +925,11 @@ def cross_validate(fit: FloorFit) -> tuple[float, float]:
         if not held_out or not training:
             continue
         errors = []
-        for each, state, noise in ((rigid, start, rigid_noise), (problem, fit.state, fit.noise)):
-            trained = fit_state(replace(each, truths=training), state, noise)
+        for each, state, hyperparameters in (
+            (rigid, start, rigid_hyperparameters),
+            (problem, fit.state, fit.hyperparameters),
+        ):
+            trained = fit_state(replace(each, truths=training), state, hyperparameters)
             tested = replace(each, seams=(), truths=held_out).linearize(trained.state)
             errors.append(tested[POSITION].residual.reshape(-1, 2))
         squares.append(np.square(errors).sum(axis=2))

@@ -145,13 +145,13 @@ def _in_datum(
     """Return a pose in the frame in which the datum sheet has the pose ``datum``."""
     angle = datum[2] - datum_pose[2]
     rotation = rotation_matrix_2d(angle)
-    lever = rotation @ (pose[:2] - datum_pose[:2])
-    by_angle = np.array([-lever[1], lever[0]])
+    offset = rotation @ (pose[:2] - datum_pose[:2])
+    by_angle = np.array([-offset[1], offset[0]])
     derivative = np.empty_like(by_unknowns)
     derivative[:2] = rotation @ (by_unknowns[:2] - datum_by_unknowns[:2])
     derivative[:2] -= by_angle[:, None] * datum_by_unknowns[2]
     derivative[2] = by_unknowns[2] - datum_by_unknowns[2]
-    return np.append(datum[:2] + lever, wrap_angle(pose[2] + angle)), derivative
+    return np.append(datum[:2] + offset, wrap_angle(pose[2] + angle)), derivative
 
 
 def _distortion(
@@ -197,9 +197,12 @@ def _mean_variance(fit: FloorFit, number: int, covariance: Array) -> Array:
     ]
     resolved = [np.einsum("ni,ij,nj->n", row, covariance, row).mean() for row in rows]
     value, by_x, by_y = unresolved_variance(
-        node_positions(manifest, number, nodes), points, weights, fit.noise.length_mm
+        node_positions(manifest, number, nodes),
+        points,
+        weights,
+        fit.hyperparameters.correlation_length_mm,
     )
-    x, y = np.square(fit.noise.field_mm)
+    x, y = np.square(fit.hyperparameters.field_sigma_mm)
     return np.array(resolved) + [value * x, value * y, (by_x * y + by_y * x) / 4]
 
 

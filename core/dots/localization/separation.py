@@ -50,8 +50,8 @@ MIN_SHEET_DOTS = 20
 lattice by chance in 4 % of the cases (the square of twice the gate), seven in a frame of 180."""
 
 MIN_EXCLUSIVE_DOTS = 7
-"""Least number of dots that no other sheet has. A dot at random has the right symbol in a quarter
-of the cases: odds of 16,000, as :data:`MIN_LOG_ODDS` requires."""
+"""Least number of dots of a view that no other sheet has. A dot at random has the right symbol in a
+quarter of the cases: odds of 16,000, as :data:`MIN_LOG_ODDS` requires."""
 
 NEIGHBOURS = 8
 """Number of nearest dots that decide to which sheet the surroundings of a dot belong."""
@@ -135,7 +135,8 @@ def separate_sheets(
     """Return the dots of each sheet that a frame (h, w) shows, most dots first.
 
     Empty if no sheet is decoded. A dot that is printed on several sheets (the overlap of tiles) is
-    one of each that predicts it; a sheet with no other dots is left out.
+    one of each that predicts it; without other dots, it is not known of which one, and there is no
+    view.
     """
     first = _first_view(image, manifest, code, camera)
     frame = None if first is None else _rectify(image, first, manifest, code, camera)
@@ -152,9 +153,8 @@ def separate_sheets(
         pose = None
         if frame.is_unassigned.sum() >= MIN_SHEET_DOTS:
             pose = frame.match_neighbour(visible) or frame.decode_rest(image, visible)
-    # The first one is the reference of the others, even if the frame does not show whose dots they
-    # are.
-    views = [view for view in views if _is_of_one_sheet(view, manifest)]
+    # The first one was the reference of the others, even if it is not known whose dots these are.
+    views = _without_ambiguous_views(views, manifest)
     return sorted(views, key=lambda view: -len(view.pixels))
 
 
@@ -197,10 +197,20 @@ def view_of_sheet(dots: DotCorrespondences, manifest: Manifest) -> SheetView | N
     return SheetView(number, dots.pixels[is_own], grid[is_own])
 
 
-def _is_of_one_sheet(view: SheetView, manifest: Manifest) -> bool:
-    """Return whether a view has dots that no other sheet has."""
-    is_member = manifest.contains(view.grid, manifest.sheets[view.number].section)
-    return int((is_member.sum(axis=0) == 1).sum()) >= MIN_EXCLUSIVE_DOTS
+def _without_ambiguous_views(views: list[SheetView], manifest: Manifest) -> list[SheetView]:
+    """Leave out views whose dots may be those of another sheet.
+
+    A sheet that the frame shows elsewhere is no alternative: a lattice displaced from its own is
+    that of another sheet.
+    """
+    is_member = [manifest.contains(v.grid, manifest.sheets[v.number].section) for v in views]
+    certain: set[int] = set()
+    for _ in views:
+        for view, member in zip(views, is_member, strict=True):
+            others = np.delete(member, [*(certain | {view.number})], axis=0)
+            if (~others.any(axis=0)).sum() >= MIN_EXCLUSIVE_DOTS:
+                certain.add(view.number)
+    return [view for view in views if view.number in certain]
 
 
 def _halves(image: Image) -> Iterator[Image]:
@@ -342,12 +352,12 @@ class _RectifiedFrame:
         rivals = np.logaddexp(
             np.logaddexp.reduce(np.delete(stacked.ravel(), best)), math.log(stacked.size)
         )
-        log_odds = float(stacked.flat[best] - rivals)
-        if log_odds < MIN_LOG_ODDS:
+        lead = float(stacked.flat[best] - rivals)
+        if lead < MIN_LOG_ODDS:
             return None
         candidate, row, column = np.unravel_index(best, stacked.shape)
         number, axes, shift = candidates[int(candidate)]
-        return _SheetPose(number, axes, shift + [column, row], float(expit(log_odds)))
+        return _SheetPose(number, axes, shift + [column, row], float(expit(lead)))
 
     def _nominal_positions(self, number: int, plane: Array) -> Array:
         """Return the grid positions on another sheet at points of the plane, by the manifest."""
@@ -404,7 +414,7 @@ def lattice_of(homography: Array, points: Array, *, lens: bool) -> DotLattices:
     )
     lattice = project_lattices(unscaled, parameters, points[None])
     offset = lattice.uv - lattice.nodes
-    lattice.sigma[:] = robust_sigma(offset - nearest_symbol_offset(offset))
+    lattice.sigma[:] = robust_sigma(np.asarray(offset - nearest_symbol_offset(offset), float))
     return lattice
 
 
@@ -453,7 +463,7 @@ def _rectify(
 
 def _near_median(positions: Array) -> NDArray[np.bool_]:
     """Return which positions (n, 2) are finite and within the area that is compared."""
-    is_finite = np.isfinite(positions).all(axis=1)
+    is_finite = np.asarray(np.isfinite(positions).all(axis=1))
     if not is_finite.any():
         return is_finite
     with np.errstate(invalid="ignore"):

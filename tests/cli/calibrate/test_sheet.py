@@ -6,10 +6,13 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from locatk.core.dots.calibration import floor as module
+from locatk.core.dots.calibration.floor import FloorReport
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.simulation import session as simulate
@@ -150,6 +153,39 @@ def test_one_truth_stands_in_for_seams(locatk, tmp_path: Path) -> None:
     assert "poses, scale of the print" in result.stdout
 
 
+@pytest.mark.slow
+def test_unplaced_sheets_and_rejected_frames_end_with_status_3(
+    locatk, seam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spare = Sheet("spare", (9000, 2000), SIZE, (0, 0), PAGE, FIRST)
+    left, right = DESIGN.sheets
+    floor = replace(
+        DESIGN, sheets=(replace(left, position_mm=None), replace(right, position_mm=None), spare)
+    )
+    artifact, out = tmp_path / "floor.toml", tmp_path / "built.toml"
+    sheets.write_manifest(artifact, floor)
+    arguments = ("calibrate", "sheet", seam, "--artifact", artifact, "-o", out, "--json")
+    reports: list[FloorReport] = []
+    calibrate_floor = module.calibrate_floor
+
+    def calibrate(*given: Any) -> FloorReport:
+        reports.append(calibrate_floor(*given))
+        return reports[0]
+
+    monkeypatch.setattr(module, "calibrate_floor", calibrate)
+    result = locatk(*arguments)
+    assert result.exit_code == 3, result.stderr
+    assert "Incomplete: without a position: spare" in result.stderr
+    assert json.loads(result.stdout)["unplaced"] == ["spare"]
+    assert sheets.read_manifest(out).sheets[2].position_mm is None
+
+    rejected = replace(reports[0], rejected=2, unplaced=())
+    monkeypatch.setattr(module, "calibrate_floor", lambda *_: rejected)
+    result = locatk(*arguments, "--overwrite")
+    assert result.exit_code == 3
+    assert "Incomplete: rejected: 2 frames that contradict the others" in result.stderr
+
+
 def test_usage_errors(locatk, seam: Path, beside: Path, tmp_path: Path) -> None:
     out = tmp_path / "built.toml"
     out.write_text("kept")
@@ -160,6 +196,13 @@ def test_usage_errors(locatk, seam: Path, beside: Path, tmp_path: Path) -> None:
     result = locatk("calibrate", "sheet", seam, beside, "-o", new, *three)
     assert result.exit_code == 2
     assert "3 files for 2 sessions" in result.stderr
+    result = locatk("calibrate", "sheet", seam, "-o", tmp_path / "built.pdf")
+    assert result.exit_code == 2
+    assert "end it in .toml" in result.stderr
+    for number in ("nan", "inf"):
+        result = locatk("calibrate", "sheet", seam, "-o", new, "--offset", number)
+        assert result.exit_code == 2
+        assert "is not a finite number" in result.stderr
 
 
 @pytest.mark.slow

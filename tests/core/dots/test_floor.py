@@ -17,7 +17,7 @@ from locatk.core.dots.calibration.floor_fit import (
     FieldWeights,
     FloorFit,
     FloorProblem,
-    Noise,
+    Hyperparameters,
     TruthObservations,
     cross_validate,
     fit_floor,
@@ -362,7 +362,9 @@ def test_a_good_print_gets_no_map() -> None:
     assert not fit.problem.layout.nodes
     assert all(sheet.distortion is None for sheet in build_sheets(fit))
     # 0.02 mm, and the error of the heading of the body (0.001 rad) times the lever of 30 mm.
-    assert fit.noise.position_mm == pytest.approx(math.hypot(0.02, 0.03 / math.sqrt(2)), rel=0.2)
+    assert fit.hyperparameters.position_mm == pytest.approx(
+        math.hypot(0.02, 0.03 / math.sqrt(2)), rel=0.2
+    )
 
 
 def test_maps_that_cannot_be_renewed_are_named() -> None:
@@ -419,13 +421,15 @@ def test_poses_in_the_frame_of_the_datum_have_the_covariance_of_their_derivative
     root = rng.normal(0, 1e-4, (layout.size, 8))
 
     def pose(at: Array) -> Array:
-        fit = FloorFit(problem, at, root @ root.T, Noise(), 0.0)
+        fit = FloorFit(problem, at, root @ root.T, Hyperparameters(), 0.0)
         return build_sheets(fit)[1].pose
 
     steps = 1e-4 * root / np.abs(root).max()
     moved = np.array([pose(state + step) - pose(state - step) for step in steps.T]) / 2
     moved *= np.abs(root).max() / 1e-4
-    covariance = build_sheets(FloorFit(problem, state, root @ root.T, Noise(), 0.0))[1].covariance
+    covariance = build_sheets(FloorFit(problem, state, root @ root.T, Hyperparameters(), 0.0))[
+        1
+    ].covariance
     # Without products of the heading and the shift by the field, which are 1e-2 of the latter.
     sigma = np.sqrt(np.diag(covariance))
     scale = np.outer(sigma, sigma)
@@ -450,7 +454,7 @@ def test_large_floors_have_coarser_fields() -> None:
         assert layout.size <= 2000
         sizes[count] = layout.nodes.get(0)
         unknowns = [layout.field(number).ravel() for number in layout.nodes]
-        assert sum(map(len, unknowns)) == layout.size - layout.rigid
+        assert sum(map(len, unknowns)) == layout.size - layout.rigid_size
         assert len(np.unique(np.concatenate([*unknowns, [0]]))) == 1 + sum(map(len, unknowns))
     assert sizes == {4: (5, 6), 6: (4, 5), 7: None, 10: None}
 

@@ -16,14 +16,24 @@ from locatk.core.dots.calibration.seam_measurements import (
     add_systematic_errors,
     crop_overlaps,
     measure_seam,
+    refuse_contained_tiles,
     without_ambiguous_dots,
 )
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.localization.separation import SheetView, separate_sheets
+from locatk.core.dots.localization import separation
+from locatk.core.dots.localization.frames import (
+    LOW_CONFIDENCE,
+    NO_GRID,
+    dot_correspondences,
+    localize_frames,
+)
+from locatk.core.dots.localization.seams import localize_view
+from locatk.core.dots.localization.separation import SheetView, separate_sheets, view_of_sheet
 from locatk.core.dots.sheet import Manifest, Sheet
 from locatk.core.dots.solver import SolveOptions, solve
+from locatk.core.errors import InputError
 
 PITCH_MM = 0.508
 ANOTO = codec("anoto")
@@ -256,3 +266,152 @@ def test_tiles_below_each_other_are_cut_along_their_rows() -> None:
     cut = crop_overlaps(Manifest((*TILES.sheets, below, corner)), []).sheets
     assert [sheet.size for sheet in cut] == [(365, 535)] * 4
     assert cut[3].origin == (1365, 2535)
+
+
+def test_a_tile_inside_of_another_cuts_nothing() -> None:
+    inner = replace(TILES.sheets[0], id="inner", origin=(1100, 2000), size=(100, 540))
+    manifest = Manifest((TILES.sheets[0], inner))
+    assert crop_overlaps(manifest, []) == manifest
+    with pytest.raises(InputError, match="tile inner is inside of that of left"):
+        refuse_contained_tiles(manifest)
+    refuse_contained_tiles(TILES)
+
+
+# ---- one estimator of poses
+
+
+@pytest.mark.parametrize("camera", [CAMERA, None], ids=["camera", "no camera"])
+def test_a_view_has_the_pose_of_its_frame(
+    lay: Callable[..., Any], shoot_floor: Callable[..., Any], camera: Camera | None
+) -> None:
+    """One sheet is in view: pose, covariance, dots and confidence are those of any frame."""
+    image = shoot_floor(
+        lay(1.3, -0.8, 0.5), 60.0, 150.0, heading=2.4, tilt=0.3, towards=1.0, missing=0.1
+    )
+    expected = localize_frames(image[None], ANOTO, camera, other_codec_odds=0)
+    (dots,) = dot_correspondences(image[None], ANOTO, camera, other_codec_odds=0)
+    view = view_of_sheet(dots, TILES)
+    assert view is not None
+    pose = localize_view(view, image.shape, TILES, ANOTO, camera)
+    sigma = np.sqrt(np.einsum("ii->i", expected.covariance[0]))
+    error = np.append(pose.grid[0] - expected.grid[0], pose.heading[0] - expected.heading[0])
+    assert np.abs(error / sigma).max() < 0.1
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(pose.covariance[0] / scale, expected.covariance[0] / scale, atol=0.1)
+    assert pose.dots[0] == expected.dots[0]
+    assert pose.confidence[0] == pytest.approx(expected.confidence[0])
+    assert pose.accepted.all()
+
+
+def test_wrong_bits_and_confidence_are_those_of_the_decoded_dots(shot: Callable[..., Any]) -> None:
+    first = shot(at=(1180.0, 2270.0))
+    symbols = ANOTO.symbols(first.corner, (2 * first.reach + 1,) * 2, (0, 0))
+    middle = first.reach
+    symbols[middle - 2, middle + 1] ^= 3
+    symbols[middle + 1, middle - 1] ^= 1
+    image = replace(first, symbols=symbols).take()
+    (view,) = separate_sheets(image, TILES, ANOTO, CAMERA)
+    pose = localize_view(view, image.shape, TILES, ANOTO, CAMERA)
+    assert pose.corrected[0] == 3
+    assert pose.grid[0] == pytest.approx(first.at, abs=0.01)
+    assert pose.confidence[0] > 1 - 1e-9
+    # Too few dots to decode them: the confidence is that with which they were found.
+    few = np.hypot(*(view.grid - first.at).T) < 2.5
+    part = SheetView(0, view.pixels[few], view.grid[few], confidence=0.99991)
+    assert 12 < few.sum() < 25
+    pose = localize_view(part, image.shape, TILES, ANOTO, CAMERA)
+    assert pose.confidence[0] == 0.99991
+    assert pose.corrected[0] == 0
+    # Dots that are decoded to another position refute the one that they were found at.
+    shifted = replace(view, grid=view.grid + [7.0, 0.0])
+    pose = localize_view(shifted, image.shape, TILES, ANOTO, CAMERA)
+    assert pose.rejected[0] == LOW_CONFIDENCE
+    assert pose.confidence[0] == 0
+
+
+def test_collinear_dots_determine_no_pose() -> None:
+    grid = np.stack([np.full(30, 1180.0), np.arange(2200.0, 2230.0)], axis=1)
+    views = [
+        SheetView(0, (grid - grid[0]) * 3 + 20, grid),
+        SheetView(1, (grid - grid[0]) * 3 + [26, 20], grid + [300, 0]),
+    ]
+    pose = localize_view(views[0], (120, 188), TILES, ANOTO, CAMERA)
+    assert pose.rejected[0] == NO_GRID
+    assert measure_seam(views, TILES, CAMERA) is None
+
+
+@pytest.mark.slow
+def test_poses_at_seams_of_tilted_frames(
+    lay: Callable[..., Any], shoot_floor: Callable[..., Any]
+) -> None:
+    """The images of large dots are displaced; without the correction the mean is 2.7."""
+    sheets = lay(0.1, 0.05, 0.1)
+    rng = np.random.default_rng(8)
+    normalized = []
+    for k in range(18):
+        spot = complex(CUT_MM + rng.uniform(-3, 3), rng.uniform(40, 260))
+        heading, towards = rng.uniform(-math.pi, math.pi, 2)
+        image = shoot_floor(
+            sheets, spot.real, spot.imag, heading=heading, tilt=0.35, towards=towards, seed=k
+        )
+        views = separate_sheets(image, TILES, ANOTO, CAMERA)
+        if len(views) == 2:
+            pose = localize_view(views[0], image.shape, TILES, ANOTO, CAMERA)
+            error = pose.grid[0] - grid_of(sheets[views[0].number], spot)
+            normalized.append(error @ np.linalg.solve(pose.covariance[0, :2, :2], error) / 2)
+    assert len(normalized) >= 12
+    assert 0.3 < np.mean(normalized) < 2
+
+
+# ---- hostile positions
+
+
+def test_specks_anywhere_do_not_matter(
+    lay: Callable[..., Any], cross: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tilt and lens map a pixel far outside to any position, or to none."""
+    ((image, _, _),) = cross(lay(1.3, -0.8, 0.5), 1, 1, width_mm=0.2)
+    expected = separate_sheets(image, TILES, ANOTO, CAMERA)
+    assert len(expected) == 2
+    apply = separation.apply_homography
+
+    def apply_with_specks(homography: Any, points: Any) -> Any:
+        result = apply(homography, points)
+        result[-3:] = [[1e12, 1e12], [np.nan, 1.0], [-3000.0, 5.0]]
+        return result
+
+    monkeypatch.setattr(separation, "apply_homography", apply_with_specks)
+    views = separate_sheets(image, TILES, ANOTO, CAMERA)
+    assert [view.number for view in views] == [view.number for view in expected]
+    for view, other in zip(views, expected, strict=True):
+        assert 0 <= len(other.pixels) - len(view.pixels) <= 3
+
+
+# ---- overlaps of several tiles
+
+
+@pytest.mark.parametrize("order", ["upper first", "lower first"])
+@pytest.mark.parametrize("row", [262, 270], ids=["near the upper end", "in the middle"])
+def test_dots_that_two_tiles_have_are_of_neither(
+    laid_sheet: Callable[..., Any], shoot_floor: Callable[..., Any], order: str, row: int
+) -> None:
+    """Next to the left tile is the overlap of two others, of which the lower one is on top."""
+    size = (370, 290)
+    left = TILES.sheets[0]
+    upper = Sheet("upper", (1360, 2000), size, (0, 0), PAGE, FIRST, (STEP_MM, 0.0))
+    lower = Sheet("lower", (1360, 2250), size, (0, 0), PAGE, FIRST, (STEP_MM, -250 * PITCH_MM))
+    rest = (upper, lower) if order == "upper first" else (lower, upper)
+    seam_y = PAGE[1] - FIRST[1] - 254 * PITCH_MM
+    x = CUT_MM - STEP_MM
+    floor = (
+        laid_sheet(left.origin, SIZE, PAGE, FIRST, visible=(0, 0, CUT_MM, PAGE[1])),
+        laid_sheet(upper.origin, size, PAGE, FIRST, STEP_MM - 0.5, 0.4, visible=(x, seam_y, *PAGE)),
+        laid_sheet(
+            *(lower.origin, size, PAGE, FIRST, STEP_MM + 0.6, 0.3 - 250 * PITCH_MM, 0.2),
+            visible=(x, 0, PAGE[0], PAGE[1] - FIRST[1] + 3 * PITCH_MM),
+        ),
+    )
+    image = shoot_floor(floor, CUT_MM, PAGE[1] - FIRST[1] - row * PITCH_MM, heading=0.2, seed=1)
+    (view,) = separate_sheets(image, Manifest((left, *rest)), ANOTO, CAMERA)
+    assert view.number == 0
+    assert len(view.pixels) > 60
