@@ -115,6 +115,7 @@ def test_a_log_becomes_a_session(locatk, tmp_path: Path) -> None:
         "devices": ["robot"],
         "odometry_poses": 40,
         "left_out": 0,
+        "left_out_poses": 0,
         "warnings": [],
     }
     session = Session.open(out)
