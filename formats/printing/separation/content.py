@@ -20,9 +20,10 @@ import numpy as np
 import pikepdf
 from pikepdf import Array, Dictionary, Name, Operator, Pdf, PdfInlineImage, Stream
 
-from locatk.formats.printing.separation import colours, images
+from locatk.formats.printing.separation import colours, images, instructions
 from locatk.formats.printing.separation.colours import ColourSpace
 from locatk.formats.printing.separation.images import NotConvertible
+from locatk.formats.printing.separation.instructions import INLINE_IMAGE
 
 DAMAGE_ERRORS = (
     pikepdf.PdfError,
@@ -56,6 +57,13 @@ DEVICE_OPERATORS = {"g": colours.GREY, "rg": colours.RGB, "k": colours.CMYK}
 """Operators that set colour and space; in upper case for lines."""
 
 COLOUR_OPERATORS = {"sc", "scn", "SC", "SCN"}
+
+
+Instruction = tuple[Sequence[Any], Operator]
+"""Operands and operator."""
+
+BLOCK_INSTRUCTIONS = 10_000
+"""Instructions that are in memory at the same time."""
 
 
 def rewrite_colours(
@@ -92,19 +100,20 @@ def rewrite_colours(
     current: list[CurrentSpace] = [colours.GREY if starts else INHERITED] * 2
     stack: list[list[CurrentSpace]] = []
     paint = _Paint()
-    out: list[Any] = []
-    instruction: Any
-    for instruction in pikepdf.parse_content_stream(stream):
-        operator = str(instruction.operator)
+    out: list[Instruction] = []
+    done: list[bytes] = []
+
+    def convert(operator: str, operands: list[Any]) -> None:
+        instruction: Instruction = (operands, Operator(operator))
         if operator == "q":
             stack.append(current.copy())
-        elif operator == "Q":
-            current = stack.pop() if stack else current
+        elif operator == "Q" and stack:
+            current[:] = stack.pop()
         elif operator.lower() in DEVICE_OPERATORS:
             current[operator.isupper()] = DEVICE_OPERATORS[operator.lower()]
             instruction = _converted(instruction, DEVICE_OPERATORS[operator.lower()], paint, left)
         elif operator in ("cs", "CS"):
-            name = instruction.operands[0] if len(instruction.operands) else None
+            name = operands[0] if operands else None
             space = look_up(name) if isinstance(name, Name) else None
             if isinstance(space, pikepdf.Array):
                 space = PatternSpace(base(space[1]) if len(space) > 1 else None)
@@ -113,10 +122,15 @@ def rewrite_colours(
                 instruction = paint(space, space.initial, operator)
         elif operator in COLOUR_OPERATORS:
             instruction = _converted(instruction, current[operator.isupper()], paint, left)
-        elif operator == "INLINE IMAGE" and not instruction.iimage.image_mask:
-            instruction = ([inline(instruction.iimage)], Operator("Do"))
+        elif operator == INLINE_IMAGE and not operands[0].image_mask:
+            instruction = ([inline(operands[0])], Operator("Do"))
         out.append(instruction)
-    return pikepdf.unparse_content_stream(out)
+        if len(out) == BLOCK_INSTRUCTIONS:
+            done.append(pikepdf.unparse_content_stream(out))
+            out.clear()
+
+    instructions.follow(stream, convert)
+    return b"\n".join([*done, pikepdf.unparse_content_stream(out)])
 
 
 class _Paint:
@@ -133,16 +147,16 @@ class _Paint:
             self._cache[key] = tuple(Decimal(f"{value:.4g}") for value in (*cmy, 0.0))
         return self._cache[key]
 
-    def __call__(
-        self, space: ColourSpace, values: tuple[float, ...], operator: str
-    ) -> tuple[Sequence[Any], Operator]:
+    def __call__(self, space: ColourSpace, values: tuple[float, ...], operator: str) -> Instruction:
         return self.numbers(space, values), Operator("K" if operator.isupper() else "k")
 
 
-def _converted(instruction: Any, current: CurrentSpace, paint: _Paint, left: Counter[str]) -> Any:
+def _converted(
+    instruction: Instruction, current: CurrentSpace, paint: _Paint, left: Counter[str]
+) -> Instruction:
     """Return the instruction that sets the same colour without black."""
-    operator = str(instruction.operator)
-    operands = list(instruction.operands)
+    operator = str(instruction[1])
+    operands = list(instruction[0])
     pattern = operands.pop() if operands and isinstance(operands[-1], Name) else None
     if pattern is not None and not operands:
         return instruction  # a pattern with colours of its own

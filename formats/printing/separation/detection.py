@@ -15,10 +15,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pikepdf
 from pikepdf import Array, Dictionary, Matrix, Name, Pdf, PdfImage, Rectangle, Stream
 
-from locatk.formats.printing.separation import colours
+from locatk.formats.printing.separation import colours, instructions
 from locatk.formats.printing.separation.colours import ColourSpace, numbers
 from locatk.formats.printing.separation.content import (
     COLOUR_OPERATORS,
@@ -26,6 +25,7 @@ from locatk.formats.printing.separation.content import (
     DEVICE_OPERATORS,
 )
 from locatk.formats.printing.separation.images import BLOCK_PIXELS, inline_stream, read_values
+from locatk.formats.printing.separation.instructions import INLINE_IMAGE
 
 MIN_BLACK = 1 / 36
 """Amount of black ink that covers as much paper as dots of 1/6 pitch do: (1/6)^2.
@@ -54,6 +54,12 @@ FILLED_TEXT, STROKED_TEXT, INVISIBLE_TEXT = {0, 2, 4, 6}, {1, 2, 5, 6}, 3
 
 MAX_IMAGE_PIXELS = 50_000_000
 """Largest image that is decoded, in 0.4 GB; larger ones count as black."""
+
+MAX_INSTRUCTIONS = 2_000_000
+"""Most instructions of a document that are examined, in about 10 s.
+
+A vector map of 11 MB has about 0.3 million.
+"""
 
 SHADING_STEPS = 64
 """Colours of a shading that are examined."""
@@ -104,11 +110,13 @@ class BlackFinder:
     """Finds out if content of one document is printed with black ink.
 
     Damaged objects and spot colours of an unknown composition count as not black. Images and
-    shadings that cannot be decoded count as black.
+    shadings that cannot be decoded, forms that are nested too deeply, and all that follows the
+    first :data:`MAX_INSTRUCTIONS` count as black.
     """
 
     def __init__(self, pdf: Pdf) -> None:
         self._found: dict[tuple[Any, ...], bool] = {}
+        self._instructions = 0
         try:
             self._hidden_layers = frozenset(_hidden_layers(pdf))
         except DAMAGE_ERRORS:
@@ -126,6 +134,8 @@ class BlackFinder:
             self._found[*key, item.objgen] = False  # until it is known: it may contain itself
         try:
             is_black = find()
+        except RecursionError:
+            is_black = True
         except DAMAGE_ERRORS:
             is_black = False
         if item.is_indirect:
@@ -142,6 +152,11 @@ class BlackFinder:
         find = lambda: _Walk(self, resources, initial, area).is_black(stream)  # noqa: E731
         key = ("content", *initial.black, *initial.visible, area and area.to_bbox())
         return self._once(key, stream, find)
+
+    def count_instruction(self) -> bool:
+        """Count an instruction; return True if there are too many to examine."""
+        self._instructions += 1
+        return self._instructions > MAX_INSTRUCTIONS
 
     def is_hidden(self, layer: Any) -> bool:
         """Return True if a layer (optional content group or membership) is not printed."""
@@ -235,16 +250,16 @@ class _Walk:
 
     def is_black(self, stream: Stream) -> bool:
         """Return True at the first black operator."""
-        with warnings.catch_warnings():
-            # Content that ends early is drawn up to there.
-            warnings.simplefilter("ignore", UserWarning)
-            instructions: Any = pikepdf.parse_content_stream(stream)
-        return any(self._follow(str(item.operator), item.operands) for item in instructions)
+        return instructions.follow(stream, self._follow)
 
     def _follow(self, operator: str, operands: Any) -> bool:
         """Return True if the operator paints in black; viewers ignore those that are damaged."""
+        if self._finder.count_instruction():
+            return True
         try:
             return self._paints_black(operator, operands)
+        except RecursionError:
+            return True
         except DAMAGE_ERRORS:
             return False
 
@@ -306,7 +321,7 @@ class _Walk:
                 and state.visible[0]
                 and self._finder.shading(item, self._resources)
             )
-        if operator == "INLINE IMAGE":
+        if operator == INLINE_IMAGE:
             if not state.visible[0] or _is_outside(UNIT_SQUARE, state.matrix, self._area):
                 return False
             image = operands[0]

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import io
 import shutil
+import tracemalloc
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import pikepdf
 import pypdfium2
 import pytest
-from pikepdf import Array, Dictionary, Name, Pdf
+from pikepdf import Array, Dictionary, Name, Pdf, Rectangle
 
 from locatk.formats.benchmarks.dots.rasterisers import rasterise_inks
 from locatk.formats.printing.overlay import overlay
+from locatk.formats.printing.separation import detection
+from locatk.formats.printing.separation.content import rewrite_colours
 from locatk.formats.printing.separation.detection import BlackFinder
 
 SIZE = 72.0
@@ -376,7 +380,7 @@ def test_nested_and_recursive_forms_end(tmp_path: Path) -> None:
     page.Resources = Dictionary(XObject=Dictionary(Inner=inner))
     page.Contents = pdf.make_stream(b"/Inner Do")
     (tmp_path / "in.pdf").write_bytes(bytes_of(pdf))
-    assert overlay(tmp_path / "in.pdf", stamp(1), strip_black=False).black_pages == 0
+    assert overlay(tmp_path / "in.pdf", stamp(1), strip_black=False).black_pages == 1
     assert overlay(tmp_path / "in.pdf", stamp(1), strip_black=True).left_black != {}
 
 
@@ -389,3 +393,49 @@ def test_huge_images_are_not_decoded(tmp_path: Path) -> None:
     page.Contents = pdf.make_stream(b"q 9 0 0 9 0 0 cm /I Do Q")
     (tmp_path / "in.pdf").write_bytes(bytes_of(pdf))
     assert overlay(tmp_path / "in.pdf", stamp(1), strip_black=False).black_pages == 1
+
+
+def form(pdf: Pdf, content: bytes, **objects: pikepdf.Object) -> pikepdf.Object:
+    made = pdf.make_stream(content)
+    made.Type, made.Subtype, made.BBox = Name.XObject, Name.Form, Array([0, 0, 9, 9])
+    made.Resources = Dictionary(XObject=Dictionary(**objects))
+    return pdf.make_indirect(made)
+
+
+PAGE = Rectangle(0, 0, 100, 100)
+
+
+def test_forms_that_are_nested_too_deeply_count_as_black() -> None:
+    pdf = Pdf.new()
+    nested = form(pdf, b"")
+    for _ in range(10):
+        nested = form(pdf, b"/Inner Do", Inner=nested)
+    assert not BlackFinder(pdf).is_black(nested, PAGE)
+    for _ in range(1000):
+        nested = form(pdf, b"/Inner Do", Inner=nested)
+    assert BlackFinder(pdf).is_black(nested, PAGE)
+
+
+def test_the_search_ends_at_black_and_after_many_instructions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pdf = Pdf.new()
+    monkeypatch.setattr(detection, "MAX_INSTRUCTIONS", 100)
+    assert not BlackFinder(pdf).is_black(form(pdf, b"q Q " * 50), PAGE)
+    assert BlackFinder(pdf).is_black(form(pdf, b"q Q " * 51), PAGE)
+    finder = BlackFinder(pdf)
+    assert finder.is_black(form(pdf, b"0 g 0 0 9 9 re f " + b"q Q " * 1000), PAGE)
+    assert finder._instructions == 3
+
+
+def test_compressed_content_takes_little_memory() -> None:
+    pdf = Pdf.new()
+    content = form(pdf, b"q Q " * 30_000)
+    tracemalloc.start()
+    assert not BlackFinder(pdf).is_black(content, PAGE)
+    converted = rewrite_colours(content, lambda _: None, lambda _: None, lambda _: Name.I,
+                                Counter(), starts=True)  # fmt: skip
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert converted.count(b"q") == 30_000
+    assert peak < 4e6
