@@ -259,8 +259,7 @@ def _assign_planes(
 def _is_aliased(times_s: Array, is_above: Mask) -> Mask:
     """Return a mask of the windows (m, k) in which an oscillation in step with reports has levels.
 
-    The level is then a function of the number of the report modulo a small period. Sweeps of one
-    report that differ are not of such a motion.
+    The level is then a function of the number of the report modulo a small period.
     """
     elapsed_s = times_s - times_s[:, :1]
     interval_s = np.diff(times_s, axis=1)
@@ -276,7 +275,7 @@ def _is_aliased(times_s: Array, is_above: Mask) -> Mask:
                 np.any(is_chosen & is_above, axis=1) & np.any(is_chosen & ~is_above, axis=1)
             )
         is_aliased |= is_function
-    return is_aliased & np.all(interval_s > 0, axis=1)
+    return is_aliased
 
 
 def _angle_evidence(time_s: Array, angle_rad: Array) -> tuple[float, float]:

@@ -123,8 +123,13 @@ def solve(
         single = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
         rows = np.flatnonzero(np.isin(sweeps.device, single))
         if len(rows):
-            photodiodes = _solve_photodiodes(sweeps.take(rows), solution.artifact, options)
-            solution = merge_solutions(solution, photodiodes)
+            others = sweeps.take(rows)
+            try:
+                photodiodes = _solve_photodiodes(others, solution.artifact, options)
+            except DegenerateError as error:
+                solution = _with_unsolved_devices(solution, others, error)
+            else:
+                solution = merge_solutions(solution, photodiodes)
     else:
         solution = _solve_photodiodes(sweeps, scene, options, odometry)
         if rigid:
@@ -171,6 +176,30 @@ def _solve_photodiodes(
             epochs, scene, kind=options.scene, odometry=odometry, seed=options.seed
         )
     return _locate_and_verify(estimate, epochs.rejected, options.method)
+
+
+def _with_unsolved_devices(solution: Solution, sweeps: Sweeps, error: DegenerateError) -> Solution:
+    """Add devices without poses to the solution of the others; ``sweeps`` are all theirs."""
+    names = [sweeps.devices[k] for k in np.unique(sweeps.device).tolist()]
+    epochs = group_epochs(sweeps)
+    no_time, no_position = np.zeros(0, np.int64), np.zeros((0, 3))
+    frame = solution.artifact.frame
+    return replace(
+        solution,
+        trajectories=(
+            *solution.trajectories,
+            *(Trajectory.from_positions(name, frame, no_time, no_position) for name in names),
+        ),
+        rejected=add_counts(
+            solution.rejected,
+            epochs.rejected,
+            {"station_not_in_scene": int(np.count_nonzero(np.isfinite(epochs.counts)))},
+        ),
+        warnings=(
+            *solution.warnings,
+            SolverWarning("no_device_pose", f"{', '.join(names)}: no pose was found: {error}"),
+        ),
+    )
 
 
 def _locate_and_verify(

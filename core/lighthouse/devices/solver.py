@@ -48,7 +48,7 @@ from locatk.core.lighthouse.results import (
     StationVerification,
 )
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
-from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M
+from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M, unused_visits_warnings
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution, SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
@@ -68,10 +68,13 @@ class MarkerAlignment:
     transform : Similarity
     misfit_m : float
         Rms distance of the markers from the transformed positions of the devices, in metres.
+    visits : int
+        Number of visits during which a device has poses.
     """
 
     transform: Similarity
     misfit_m: float
+    visits: int
 
 
 def select_rigid_receivers(
@@ -146,6 +149,7 @@ def solve_devices(
             trajectories = tuple(
                 _transform_trajectory(t, transform, scene.frame) for t in trajectories
             )
+            warnings.extend(unused_visits_warnings(scene.markers, alignment.visits))
             facts = replace(facts, marker_misfit_m=alignment.misfit_m, marker_scale=transform.scale)
     if not scene.stations and solved.scale == "device":
         warnings.extend(_scale_warnings(scene))
@@ -313,7 +317,8 @@ def align_to_markers(
     except DegenerateError:
         return None
     offset = transform.apply(device_positions) - marker_positions
-    return MarkerAlignment(transform, float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))))
+    misfit_m = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
+    return MarkerAlignment(transform, misfit_m, len(marker_positions))
 
 
 def _visit_position(visit: MarkerVisit, trajectories: Sequence[Trajectory]) -> Array | None:

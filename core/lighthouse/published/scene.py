@@ -371,7 +371,7 @@ def _scene_frame(
     unit = Similarity.identity()
     if not prior.distances:
         return unit, "unit"
-    scale = scale_from_distances(
+    scale, _ = scale_from_distances(
         lambda observed: solved.locate(image_points(epochs, observed)),
         prior.distances,
         epochs,

@@ -36,6 +36,7 @@ from locatk.core.lighthouse.scene.frame import (
     fix_gauge,
     marker_angles,
     marker_misfit,
+    unused_visits_warnings,
 )
 from locatk.core.lighthouse.scene.keyframes import (
     average_standstills,
@@ -253,7 +254,10 @@ def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
     state = adjustment.state
     raised = replace(state, positions=state.positions + np.array([0.0, 0.0, floor_z]))
     framed = FramedState(raised, adjustment.station_covariance, floor_z, "markers", prior.frame)
-    warnings = generic_calibration_warnings(epochs.channels.tolist(), state.calibrations)
+    warnings = (
+        *generic_calibration_warnings(epochs.channels.tolist(), state.calibrations),
+        *unused_visits_warnings(prior.markers, len(marker_points)),
+    )
     scene = _build_scene(framed, True, epochs, prior, warnings)
     station = replace(scene.stations[0], floor_map=fit_floor_homography(on_floor[:, :2], rays))
     facts = LighthouseFacts(

@@ -142,7 +142,8 @@ def _framed_by_markers(
     to_markers: Similarity,
 ) -> FramedState:
     """Transform a state by ``to_markers``, and add warnings about the markers."""
-    warnings = []
+    is_located = np.isfinite(locate_with(state, planar, observed).position[:, 0])
+    warnings = unused_visits_warnings(prior.markers, int(np.count_nonzero(is_located)))
     misfit = marker_misfit(state, planar, marker_points, observed)
     if MAX_MARKER_MISFIT_M < misfit < np.inf:
         warnings.append(marker_misfit_warning(misfit))
@@ -167,6 +168,18 @@ def _framed_by_markers(
     )
 
 
+def unused_visits_warnings(markers: Sequence[Marker], used: int) -> list[SolverWarning]:
+    """Return a warning if fewer visits of ``markers`` are used than there are."""
+    total = sum(len(marker.visits) for marker in markers)
+    if used == total:
+        return []
+    message = (
+        f"{total - used} of {total} visits of markers are not used, because too few stations were "
+        "received: are their times those of the recording?"
+    )
+    return [SolverWarning("visits_not_used", message)]
+
+
 def marker_misfit_warning(misfit_m: float) -> SolverWarning:
     """Return the warning for markers with an rms residual of ``misfit_m``."""
     return SolverWarning(
@@ -187,12 +200,19 @@ def _scale(
     """Return metres per unit of a state, their source, and warnings."""
     warnings: list[SolverWarning] = []
     if prior.distances:
-        scale = scale_from_distances(
+        scale, used = scale_from_distances(
             lambda observed: locate_with(state, planar, observed).position,
             prior.distances,
             epochs,
             angles,
         )
+        if used < len(prior.distances):
+            message = (
+                f"{len(prior.distances) - used} of {len(prior.distances)} known distances are not "
+                "used, because too few stations were received at an end: are the times of the "
+                "visits those of the recording?"
+            )
+            warnings.append(SolverWarning("visits_not_used", message))
         return scale, "distance", warnings
     if odometry:
         estimates = locate_with(state, planar, angles)
@@ -351,8 +371,10 @@ def scale_from_distances(
     distances: Sequence[Distance],
     epochs: Epochs,
     angles: Array,
-) -> float:
+) -> tuple[float, int]:
     """Estimate metres per unit of a state from known distances, by least squares.
+
+    Returns the scale and the number of distances that were observed at both ends.
 
     Parameters
     ----------
@@ -380,7 +402,7 @@ def scale_from_distances(
             hint="check the times of its visits",
         )
     lengths, known_m = lengths[is_observed], known_m[is_observed]
-    return float(lengths @ known_m / (lengths @ lengths))
+    return float(lengths @ known_m / (lengths @ lengths)), len(lengths)
 
 
 def scale_from_odometry(

@@ -201,7 +201,7 @@ def test_the_other_codec_is_named_by_frames_off_the_sheet(shoot: Shoot) -> None:
     assert all(frame.confidence < 0.999 for frame in off_sheet)
     (warning,) = (each for each in confused.warnings if each.code != "no_camera_model")
     assert warning.code == "other_codec"
-    assert "'libdots'" in warning.message
+    assert "were printed with the codec 'libdots'" in warning.message
     right = solve([frames_of(images)], Manifest((sheet,), codec="libdots"))
     assert right.poses == 6
     assert [each.code for each in right.warnings] == ["no_camera_model"]

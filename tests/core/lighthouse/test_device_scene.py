@@ -35,6 +35,7 @@ from locatk.core.lighthouse.devices.solver import (
 from locatk.core.lighthouse.devices.tracking import TrackedDevice
 from locatk.core.lighthouse.results import LighthouseFacts, StationDetection
 from locatk.core.lighthouse.scene import Marker, MarkerVisit
+from locatk.core.lighthouse.scene.frame import unused_visits_warnings
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -264,6 +265,13 @@ def test_markers_on_which_a_device_rested_give_the_transform() -> None:
     assert alignment.misfit_m == pytest.approx(0.0, abs=1e-9)
     assert alignment.transform.scale == pytest.approx(1.01)
     assert alignment.transform.rotation == pytest.approx(rotation)
+    assert alignment.visits == 4
+    later = trajectory("a", corners).select(np.arange(4) > 0)
+    without_first = align_to_markers(visited(corners), [later])
+    assert without_first is not None
+    assert without_first.visits == 3
+    (warning,) = unused_visits_warnings(visited(corners), 3)
+    assert (warning.code, warning.message[:20]) == ("visits_not_used", "1 of 4 visits of mar")
     assert align_to_markers(visited(corners[:2]), [path]) is None
     assert align_to_markers(visited(corners), [trajectory("b", corners)]) is None
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])

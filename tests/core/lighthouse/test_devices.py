@@ -166,6 +166,25 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> No
 
 
 @pytest.mark.slow
+def test_a_photodiode_without_a_station_leaves_rigid_devices_their_poses(mixed: Any) -> None:
+    sweeps, _, scene = mixed
+    sweeps = sweeps.take((sweeps.device == 0) | (np.arange(len(sweeps)) % 5 == 0))
+    is_single = sweeps.device == 1
+    alone = solve(sweeps.take(~is_single), scene, receivers={"rigid": RIGID})
+    for channel, reason in ((9, "station_not_in_scene"), (77, "unknown_channel")):
+        unseen = replace(sweeps, channel=np.where(is_single, channel, sweeps.channel))
+        solution = solve(unseen, scene, receivers={"rigid": RIGID})
+        assert {each.device: len(each) for each in solution.trajectories} == {
+            "rigid": alone.poses,
+            "single": 0,
+        }
+        assert solution.rejected.get(reason, 0) > 0
+        assert sum(solution.rejected.values()) - sum(alone.rejected.values()) == is_single.sum()
+        (warning,) = (each for each in solution.warnings if each.code == "no_device_pose")
+        assert warning.message.startswith("single: ")
+
+
+@pytest.mark.slow
 def test_two_markers_determine_no_frame(world: Any) -> None:
     _, sweeps, markers = marked(world, 2, 2.5)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
@@ -179,6 +198,7 @@ def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
     wrong = replace(markers[3], position=markers[3].position + [0.15, 0.0, 0.0])
     solution = solve(sweeps, Scene(markers=(*markers[:3], wrong)), receivers={"robot": RIGID})
     assert "marker_misfit" in codes(solution)
+    assert "visits_not_used" not in codes(solution)
 
 
 @pytest.mark.slow

@@ -269,3 +269,7 @@ def test_a_single_station_is_that_with_the_most_markers(world: Any) -> None:
     assert station.channel == 2
     assert estimate.rejected == {"other_station": 80}
     assert estimate.epochs.channels.tolist() == [2]
+    assert "visits_not_used" not in {w.code for w in estimate.warnings}
+    other = replace(markers[0], visits=(MarkerVisit("robot", 0, 1),))
+    estimate = estimate_scene(epochs, Scene(markers=(*markers, other)), kind="one-planar")
+    assert "visits_not_used" in {w.code for w in estimate.warnings}

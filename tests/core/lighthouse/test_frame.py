@@ -148,15 +148,19 @@ def positions_on_floor(recorded: Recorded) -> Any:
 
 
 def test_distances_give_the_scale(recorded: Recorded) -> None:
-    def scale(*distances: Distance) -> float:
-        return frame.scale_from_distances(
+    def scale(*distances: Distance, unseen: int = 0) -> float:
+        scale, used = frame.scale_from_distances(
             positions_on_floor(recorded), distances, recorded.epochs, recorded.angles
         )
+        assert used == len(distances) - unseen
+        return scale
 
     edge = Distance(recorded.stay(0), recorded.stay(1), 1.0)
     diagonal = Distance(recorded.stay(0), recorded.stay(2), np.sqrt(2))
     assert scale(edge) == pytest.approx(5, rel=2e-3)
     assert scale(edge, diagonal) == pytest.approx(5, rel=2e-3)
+    late = replace(edge, second=MarkerVisit("robot", 0, 1))
+    assert scale(edge, late, unseen=1) == scale(edge)
     # Of two that disagree the longer says more.
     wrong = replace(edge, distance=1.1)
     assert 5 < scale(wrong, diagonal) < 5.25
@@ -169,6 +173,31 @@ def test_unobserved_distances_are_refused(recorded: Recorded) -> None:
             positions_on_floor(recorded), [unseen], recorded.epochs, recorded.angles
         )
     assert refused.value.hint
+
+
+def test_visits_that_are_not_used_are_reported(recorded: Recorded, world: Any) -> None:
+    def warnings(prior: Scene) -> list[str]:
+        framed = frame.fix_gauge(
+            recorded.state,
+            np.zeros((2, 6, 6)),
+            True,
+            prior,
+            recorded.epochs,
+            recorded.angles,
+            (),
+        )
+        return [each.message for each in framed.warnings if each.code == "visits_not_used"]
+
+    markers = world.markers_of(recorded.lamps, recorded.places)
+    late = replace(markers[0], visits=(MarkerVisit("robot", 0, 1),))
+    assert warnings(Scene(markers=markers)) == []
+    (message,) = warnings(Scene(markers=(*markers, late)))
+    assert message.startswith(f"1 of {len(markers) + 1} visits of markers")
+    edge = Distance(recorded.stay(0), recorded.stay(1), 1.0)
+    assert warnings(Scene(distances=(edge,))) == []
+    unseen = replace(edge, second=MarkerVisit("robot", 0, 1))
+    (message,) = warnings(Scene(distances=(edge, unseen)))
+    assert message.startswith("1 of 2 known distances")
 
 
 def drift(points: Array, seed: int, share: float = 0.05) -> Array:
