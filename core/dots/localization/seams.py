@@ -60,8 +60,9 @@ def relocalize_at_seams(
         image = frames.images[index]
         views = separate_sheets(image, manifest, code, camera)
         if len(views) > 1 or (views and views[0].number != numbers[index]):
-            localized.replace(index, localize_view(views[0], image.shape, manifest, code, camera))
-            numbers[index] = views[0].number
+            pose = localize_view(views[0], image.shape, manifest, code, camera)
+            localized.replace(index, pose)
+            numbers[index] = views[0].number if pose.accepted[0] else -1
 
 
 def localize_view(
