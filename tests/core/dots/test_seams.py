@@ -322,6 +322,8 @@ def test_wrong_bits_and_confidence_are_those_of_the_decoded_dots(shot: Callable[
     pose = localize_view(part, image.shape, TILES, ANOTO, CAMERA)
     assert pose.confidence[0] == 0.99991
     assert pose.corrected[0] == 0
+    part = replace(part, misread_pixels=view.misread_pixels)
+    assert localize_view(part, image.shape, TILES, ANOTO, CAMERA).corrected[0] == 3
     # Dots that are decoded to another position refute the one that they were found at.
     shifted = replace(view, grid=view.grid + [7.0, 0.0])
     pose = localize_view(shifted, image.shape, TILES, ANOTO, CAMERA)
