@@ -1,7 +1,7 @@
 """Calibration of a floor as built: the poses of its sheets, and the errors of their print.
 
 Frames that cross a seam show the relative pose of two sheets
-(:mod:`~locatk.core.dots.localization.seams`, :mod:`.seam_measurements`); all of them together
+(:mod:`~locatk.core.dots.localization.separation`, :mod:`.seam_measurements`); all of them together
 determine the poses of all sheets in the frame of one, the datum (:mod:`.floor_fit`).
 
 What is not observable: from frames alone, neither the scale of the print nor its errors inside of a
@@ -629,7 +629,7 @@ def fit_consistent_sheets(
     """Fit a floor, without the sheets that too few consistent frames connect with the datum.
 
     A fit rejects frames that contradict the others. The rest connects two sheets only if it has
-    still :data:`MIN_SEAM_FRAMES` and is the majority: otherwise nobody knows which frames are
+    still :data:`MIN_SEAM_FRAMES` and is the majority: otherwise it is unknown which frames are
     wrong.
 
     Returns

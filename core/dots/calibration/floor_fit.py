@@ -655,9 +655,9 @@ class Prior:
         if key not in self._inverse:
             points = self._positions[number]
             correlation, _ = field_correlation(points, points, length_mm)
-            matrix = correlation + RELATIVE_JITTER * np.eye(len(points))
+            matrix: Array = correlation + RELATIVE_JITTER * np.eye(len(points))
             _, log_determinant = np.linalg.slogdet(matrix)
-            self._inverse[key] = np.linalg.inv(matrix), -float(log_determinant)
+            self._inverse[key] = np.asarray(np.linalg.inv(matrix)), -float(log_determinant)
         return self._inverse[key]
 
 

@@ -27,8 +27,10 @@ from locatk.core.dots.localization.frames import (
 from locatk.core.dots.localization.pose import localize_windows
 from locatk.core.dots.localization.separation import (
     MIN_SHEET_DOTS,
+    NO_SYMBOL,
     SheetView,
     lattice_of,
+    padded_symbols,
     separate_sheets,
 )
 from locatk.core.dots.sheet import Manifest
@@ -60,8 +62,9 @@ def relocalize_at_seams(
         image = frames.images[index]
         views = separate_sheets(image, manifest, code, camera)
         if len(views) > 1 or (views and views[0].number != numbers[index]):
-            localized.replace(index, localize_view(views[0], image.shape, manifest, code, camera))
-            numbers[index] = views[0].number
+            pose = localize_view(views[0], image.shape, manifest, code, camera)
+            localized.replace(index, pose)
+            numbers[index] = views[0].number if pose.accepted[0] else -1
 
 
 def localize_view(
@@ -90,20 +93,25 @@ def localize_view(
         return unlocalized_frames(1, NO_GRID)
     lattice = lattice_of(homography, points, lens=camera is None)
     half = window_half_width(lattice)
-    decoded = identify_windows(*soft_bits(lattice, half), code, other_codec_odds=0)
+    bits = soft_bits(lattice, half)
+    decoded = identify_windows(*bits, code, other_codec_odds=0)
     x, y = (origin - half)[:, None]
-    section = np.array([manifest.sheets[view.number].section])
+    sheet = manifest.sheets[view.number]
+    section = np.array([sheet.section])
     is_same = (decoded.x == x) & (decoded.y == y) & (decoded.rotation == 0)
     is_same &= (decoded.section == section).all(axis=1)
     confidence = np.where(is_same, np.maximum(decoded.confidence, view.confidence), view.confidence)
     is_refuted = ~is_same & (decoded.confidence > view.confidence)
+    symbols = padded_symbols(code, sheet, origin - half, 2 * half)
+    observed, printed = np.stack(bits)[:, 0], np.stack([symbols & 1, symbols >> 1]) == 1
+    is_wrong = (observed != 0) & (symbols < NO_SYMBOL) & ((observed > 0) != printed)
     windows = DecodedWindows(
         x,
         y,
         section,
         np.zeros(1, np.int64),
         decoded.dots,
-        np.where(is_same, decoded.corrected, 2 * len(view.misread_pixels)),
+        np.array([is_wrong.sum()]),
         np.where(is_refuted, 0.0, confidence),
         border=np.zeros(1, np.bool_),
         rival_odds=np.zeros(1),

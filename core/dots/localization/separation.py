@@ -381,7 +381,7 @@ class _RectifiedFrame:
         gain = np.vstack([gain, gain.min(axis=0)])
         radius = math.ceil(MAX_POSITION_ERROR_MM / self.manifest.pitch_mm)
         low = nominal - radius
-        symbols = _padded_symbols(
+        symbols = padded_symbols(
             self.code, self.manifest.sheets[number], low - half, 2 * (radius + half)
         )
         count = 2 * radius + 1
@@ -486,7 +486,7 @@ def _printed_dots(
     node = np.rint(grid[is_own]).astype(np.int64)
     low = node.min(axis=0)
     side = int((node.max(axis=0) - low).max()) + 1
-    symbols = _padded_symbols(code, manifest.sheets[number], low, side)
+    symbols = padded_symbols(code, manifest.sheets[number], low, side)
     column, row = (node - low).T
     symbol = symbols[row, column]
     printed = node + DOT_DIRECTIONS[symbol % NO_SYMBOL] * DOT_OFFSET_PITCHES
@@ -496,7 +496,7 @@ def _printed_dots(
     return dot, is_own
 
 
-def _padded_symbols(
+def padded_symbols(
     code: Codec, sheet: Sheet, low: NDArray[np.int64], side: int
 ) -> NDArray[np.uint8]:
     """Return the symbols of a square of the grid, :data:`NO_SYMBOL` beyond the sheet."""

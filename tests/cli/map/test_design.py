@@ -209,7 +209,7 @@ def test_outputs_are_not_overwritten_without_the_option(locatk, made: Path) -> N
         (["5x5", "--window", "4x4"], 2, "--window"),
         (["5x5", "--alphabet", "7"], 2, "--alphabet"),
         (["5x5", "--pitch", 50], 1, "60 mm"),
-        (["5x5", "--pitch", "nan"], 1, "overlap"),
+        (["5x5", "--pitch", "nan"], 2, "--pitch"),
         (["5x5", "--bar", "30x10"], 2, "30x10x5"),
         (["5x5", "--bar", "60x10x5"], 1, "overlap"),
         (["5x5", "--remanence", 12000], 1, "tesla"),

@@ -22,7 +22,7 @@ from locatk.core.dots.calibration.seam_measurements import (
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import codec
 from locatk.core.dots.frames import Frames
-from locatk.core.dots.localization import separation
+from locatk.core.dots.localization import seams, separation
 from locatk.core.dots.localization.frames import (
     LOW_CONFIDENCE,
     NO_GRID,
@@ -322,11 +322,27 @@ def test_wrong_bits_and_confidence_are_those_of_the_decoded_dots(shot: Callable[
     pose = localize_view(part, image.shape, TILES, ANOTO, CAMERA)
     assert pose.confidence[0] == 0.99991
     assert pose.corrected[0] == 0
+    part = replace(part, misread_pixels=view.misread_pixels)
+    assert localize_view(part, image.shape, TILES, ANOTO, CAMERA).corrected[0] == 3
     # Dots that are decoded to another position refute the one that they were found at.
     shifted = replace(view, grid=view.grid + [7.0, 0.0])
     pose = localize_view(shifted, image.shape, TILES, ANOTO, CAMERA)
     assert pose.rejected[0] == LOW_CONFIDENCE
     assert pose.confidence[0] == 0
+
+
+def test_a_refuted_frame_has_neither_pose_nor_sheet(
+    lay: Callable[..., Any], cross: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ((image, _, _),) = cross(lay(1.3, -0.8, 0.5), 1, 1, width_mm=0.2)
+    views = separate_sheets(image, TILES, ANOTO, CAMERA)
+    wrong = [replace(view, grid=view.grid + [7.0, 0.0]) for view in views]
+    monkeypatch.setattr(seams, "separate_sheets", lambda *_: wrong)
+    recording = Frames("robot", np.array([10**18]), ("a",), [image])
+    solution = solve([recording], TILES, SolveOptions(camera=CAMERA))
+    assert solution.rejected == {LOW_CONFIDENCE: 1}
+    assert solution.detections == ()
+    assert sum(len(track) for track in solution.trajectories) == 0
 
 
 def test_collinear_dots_determine_no_pose() -> None:
