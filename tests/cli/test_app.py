@@ -273,8 +273,8 @@ def test_wrong_usage_is_one_line(locatk: Run) -> None:
     "given",
     [
         ("eval", "SESSION", "--truth", "SESSION", "--max-gap"),
-        ("emulate", "SESSION", "--speed"),
-        ("emulate", "SESSION", "--drop"),
+        ("emulate", "SESSION", "--no-wait", "--speed"),
+        ("emulate", "SESSION", "--no-wait", "--drop"),
         ("solve", "SESSION", "--speed"),
         ("calibrate", "camera", "SESSION", "-o", "camera.toml", "--focal-px"),
     ],

@@ -380,6 +380,7 @@ def test_clocks(name: str, cell: str, ticks: Ticks, tick: int) -> None:
     assert (stream.ticks, records["tick"], stream.names) == (ticks, [tick], ("v",))
 
 
+@pytest.mark.filterwarnings("error")
 def test_infinite_clocks_are_damaged() -> None:
     decoder, batches = decode(b"t_s,a\n1,2\n2,3\n1e308,4\n-1e308,5\n3,6\n")
     _, columns = only(batches, "readings")
