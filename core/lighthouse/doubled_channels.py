@@ -227,10 +227,13 @@ def count_phase_conflicts(time_s: Array, zero_s: Array, period_s: float) -> tupl
         tolerance_s = MAX_PAIR_ERROR_S + MAX_PHASE_DRIFT_PPM * 1e-6 * interval_s
         return (error_s < tolerance_s) & (interval_s < PHASE_WINDOW_S)
 
+    # Different from both: where the clock of the host is corrected, phases change continuously.
+    differs_before = ~agrees(before, zero_s[:, None])
     differs_after = (after - zero_s[:, None] < PHASE_WINDOW_S) & ~agrees(zero_s[:, None], after)
     is_conflict = np.zeros(len(zero_s), bool)
     for k in range(NEIGHBOURS):
-        is_conflict |= np.any(agrees(before[:, k, None], after) & differs_after, axis=1)
+        differs = differs_before[:, k, None] & differs_after
+        is_conflict |= np.any(agrees(before[:, k, None], after) & differs, axis=1)
     return int(size[is_conflict].sum()), paired
 
 

@@ -236,6 +236,18 @@ def test_a_restarted_station_is_one(world: Any) -> None:
     assert find_doubled_channels(world.join(before, after)) == NONE
 
 
+@pytest.mark.parametrize("slew_us_per_s", [200, 500, 1000, 5000])
+def test_a_clock_that_is_corrected_is_no_station(world: Any, slew_us_per_s: float) -> None:
+    """Capture finds a better mapping to the time of the host, and approaches it."""
+    still = lambda t: np.array([0.2, 0.1, 0.0]) + np.zeros((*np.shape(t), 3))  # noqa: E731
+    for start_s in (0.7, 1.5, 3.0):
+        sweeps = world.stream(world.lamps(5), still, 4.0, seed=3)
+        time_s = (sweeps.time_ns - sweeps.time_ns[0]) * 1e-9
+        correction_s = 1e-6 * slew_us_per_s * np.clip(time_s - start_s, 0, 0.5)
+        corrected = sweeps.time_ns + (1e9 * correction_s).astype(np.int64)
+        assert find_doubled_channels(replace(sweeps, time_ns=corrected)) == NONE
+
+
 def test_counts_that_are_no_numbers(world: Any) -> None:
     sweeps = twins(world)
     sweeps.count[::3] = np.nan
