@@ -181,7 +181,7 @@ def test_info_reports_recoverable_damage(locatk, chunked: Path, tmp_path: Path) 
 def test_info_of_a_damaged_chunk_points_to_recover(locatk, session: Path) -> None:
     result = locatk("info", damage(session))
     assert result.exit_code == 3
-    assert f"Incomplete: {session}: a chunk is damaged" in result.stderr
+    assert f"Incomplete: {session}: a damaged chunk at byte" in result.stderr
     assert "locatk recover" in result.stderr
 
 

@@ -94,10 +94,10 @@ def test_damaged_truth_is_reported(session: Path, tmp_path: Path) -> None:
 
 def test_truth_that_cannot_be_used_is_reported(tmp_path: Path) -> None:
     record(tmp_path / "run.mcap")
-    far = track()
-    far = replace(far, position=far.position + 1e150)
-    path = tmp_path / "far.tum"
-    write_tum(path, far)
+    late = track()
+    late = replace(late, time_ns=late.time_ns + 1_000_000_000_000)
+    path = tmp_path / "late.tum"
+    write_tum(path, late)
     subject = load_subject(solved(tmp_path / "solved.mcap"), truth=path)
     assert subject.evaluation is None
     assert "The truth cannot be used" in why_not_evaluated(subject)
