@@ -19,9 +19,11 @@ from locatk.core.errors import FormatError, InputError, LocatkError, MissingData
 MAX_FILE_BYTES = 512 << 20
 """Largest file that is read completely [bytes], unless its reader states another limit.
 
-A scan of an A0 sheet has 100 MB, a table of a million poses 158 MB. A table needs up to ten times
-its size as numbers and text, which a laptop still holds.
+A scan of an A0 sheet has 100 MB, a table of a million poses 158 MB.
 """
+
+MIN_READ_BYTES = 1 << 20
+"""Memory that is allocated for the rest of a file of unknown size [bytes]."""
 
 MAX_TEXT_BYTES = 32 << 20
 """Largest configuration, artifact or map that is read as text [bytes].
@@ -48,7 +50,8 @@ def check_regular(path: str | os.PathLike[str]) -> int:
     except ValueError as error:
         if isinstance(error, LocatkError):
             raise
-        raise InputError("a file name with a zero byte", file=path) from None
+        message = "a file name with a zero byte or an unpaired surrogate"
+        raise InputError(message, file=repr(path)) from None
     if stat.S_ISDIR(status.st_mode):
         raise FormatError("a folder instead of a file", file=path, hint="Name a file in it")
     if not stat.S_ISREG(status.st_mode):
@@ -114,7 +117,10 @@ def read_bytes(path: str | os.PathLike[str], max_bytes: int = MAX_FILE_BYTES) ->
     with open_binary(path) as stream:
         # The size is compared before memory is allocated, and again because a file can grow.
         size = os.fstat(stream.fileno()).st_size
-        data = stream.read(max_bytes + 1) if size <= max_bytes else b""
+        data = stream.read(size + 1) if size <= max_bytes else b""
+        while len(data) > size:  # It grows, or the system does not know its size.
+            size = len(data)
+            data += stream.read(min(max_bytes - size, max(size, MIN_READ_BYTES)) + 1)
     if max(size, len(data)) > max_bytes:
         raise FormatError(
             f"{max(size, len(data)):,} bytes, more than the limit of {max_bytes:,}",

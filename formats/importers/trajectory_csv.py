@@ -99,15 +99,16 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
     time_ns = table.epoch_times_ns("time_s")
 
     trajectories = []
-    cells = np.array(table.columns["device"], object)
-    for cell in dict.fromkeys(table.columns["device"]):
-        rows = np.flatnonzero(cells == cell)
+    devices = [text_of_spreadsheet(cell) for cell in table.columns["device"]]
+    device_of_row = np.array(devices, object)
+    for device in dict.fromkeys(devices):
+        rows = np.flatnonzero(device_of_row == device)
         check_ascending(table, time_ns, rows)
         covariance = _diagonal_covariance(sigma[rows])
         is_known = np.isfinite(probability[rows]).any()
         trajectories.append(
             Trajectory(
-                text_of_spreadsheet(cell),
+                device,
                 frame,
                 time_ns[rows],
                 position[rows],

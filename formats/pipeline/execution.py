@@ -108,6 +108,10 @@ class _BrokenPool(Exception):
     """A worker died, or could not be started."""
 
 
+class _FailedStart(_BrokenPool):
+    """A worker could not be started."""
+
+
 class _Cancelled(Exception):
     """The executor dropped the job."""
 
@@ -196,7 +200,7 @@ def _run_jobs(
                 time.sleep(RESTART_DELAY_S)
             for index in interrupted:
                 clean(jobs[index])
-            if len(interrupted) == 1:
+            if len(interrupted) == 1 and not isinstance(error, _FailedStart):
                 [index] = interrupted
                 deaths[index] += 1
                 if deaths[index] >= MAX_DEATHS:
@@ -206,11 +210,11 @@ def _run_jobs(
 
 
 def _submit(executor: Executor, function: Callable[[Job], Any], job: Job) -> Future[Any]:
-    """Submit a job, which may start a worker; raise _BrokenPool if that fails."""
+    """Submit a job, which may start a worker; raise _FailedStart if that fails."""
     try:
         return executor.submit(function, job)
     except (EOFError, OSError) as error:  # The fork server died, or processes are limited.
-        raise _BrokenPool(short_reason(error)) from error
+        raise _FailedStart(short_reason(error)) from error
 
 
 @contextlib.contextmanager

@@ -57,6 +57,9 @@ MIN_ARROW_BYTES = 2 << 20
 MAX_COLUMNS = 1000
 """Most columns of a table."""
 
+MAX_CELLS = 20_000_000
+"""Most cells of a table, and one for each row, in up to 3 GB. A million poses have 17 million."""
+
 MAX_QUOTED_CHARACTERS = 40
 """Longest part of a cell in an error message."""
 
@@ -253,9 +256,18 @@ def read_table(path: Path) -> Table:
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows: list[list[str]] = []
     lines: list[int] = []
+    cells = 0
     try:
         for row in reader:
             if row:
+                cells += len(row) + 1
+                if cells > MAX_CELLS:
+                    raise FormatError(
+                        f"more than {MAX_CELLS:,} cells",
+                        file=path,
+                        where=reader.line_num,
+                        hint="Split the recording",
+                    )
                 rows.append(row)
                 lines.append(reader.line_num)
     except csv.Error as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import socket
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -94,6 +95,10 @@ def test_large_files_are_refused_before_memory_is_allocated(tmp_path: Path) -> N
     assert read_head(path, 3) == b"\0\0\0"
     path.write_bytes(b"12345")
     assert read_bytes(path, 5) == b"12345"
+    tracemalloc.start()
+    read_bytes(path)
+    assert tracemalloc.get_traced_memory()[1] < 100_000
+    tracemalloc.stop()
     with pytest.raises(FormatError, match="5 bytes, more than the limit of 4"):
         read_bytes(path, 4)
 

@@ -17,6 +17,7 @@ from locatk.formats.exporters.kitti import write_kitti
 from locatk.formats.exporters.trajectory_csv import write_csv
 from locatk.formats.exporters.tum import write_tum
 from locatk.formats.importers import trajectories as files
+from locatk.formats.importers.trajectory_csv import read_csv
 from locatk.formats.sessions.solutions import write_solution
 from locatk.formats.sessions.trajectories import truth_messages, write_streams
 from locatk.formats.sessions.writer import SessionWriter
@@ -137,3 +138,13 @@ def test_compressed_files_are_named(tmp_path: Path) -> None:
     path.write_bytes(gzip.compress(b"0 0 0 0 0 0 0 1\n"))
     with pytest.raises(FormatError, match="compressed"):
         files.read(path)
+
+
+def test_quoted_names_are_of_one_device(tmp_path: Path) -> None:
+    """A name that begins like a formula is quoted for spreadsheets, or not."""
+    path = tmp_path / "poses.csv"
+    path.write_text("time_s,device,x_m,y_m,z_m\n1,=a,0,0,0\n2,'=a,0,0,0\n")
+    assert [(each.device, len(each)) for each in read_csv(path)] == [("=a", 2)]
+    path.write_text("time_s,device,x_m,y_m,z_m\n2,=a,0,0,0\n1,'=a,0,0,0\n")
+    with pytest.raises(InputError, match="does not ascend"):
+        read_csv(path)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import importlib
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
 from types import ModuleType
@@ -157,6 +161,28 @@ def test_a_dead_fork_server_is_started_again(
     _FailingExecutor.failures = failures
     results = dict(run_jobs(abs, [-1, -2, -3], Pool(lambda width: _FailingExecutor(), 2)))
     assert results == {0: 1, 1: 2, 2: 3}
+
+
+class _LimitedExecutor(Executor):
+    """Executor that refuses every second submission while the first job runs."""
+
+    def __init__(self) -> None:
+        self._submissions = 0
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self._submissions += 1
+        if self._submissions == 2:
+            raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+        future: Future[Any] = Future()
+        finish = partial(future.set_result, function(*args, **kwargs))
+        threading.Timer(0.01, finish).start()
+        return future
+
+
+def test_a_process_that_is_refused_is_no_death_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(execution, "MAX_DEATHS", 1)
+    pool = Pool(lambda width: contextlib.nullcontext(_LimitedExecutor()), 2)
+    assert dict(run_jobs(abs, [-1, -2, -3], pool)) == {0: 1, 1: 2, 2: 3}
 
 
 def test_all_jobs_are_given_up_without_processes(monkeypatch: pytest.MonkeyPatch) -> None:

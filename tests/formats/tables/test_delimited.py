@@ -170,3 +170,14 @@ def test_zero_bytes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="zero bytes in a text file") as caught:
         read_number_rows(path, ("t", "x"), hint="", time_column="t")
     assert caught.value.where == 2
+
+
+def test_tables_of_many_cells_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("a,b\n" + "1,2\n" * 3)
+    monkeypatch.setattr(delimited, "MAX_CELLS", 12)
+    assert len(read_table(path)) == 3
+    path.write_text("a,b\n" + "1,2\n" * 4)
+    with pytest.raises(FormatError, match="more than 12 cells") as caught:
+        read_table(path)
+    assert caught.value.where == 5
