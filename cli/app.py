@@ -17,6 +17,7 @@ import click
 
 from locatk.cli import console, failures
 from locatk.cli.lazy import LazyGroup
+from locatk.core.errors import InputError
 
 COMMANDS = {
     "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),
@@ -46,6 +47,10 @@ TERMINATED_STATUS = 143
 """Exit status after SIGTERM: 128 and the number of the signal (POSIX shells)."""
 
 
+MAX_SOURCE_DATE_S = 253_402_300_799
+"""End of the year 9999 [s since 1970], the last that ``datetime`` has."""
+
+
 class App(LazyGroup):
     """Group of :data:`COMMANDS` that reports errors in the format of locatk."""
 
@@ -62,13 +67,29 @@ class App(LazyGroup):
             return super().main(args, prog_name, complete_var, False, **extra)
         console.reset()
         try:
+            _check_environment()
             status = super().main(args, prog_name, complete_var, False, **extra)
         except Exception as error:
-            status = failures.report(error)
+            # click prints help without the console.
+            is_of_stdout = isinstance(error, OSError) and console.lost_results() is not None
+            status = 1 if is_of_stdout else failures.report(error)
         lost = console.lost_results()
         if lost is not None:
             status = failures.report_lost_results(lost)
         sys.exit(status if isinstance(status, int) else 0)
+
+
+def _check_environment() -> None:
+    """Raise InputError if SOURCE_DATE_EPOCH is not a time; libraries for PDF read it, too.
+
+    Source: https://reproducible-builds.org/specs/source-date-epoch, which demands an error.
+    """
+    given = os.environ.get("SOURCE_DATE_EPOCH", "")
+    if given and not (given.isascii() and given.isdecimal() and int(given) <= MAX_SOURCE_DATE_S):
+        raise InputError(
+            f"the environment variable SOURCE_DATE_EPOCH is {given[:20]!r}",
+            hint="Set it to whole seconds since 1970, or unset it",
+        )
 
 
 def _show_version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
@@ -107,20 +128,22 @@ def app() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Connect standard streams that are closed to the null device, as if ``/dev/null`` was given.
+    """Connect standard streams that are closed to the null device.
 
     Otherwise the next file that is opened gets the number of a closed stream, so that messages of
-    libraries would be written into a recording. A character that the encoding of a stream does not
-    contain is escaped.
+    libraries would be written into a recording. A closed stdin or stderr is as if ``/dev/null`` was
+    given; a closed stdout stays one that cannot be written. A character that the encoding of a
+    stream does not contain is escaped.
     """
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number)
         except OSError:
             # The lowest free number is opened, which is this one; programs that are started get it.
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+            access = os.O_RDONLY if name == "stdout" else os.O_RDWR
+            os.set_inheritable(os.open(os.devnull, access), True)
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
         elif mode == "w":
             getattr(sys, name).reconfigure(errors="backslashreplace")
 

@@ -144,16 +144,24 @@ def write_result(text: str | bytes) -> None:
     try:
         click.echo(text, nl=False)
     except OSError as error:
-        _state.stdout_error = _state.stdout_error or error
-        with contextlib.suppress(OSError):  # no descriptor
-            # Python also flushes the text that is still buffered, when it ends.
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, sys.stdout.fileno())
-            os.close(null)
+        _drop_results(error)
+
+
+def _drop_results(error: OSError) -> None:
+    _state.stdout_error = _state.stdout_error or error
+    with contextlib.suppress(OSError):  # no descriptor
+        # Python also flushes the text that is still buffered, when it ends.
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
 
 
 def lost_results() -> OSError | None:
     """Return the reason why results are missing on stdout; None if they are complete."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        _drop_results(error)
     return _state.stdout_error
 
 

@@ -129,13 +129,14 @@ def command(
         return
 
     planned = exports.plan_files(tracks, format_name, output)
-    if planned[0].path != output:
-        options.make_folder(output)
-    for path in (path for part in planned for path in part.files):
-        options.guard_output(path, overwrite=overwrite, inputs=[solution])
+    files = [path for part in planned for path in part.files]
     if planned[0].path == output:
+        for path in files:
+            options.guard_output(path, overwrite=overwrite, inputs=[solution])
         options.check_ending(output, ENDINGS[format_name])
     facts = exports.read_origin(solution)
+    if planned[0].path != output:
+        options.prepare_folder(output, files, overwrite=overwrite, inputs=[solution])
     for part in planned:
         exports.write(part, format_name, facts=facts, covariance=covariance, overwrite=overwrite)
         console.result(f"Wrote {part.path}: {sum(map(len, part.trajectories))} poses")
@@ -146,12 +147,12 @@ def command(
     if format_name == "ros2" and not output.suffix:
         console.warn(f"{output} does not end in .mcap, which ros2 bag and evo require")
     if as_json:
-        files = [
+        listed = [
             {"path": part.path, "device": each.device, "poses": len(each), "times": part.times}
             for part in planned
             for each in part.trajectories
         ]
-        console.emit_json({"version": 1, "input": solution, "format": format_name, "files": files})
+        console.emit_json({"version": 1, "input": solution, "format": format_name, "files": listed})
     check_loss(lost)
 
 

@@ -12,6 +12,7 @@ An interrupt gives 130, as in shells.
 
 from __future__ import annotations
 
+import errno
 import os
 import traceback
 from collections.abc import Sequence
@@ -81,7 +82,7 @@ def report(error: BaseException) -> int:
         _print_error(file + os.strerror(error.errno), system_hint(error))
         return 1
     if isinstance(error, MemoryError):
-        _print_error("not enough memory", "Solve shorter sessions, or fewer at a time")
+        _print_error("not enough memory", "Work on shorter sessions, or fewer at a time")
         return 1
     _print_error(
         f"internal error, {type(error).__name__}: {error}",
@@ -95,7 +96,11 @@ def report_lost_results(error: OSError) -> int:
 
     A reader that ended, as in ``| head -1``, wants no more results and no message about them.
     """
-    if not isinstance(error, BrokenPipeError):
+    if error.errno == errno.EBADF:
+        _print_error(
+            "the standard output is closed", "Redirect it: >/dev/null if no results are needed"
+        )
+    elif not isinstance(error, BrokenPipeError):
         _print_error(
             f"the standard output cannot be written ({error.strerror or error})",
             "Free some space, or print into another file",

@@ -230,21 +230,41 @@ def guard_output(path: Path, *, overwrite: bool, inputs: Sequence[Path] = ()) ->
     check_output(path, overwrite=overwrite)
 
 
-def make_folder(path: Path, option: str = "-o") -> None:
-    """Create the folder for several outputs if it does not exist.
+def prepare_folder(
+    folder: Path,
+    files: Sequence[Path],
+    *,
+    overwrite: bool,
+    inputs: Sequence[Path] = (),
+    option: str = "-o",
+) -> None:
+    """Create the folder for several outputs if it does not exist, and no output is refused.
+
+    Parameters
+    ----------
+    folder : Path
+        Named with ``option``.
+    files : sequence of Path
+        Outputs, in this folder and elsewhere.
+    overwrite, inputs
+        See :func:`guard_output`.
+    option : str
 
     Raises
     ------
-    OutputExistsError
-        ``path`` is a file.
+    OutputExistsError, MissingDataError
+        ``folder`` is a file, or :func:`guard_output` refuses an output.
     """
-    if path.exists() and not path.is_dir():
+    if folder.exists() and not folder.is_dir():
         raise OutputExistsError(
             f"there are several outputs, but {option} is a file",
-            file=path,
+            file=folder,
             hint=f"Name a folder with {option}",
         )
-    path.mkdir(parents=True, exist_ok=True)
+    for path in files:
+        if path.parent != folder or folder.exists():
+            guard_output(path, overwrite=overwrite, inputs=inputs)
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 def load(target: str) -> Any:

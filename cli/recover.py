@@ -83,6 +83,7 @@ def _facts(recovered: Any, written: int) -> dict[str, Any]:
         "tail_bytes": recovered.tail,
         "damaged_chunks": recovered.damaged_chunks,
         "orphans": recovered.orphans,
+        "late": recovered.late,
         "nameless": recovered.nameless,
         "unconfirmed": recovered.unconfirmed,
         "losses": [
@@ -123,10 +124,13 @@ def _lost(recovered: Any) -> str:
     """Return the losses in one sentence."""
     holes = len(recovered.losses) - bool(recovered.tail)
     hole_bytes = recovered.lost_bytes - recovered.tail
+    late = recovered.late
+    others = (recovered.lost_messages or late) - late
     words = [
         words
         for count, words in (
-            (recovered.lost_messages, _count(recovered.lost_messages or 0, "message")),
+            (others, _count(others, "message")),
+            (late, f"{_count(late, 'message')} with a time after the year 2262"),
             (recovered.orphans, f"{_count(recovered.orphans, 'message')} without a channel"),
             (recovered.lost_attachments, _count(recovered.lost_attachments or 0, "attachment")),
             (recovered.lost_metadata, _count(recovered.lost_metadata or 0, "metadata record")),

@@ -148,19 +148,24 @@ def plan_outputs(
         ]
         return page, [pictures]
     return page, [
-        [output.with_name(f"{output.stem}-{file_name_part(name)}{each}") for each in suffixes]
-        for name in _unique_stems(solutions)
+        [output.with_name(f"{output.stem}-{name}{each}") for each in suffixes]
+        for name in _unique_names(solutions)
     ]
 
 
-def _unique_stems(paths: tuple[Path, ...]) -> list[str]:
-    """Return the stem of each file, with a number if an earlier file has the same."""
-    stems: list[str] = []
+def _unique_names(paths: tuple[Path, ...]) -> list[str]:
+    """Return the part of a file name for each path: its stem, numbered if an earlier one is equal.
+
+    Names that differ only in case are equal, as on the file systems of macOS and Windows.
+    """
+    names: dict[str, str] = {}
     for path in paths:
-        numbered = (f"{path.stem}-{number}" for number in itertools.count(2))
-        names = itertools.chain([path.stem], numbered)
-        stems.append(next(name for name in names if name not in stems))
-    return stems
+        stem = file_name_part(path.stem)
+        numbered = (f"{stem}-{number}" for number in itertools.count(2))
+        candidates = itertools.chain([stem], numbered)
+        name = next(name for name in candidates if name.casefold() not in names)
+        names[name.casefold()] = name
+    return list(names.values())
 
 
 def _match_sessions(solutions: tuple[Path, ...], sessions: tuple[Path, ...]) -> list[Path | None]:

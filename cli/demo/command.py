@@ -78,11 +78,11 @@ def command(
 
     chosen = [name for name in SYSTEMS if name in systems or not systems]
     report = output or (keep or Path()) / REPORT
-    if keep is not None:
-        options.make_folder(keep, "--keep")
-        for path in (path for name in chosen for path, _ in kept(keep, name)):
-            options.guard_output(path, overwrite=overwrite)
-    options.guard_output(report, overwrite=overwrite)
+    if keep is None:
+        options.guard_output(report, overwrite=overwrite)
+    else:
+        files = [report, *(path for name in chosen for path, _ in kept(keep, name))]
+        options.prepare_folder(keep, files, overwrite=overwrite, option="--keep")
 
     start = time.perf_counter()
     folder: AbstractContextManager[str | Path] = (

@@ -39,7 +39,7 @@ LIF_VERSIONS = ("1.0.0", "2.0.0")
 @click.option(
     "--resolution",
     "resolution_mm",
-    type=click.FloatRange(0, min_open=True),
+    type=options.POSITIVE,
     default=10.0,
     show_default=True,
     metavar="MM",
@@ -158,5 +158,5 @@ def _stamp(path: Path) -> datetime:
     from datetime import UTC, datetime
 
     given = os.environ.get("SOURCE_DATE_EPOCH", "")
-    seconds = int(given) if given.isdigit() else int(path.stat().st_mtime)
+    seconds = int(given or path.stat().st_mtime)
     return datetime.fromtimestamp(seconds, UTC)

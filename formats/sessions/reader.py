@@ -165,7 +165,7 @@ class Session:
                 for channel, time_ns, data in mcap_file.read_messages(stream, segment, topic_of):
                     count += 1
                     if time_ns > MAX_TIME_NS:
-                        raise time_error(self.path, topic_of[channel], time_ns)
+                        raise _log_time_error(self.path, topic_of[channel], time_ns)
                     yield topic_of[channel], time_ns, data
             _check_count(self.index, count, topic_of)
 
@@ -261,7 +261,7 @@ class RandomAccess:
             _check_count(self._session.index, len(found), channels)
         last_ns = max((position.time_ns for position in found), default=0)
         if last_ns > MAX_TIME_NS:
-            raise time_error(self._session.path, topic, last_ns)
+            raise _log_time_error(self._session.path, topic, last_ns)
         return found
 
     def payload(self, position: MessagePosition) -> bytes:
@@ -305,14 +305,28 @@ def find_damage(path: str | os.PathLike[str]) -> str | None:
         return describe_damage(salvage(stream))
 
 
-def time_error(path: str | os.PathLike[str], topic: str, time_ns: int) -> FormatError:
-    """Return the error for a time that int64 nanoseconds do not hold."""
+def time_error(
+    path: str | os.PathLike[str], topic: str, time_ns: int, hint: str | None = None
+) -> FormatError:
+    """Return the error for a time that int64 nanoseconds do not hold.
+
+    ``hint`` is the remedy if the time is that of the message, and not one in its payload.
+    """
     return FormatError(
         f"a message has the time {time_ns} ns, after the year 2262",
         file=path,
         where=topic,
-        hint="Set the clock of the recorder, and record again",
+        hint=hint or "Set the clock of the recorder, and record again",
     )
+
+
+def _log_time_error(path: str, topic: str, time_ns: int) -> FormatError:
+    hint = f"`{_recover_command(path)}` leaves such messages out"
+    return time_error(path, topic, time_ns, hint)
+
+
+def _recover_command(path: str | os.PathLike[str]) -> str:
+    return f"locatk recover {shlex.quote(os.fspath(path))} -o whole.mcap"
 
 
 def _check_count(index: Index, count: int, channels: Iterable[int]) -> None:
@@ -356,10 +370,9 @@ def damage_as_format_error(path: str | os.PathLike[str]) -> Iterator[None]:
             hint="Give a session made by `locatk capture`, `import` or `simulate`",
         ) from None
     except DamageError as damage:
-        command = f"locatk recover {shlex.quote(os.fspath(path))} -o whole.mcap"
         raise FormatError(
             str(damage),
             file=path,
             where=None if damage.offset is None else f"byte {damage.offset}",
-            hint=f"`{command}` saves the undamaged rest",
+            hint=f"`{_recover_command(path)}` saves the undamaged rest",
         ) from None

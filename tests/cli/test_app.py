@@ -330,17 +330,47 @@ def test_termination_cleans_up(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="streams of POSIX")
-@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", "2>/dev/full"])
-def test_results_are_written_without_standard_streams(
-    session: Path, tmp_path: Path, closed: str
+@pytest.mark.parametrize(
+    ("closed", "status"), [("<&- >&- 2>&-", 1), ("<&- 2>&-", 0), ("2>/dev/full", 0)]
+)
+def test_files_are_written_without_standard_streams(
+    session: Path, tmp_path: Path, closed: str, status: int
 ) -> None:
     output = tmp_path / "truth.tum"
     command = f"export {session} --format tum -o {output} {closed}"
     done = subprocess.run(
         f"{sys.executable} -m locatk.cli {command}", shell=True, capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == status, done.stderr
     assert len(output.read_text().splitlines()) == 20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="streams of POSIX")
+@pytest.mark.parametrize("command", ["--help", "export SESSION --format csv -o -"])
+def test_results_on_a_closed_stdout_are_lost(session: Path, command: str) -> None:
+    done = subprocess.run(
+        f"{sys.executable} -m locatk.cli {command.replace('SESSION', str(session))} >&-",
+        shell=True,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: the standard output is closed")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["abc", "-1", "1e30", "9" * 30, "\u00b2"])
+def test_an_impossible_source_date_is_refused(
+    locatk: Run, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", text)
+    result = locatk("tag", "--help")
+    assert result.exit_code == 1
+    assert "SOURCE_DATE_EPOCH is" in result.stderr
+    assert result.stderr.count("\n") == 1
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
+    assert locatk("tag", "--help").exit_code == 0
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "1e999"])

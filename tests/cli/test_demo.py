@@ -106,5 +106,15 @@ def test_alone_it_leaves_the_report_only(locatk, tmp_path: Path, monkeypatch) ->
     assert "report.html" in again.stderr
 
 
+def test_a_refusal_leaves_no_folder(locatk, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("locatk.cli.demo.command.run_system", None)
+    report = tmp_path / "mine.html"
+    report.write_text("mine")
+    result = locatk("demo", "--keep", tmp_path / "kept", "-o", report)
+    assert result.exit_code == 1
+    assert "mine.html" in result.stderr
+    assert not (tmp_path / "kept").exists()
+
+
 def test_a_wrong_name_is_refused(locatk) -> None:
     assert locatk("demo", "magnets").exit_code == 2

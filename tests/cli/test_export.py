@@ -109,6 +109,11 @@ def test_a_folder_holds_a_file_a_device(locatk, two: Path, tmp_path: Path) -> No
         "red.times.txt",
         "red.txt",
     ]
+    (out / "red.txt").unlink()
+    again = locatk("export", two, "--format", "kitti", "-o", out)
+    assert again.exit_code == 1
+    assert "--overwrite" in again.stderr
+    assert not (out / "red.txt").exists()
 
 
 def test_two_devices_never_share_a_file(locatk, requests, record, tmp_path: Path) -> None:

@@ -96,6 +96,16 @@ def test_names_of_outputs() -> None:
     assert pictures == [[Path("r-a.svg")], [Path("r-a-2.svg")], [Path("r-a-2-2.svg")]]
 
 
+def test_each_solution_has_its_own_picture() -> None:
+    """Also if their names differ only in characters that no file name may have, or in case."""
+    long = 160 * "x"
+    stems = ("a:b", "a_b", "A_B", f"{long}1", f"{long}2")
+    _, pictures = plan_outputs(tuple(Path(f"{stem}.mcap") for stem in stems), Path("r.png"), [])
+    names = [path.name for [path] in pictures]
+    assert names[:3] == ["r-a_b.png", "r-a_b-2.png", "r-A_B-3.png"]
+    assert len({name.casefold() for name in names}) == len(stems)
+
+
 @pytest.mark.slow
 def test_nothing_is_replaced_without_overwrite(
     solution: Path, locatk: Locatk, tmp_path: Path

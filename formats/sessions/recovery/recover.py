@@ -25,6 +25,7 @@ from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.mcap_file import (
     CAPTURE_RECORD,
     CHANNELS_RECORD,
+    MAX_TIME_NS,
     MESSAGE_HEAD,
     SESSION_RECORD,
     DamageError,
@@ -86,6 +87,9 @@ class Recovered:
         None if the file does not state how many there were.
     orphans : int
         Messages in intact chunks whose channel is defined nowhere; not saved.
+    late : int
+        Messages in intact chunks with a time that no reader accepts (:data:`MAX_TIME_NS`); not
+        saved, and lost messages of their topics.
     nameless : tuple of str
         Topics whose schema is lost; saved without it.
     unconfirmed : tuple of str
@@ -112,6 +116,7 @@ class Recovered:
     lost_attachments: int | None
     lost_metadata: int | None
     orphans: int
+    late: int
     nameless: tuple[str, ...]
     unconfirmed: tuple[str, ...]
     losses: tuple[Loss, ...]
@@ -264,6 +269,8 @@ class Rewriter:
         Bytes that the offsets of raw bytes skip, by new id of their channels.
     orphans : int
         Messages left out, because their channel is unknown.
+    late : Counter of int
+        Messages left out, because their time is later than :data:`MAX_TIME_NS`, by new id.
     nameless : list of str
         Topics whose schema is lost; they are written without it.
     attachments, metadata : int
@@ -282,6 +289,7 @@ class Rewriter:
         self.counts: Counter[int] = Counter()
         self.missing: dict[int, int] = {}
         self.orphans = 0
+        self.late: Counter[int] = Counter()
         self.nameless: list[str] = []
         self.attachments = 0
         self.metadata = 0
@@ -322,6 +330,9 @@ class Rewriter:
                 new_id = self.new_ids.get(old_id)
                 if new_id is None:
                     self.orphans += 1
+                    continue
+                if log_ns > MAX_TIME_NS:
+                    self.late[new_id] += 1
                     continue
                 payload = bytes(data[start + MESSAGE_HEAD.size : end])
                 self._writer.add_message(new_id, log_ns, payload, publish_ns, sequence)
@@ -401,6 +412,8 @@ def _no_message_error(path: str | os.PathLike[str], recovered: Recovered) -> For
             "them",
             file=path,
         )
+    if recovered.late:
+        return FormatError("all its messages have times after the year 2262", file=path)
     return FormatError("no chunk is intact, there is no message to save", file=path)
 
 
@@ -419,12 +432,13 @@ def _summarize(source: str, output: str, found: Salvage, rewriter: Rewriter) -> 
     lost: Counter[int | str] = Counter()
     for channel, count in missing.items():
         lost[rewriter.new_ids.get(channel, f"channel {channel}")] += count
+    lost.update(rewriter.late)
     topics = [
         RecoveredTopic(
             topic,
             schema,
             rewriter.counts[new_id],
-            lost[new_id] if statistics else unknown,
+            lost[new_id] if statistics or unknown is not None else None,
             rewriter.missing.get(new_id),
         )
         for new_id, (topic, schema) in rewriter.topics.items()
@@ -445,13 +459,18 @@ def _summarize(source: str, output: str, found: Salvage, rewriter: Rewriter) -> 
         lost_attachments=lost_attachments,
         lost_metadata=lost_metadata,
         orphans=rewriter.orphans,
+        late=rewriter.late.total(),
         nameless=tuple(rewriter.nameless),
         unconfirmed=unconfirmed,
         losses=tuple(found.losses),
         tail=found.tail,
         ended=found.ended,
         damaged=not found.is_whole,
-        complete=found.ended and is_intact and not rewriter.orphans and not unconfirmed,
+        complete=(
+            found.ended
+            and is_intact
+            and not (rewriter.orphans or rewriter.late.total() or unconfirmed)
+        ),
     )
 
 
@@ -476,6 +495,7 @@ def _metadata_record(recovered: Recovered) -> dict[str, str]:
         "lost_attachments": recovered.lost_attachments,
         "lost_metadata": recovered.lost_metadata,
         "orphans": recovered.orphans,
+        "late": recovered.late,
         "unconfirmed": ", ".join(recovered.unconfirmed) or None,
         "tail_bytes": recovered.tail,
         **{f"saved:{topic.topic}": topic.saved for topic in recovered.topics},

@@ -70,7 +70,15 @@ def test_json(locatk, chunked: Path, tmp_path: Path) -> None:
     assert set(answer) == {
         *("version", "source", "output", "bytes", "complete", "damaged", "ended", "messages"),
         *("chunks", "attachments", "metadata", "topics", "lost_messages", "lost_attachments"),
-        *("lost_metadata", "lost_bytes", "tail_bytes", "damaged_chunks", "orphans", "nameless"),
+        *(
+            "lost_metadata",
+            "lost_bytes",
+            "tail_bytes",
+            "damaged_chunks",
+            "orphans",
+            "late",
+            "nameless",
+        ),
         *("unconfirmed", "losses"),
     }
     assert (answer["version"], answer["source"], answer["output"]) == (1, str(chunked), str(out))

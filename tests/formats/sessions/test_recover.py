@@ -625,6 +625,45 @@ def test_a_message_of_an_impossible_time_is_lost(tmp_path: Path) -> None:
     assert len(list(Session.open(output).messages())) == len(messages) - 1
 
 
+@pytest.mark.parametrize("has_statistics", [True, False])
+def test_a_message_of_an_impossible_time_in_a_chunk_is_lost(
+    tmp_path: Path, has_statistics: bool
+) -> None:
+    path, output = tmp_path / "late.mcap", tmp_path / "out.mcap"
+    times_ns = {"/a": [5, 6, (1 << 63) - 1], "/late": [7, 1 << 63, (1 << 64) - 1]}
+    with open(path, "wb") as stream:
+        writer = mcap.writer.Writer(stream, use_statistics=has_statistics)
+        writer.start("locatk")
+        for topic, times in times_ns.items():
+            channel = writer.register_channel(topic, "json", 0)
+            for time_ns in times:
+                writer.add_message(channel, time_ns, b"{}", 0)
+        writer.finish()
+    result = recover(path, output)
+    assert [(each.topic, each.saved, each.lost) for each in result.topics] == [
+        ("/a", 3, 0),
+        ("/late", 1, 2),
+    ]
+    assert (result.lost_messages, result.late, result.complete) == (2, 2, False)
+    saved = list(Session.open(output).messages())
+    assert [(topic, time_ns) for topic, time_ns, _ in saved] == [
+        *(("/a", time_ns) for time_ns in times_ns["/a"]),
+        ("/late", 7),
+    ]
+
+
+def test_messages_of_impossible_times_alone_are_no_recording(tmp_path: Path) -> None:
+    path = tmp_path / "late.mcap"
+    with open(path, "wb") as stream:
+        writer = mcap.writer.Writer(stream)
+        writer.start("locatk")
+        writer.add_message(writer.register_channel("/late", "json", 0), 1 << 63, b"{}", 0)
+        writer.finish()
+    with pytest.raises(FormatError, match="all its messages have times after the year 2262"):
+        recover(path, tmp_path / "out.mcap")
+    assert list(tmp_path.iterdir()) == [path]
+
+
 # ---- any damage at all
 
 SMALL: list[dict[str, object]] = [

@@ -525,8 +525,9 @@ def test_times_after_2262_are_refused(tmp_path: Path, time_ns: int) -> None:
         writer.finish()
     session = Session.open(path)
     problem = f"late.mcap:/late: a message has the time {time_ns} ns, after the year 2262"
-    with pytest.raises(FormatError, match=problem):
+    with pytest.raises(FormatError, match=problem) as caught:
         list(session.messages())
+    assert f"locatk recover {path}" in (caught.value.hint or "")
     with pytest.raises(FormatError, match=problem):
         RandomAccess(session).positions("/late")
 
