@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from hypothesis import settings
 
 # As the command does: with two threads for small matrices a busy machine takes seven times as
 # long. Before anything imports numpy.
@@ -19,6 +20,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Little of what is made until the tests begin is garbage: thousands of searches for it are a third
 # of the time that each process takes to collect the tests.
 gc.disable()
+
+
+# Other examples in each run; tests/fuzz looks for rare ones.
+settings.register_profile("suite", max_examples=50)
+settings.load_profile("suite")
 
 
 def pytest_collection_finish() -> None:
