@@ -381,6 +381,20 @@ def test_options_are_finite(locatk: Run, tmp_path: Path, number: str) -> None:
     assert "Invalid value for '--rate'" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("command", "flag"),
+    [("solve", "--speed"), ("calibrate tag", "--speed"), ("calibrate camera", "--focal-px")],
+)
+@pytest.mark.parametrize("number", ["1e-308", "1e308"])
+def test_numbers_whose_squares_overflow_are_refused(
+    locatk: Run, session: Path, tmp_path: Path, command: str, flag: str, number: str
+) -> None:
+    output = tmp_path / f"out.{'mcap' if command == 'solve' else 'toml'}"
+    result = locatk(*command.split(), session, "-o", output, flag, number)
+    assert result.exit_code == 2
+    assert f"Invalid value for '{flag}'" in result.stderr
+
+
 @pytest.mark.parametrize("end", ["\n", "\r", "\u2028"])
 def test_names_with_line_ends_are_refused(
     locatk: Run, session: Path, tmp_path: Path, end: str
