@@ -25,7 +25,7 @@ MAX_SAMPLES = 1_000_000
 """Largest number of samples of a session that is simulated as one array."""
 
 MAX_SESSION_S = 1e9
-"""Longest session that is simulated, 30 years [s]: later times do not fit int64 nanoseconds."""
+"""Longest session that is simulated, 30 years [s]; int64 nanoseconds end after 236 years."""
 
 Rule = tuple[str, bool, str]
 """Name of an option, validity of its value, and a description of the valid values."""

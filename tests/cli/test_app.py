@@ -360,7 +360,7 @@ def test_results_on_a_closed_stdout_are_lost(session: Path, command: str) -> Non
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("text", ["abc", "-1", "1e30", "9" * 30, "\u00b2"])
+@pytest.mark.parametrize("text", ["abc", "-1", "1e30", "9" * 12, "9" * 5000, "\u00b2"])
 def test_an_impossible_source_date_is_refused(
     locatk: Run, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
