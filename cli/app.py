@@ -7,6 +7,7 @@ quickly.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import warnings
@@ -85,7 +86,7 @@ def _check_environment() -> None:
     Source: https://reproducible-builds.org/specs/source-date-epoch, which demands an error.
     """
     given = os.environ.get("SOURCE_DATE_EPOCH", "")
-    if given and not (given.isascii() and given.isdecimal() and int(given) <= MAX_SOURCE_DATE_S):
+    if given and not (re.fullmatch("[0-9]{1,12}", given) and int(given) <= MAX_SOURCE_DATE_S):
         raise InputError(
             f"the environment variable SOURCE_DATE_EPOCH is {given[:20]!r}",
             hint="Set it to whole seconds since 1970, or unset it",

@@ -24,6 +24,9 @@ SESSION_START_NS = 1_767_225_600_000_000_000
 MAX_SAMPLES = 1_000_000
 """Largest number of samples of a session that is simulated as one array."""
 
+MAX_SESSION_S = 1e9
+"""Longest session that is simulated, 30 years [s]; int64 nanoseconds end after 236 years."""
+
 Rule = tuple[str, bool, str]
 """Name of an option, validity of its value, and a description of the valid values."""
 
@@ -82,6 +85,28 @@ def require_fraction_below_1(options: object, *names: str) -> Iterator[Rule]:
     """Yield the rules of options from 0 to below 1."""
     for name in names:
         yield name, 0 <= getattr(options, name) < 1, "0 to below 1"
+
+
+def check_session_size(samples: float, duration_s: float) -> None:
+    """Raise an error for a session that would not fit into the memory, or not into its times.
+
+    Raises
+    ------
+    InputError
+        There are more than :data:`MAX_SAMPLES`, or it is longer than :data:`MAX_SESSION_S`.
+    """
+    if not samples <= MAX_SAMPLES:
+        raise InputError(
+            f"a simulation of {samples:.3g} samples",
+            hint=f"At most {MAX_SAMPLES:,} are simulated: choose a shorter duration or path, a "
+            "lower rate or fewer robots",
+        )
+    if not duration_s <= MAX_SESSION_S:
+        raise InputError(
+            f"a simulation of {duration_s:.3g} s",
+            hint=f"At most {MAX_SESSION_S:.0e} s are simulated: choose a shorter duration, a "
+            "higher rate or speed",
+        )
 
 
 # ---- random numbers, times, sensors, truth

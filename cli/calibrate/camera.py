@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     click.option("--device", metavar="NAME", help="Camera to use, if the session has several."),
     click.option(
         "--focal-px",
-        type=click.FloatRange(min=0.0, min_open=True),
+        type=options.POSITIVE,
         metavar="PX",
         help="Known focal length.  [default: estimated from the frames]",
     ),

@@ -52,7 +52,7 @@ MEASURED_LENGTH = click.FloatRange(50.0, 150.0)
     click.option(
         "--pitch",
         "pitch_mm",
-        type=click.FloatRange(min=0.0, min_open=True),
+        type=options.POSITIVE,
         metavar="MM",
         help="Recommend a dot for this pitch.  [default: recommend a pitch, too]",
     ),

@@ -81,8 +81,8 @@ def command(
     if keep is None:
         options.guard_output(report, overwrite=overwrite)
     else:
-        files = [report, *(path for name in chosen for path, _ in kept(keep, name))]
-        options.prepare_folder(keep, files, overwrite=overwrite, option="--keep")
+        outputs = [report, *(path for name in chosen for path, _ in kept(keep, name))]
+        options.prepare_folder(keep, outputs, overwrite=overwrite, option="--keep")
 
     start = time.perf_counter()
     folder: AbstractContextManager[str | Path] = (

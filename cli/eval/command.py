@@ -89,7 +89,7 @@ offset_option = click.option(
     ),
     click.option(
         "--max-diff",
-        type=click.FloatRange(0, min_open=True),
+        type=options.POSITIVE,
         default=0.01,
         show_default=True,
         metavar="SECONDS",
@@ -97,7 +97,7 @@ offset_option = click.option(
     ),
     click.option(
         "--max-gap",
-        type=click.FloatRange(0, min_open=True),
+        type=options.POSITIVE,
         default=0.5,
         show_default=True,
         metavar="SECONDS",

@@ -87,7 +87,7 @@ landmark_options = section(
     ),
     click.option(
         "--circle",
-        type=click.FloatRange(min=0, min_open=True, max=1000),
+        type=options.PositiveNumber(1e-9, 1000),
         metavar="MM",
         help="Radius of the circle of sensors.  [default: that of --map]",
     ),

@@ -19,7 +19,7 @@ polaris_options = section(
     "For polaris-csv",
     click.option(
         "--spacing",
-        type=click.FloatRange(min=0, min_open=True, max=1000),
+        type=options.PositiveNumber(1e-9, 1000),
         metavar="MM",
         help="Distance between neighbouring sensors. Required (published runs: 20).",
     ),

@@ -30,14 +30,14 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
     click.option(
         "--pitch",
         "pitch_mm",
-        type=click.FloatRange(0, min_open=True),
+        type=options.POSITIVE,
         metavar="MM",
         help="Distance between neighbouring cells.  [default: the largest that fits the positions]",
     ),
     click.option(
         "--tolerance",
         "tolerance_mm",
-        type=click.FloatRange(0, min_open=True),
+        type=options.POSITIVE,
         default=10.0,
         show_default=True,
         metavar="MM",

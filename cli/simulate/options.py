@@ -19,10 +19,10 @@ from click.core import ParameterSource
 from locatk.cli import console, options
 from locatk.cli.command import Command, combine
 from locatk.formats.artifacts.kinds import (
-    ANY_NUMBER,
     Boolean,
     FilePath,
     Integer,
+    InvalidValueError,
     Kind,
     ListOf,
     Number,
@@ -186,19 +186,37 @@ _METAVARS: dict[type, str] = {FilePath: "FILE", Integer: "N", Number: "NUMBER"}
 def _parameter_type(kind: Kind, metavar: str) -> click.ParamType:
     """Return click's type of a kind of value."""
     if isinstance(kind, Number):
-        if kind == ANY_NUMBER:
-            return click.FLOAT
-        return click.FloatRange(
-            None if math.isinf(kind.low) else kind.low,
-            None if math.isinf(kind.high) else kind.high,
-            min_open=kind.is_low_excluded,
-            max_open=kind.is_high_excluded,
-        )
+        return _Number(kind)
     if isinstance(kind, Integer):
         return click.IntRange(kind.low, kind.high)
     if isinstance(kind, Text):
         return click.Choice(kind.choices) if kind.choices else click.STRING
     return click.STRING if isinstance(kind, FilePath) else _Form(kind, metavar)
+
+
+class _Number(click.FloatRange):
+    """Number within the range and the magnitudes of its kind."""
+
+    def __init__(self, kind: Number) -> None:
+        self._kind = kind
+        super().__init__(
+            None if math.isinf(kind.low) else kind.low,
+            None if math.isinf(kind.high) else kind.high,
+            min_open=kind.is_low_excluded,
+            max_open=kind.is_high_excluded,
+        )
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the number."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            return number  # Command refuses it.
+        try:
+            return self._kind.parse(number)
+        except InvalidValueError as error:
+            self.fail(f"{number:g}: {error.message}.", param, ctx)
 
 
 class _Form(click.ParamType):

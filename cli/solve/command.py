@@ -46,7 +46,7 @@ class TemplateResolution(click.ParamType):
 
 speed_option = click.option(
     "--speed",
-    type=click.FloatRange(min=0, min_open=True, max=100),
+    type=options.PositiveNumber(1e-9, 100),
     metavar="M/S",
     help="Polaris: speed of the array over the tags, if it is known.",
 )
@@ -64,7 +64,7 @@ templates_option = click.option(
 
 odometry_noise_option = click.option(
     "--odometry-noise",
-    type=click.FloatRange(min=0, min_open=True, max=90),
+    type=options.PositiveNumber(1e-9, 90),
     metavar="DEG",
     help="Landmarks: random walk of the heading by odometry, in deg per square root of a metre.  "
     "[default: estimated]",

@@ -187,6 +187,9 @@ MAX_MAGNITUDE = 1e12
 """Largest number in an artifact, in the unit of its key: a million kilometres in millimetres. The
 squares of much larger ones overflow."""
 
+MIN_POSITIVE = 1 / MAX_MAGNITUDE
+"""Smallest number of a range that begins above 0; the reciprocals of much smaller ones overflow."""
+
 MAX_VARIANCE = MAX_MAGNITUDE**2
 """Largest element of a covariance."""
 
@@ -235,6 +238,10 @@ class Number:
         if abs(number) > self.max_magnitude:
             raise InvalidValueError(
                 f"expected a number of at most {self.max_magnitude:g} in magnitude{symbol}"
+            )
+        if self.is_low_excluded and 0 < number - self.low < MIN_POSITIVE:
+            raise InvalidValueError(
+                f"expected a number that exceeds {self.low:g} by {MIN_POSITIVE:g} or more{symbol}"
             )
         is_above = number > self.low if self.is_low_excluded else number >= self.low
         is_below = number < self.high if self.is_high_excluded else number <= self.high

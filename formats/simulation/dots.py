@@ -13,6 +13,7 @@ from locatk.core.dots.sheet import Manifest
 from locatk.core.dots.simulation import session as simulation
 from locatk.core.dots.simulation.paths import PATHS
 from locatk.core.dots.simulation.session import SimulationOptions
+from locatk.core.simulation import check_session_size
 from locatk.formats.artifacts import sheets
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
@@ -315,6 +316,7 @@ def simulation_options(settings: Mapping[str, Any], manifest: Manifest) -> Simul
     duration_s = values.pop(DURATION, None)
     if duration_s is not None:
         rate_hz = values.get("rate_hz", SimulationOptions.rate_hz)
+        check_session_size(duration_s * rate_hz, duration_s)
         values["frames"] = max(1, round(duration_s * rate_hz))
     return SimulationOptions(
         camera=sheets.read_camera(Path(file)) if file else simulation.camera(distortion),

@@ -360,7 +360,7 @@ def test_results_on_a_closed_stdout_are_lost(session: Path, command: str) -> Non
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("text", ["abc", "-1", "1e30", "9" * 30, "\u00b2"])
+@pytest.mark.parametrize("text", ["abc", "-1", "1e30", "9" * 12, "9" * 5000, "\u00b2"])
 def test_an_impossible_source_date_is_refused(
     locatk: Run, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
@@ -379,6 +379,20 @@ def test_options_are_finite(locatk: Run, tmp_path: Path, number: str) -> None:
     result = locatk("import", "images", tmp_path, "--rate", number, "-o", tmp_path / "run.mcap")
     assert result.exit_code == 2
     assert "Invalid value for '--rate'" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "flag"),
+    [("solve", "--speed"), ("calibrate tag", "--speed"), ("calibrate camera", "--focal-px")],
+)
+@pytest.mark.parametrize("number", ["1e-308", "1e308"])
+def test_numbers_whose_squares_overflow_are_refused(
+    locatk: Run, session: Path, tmp_path: Path, command: str, flag: str, number: str
+) -> None:
+    output = tmp_path / f"out.{'mcap' if command == 'solve' else 'toml'}"
+    result = locatk(*command.split(), session, "-o", output, flag, number)
+    assert result.exit_code == 2
+    assert f"Invalid value for '{flag}'" in result.stderr
 
 
 @pytest.mark.parametrize("end", ["\n", "\r", "\u2028"])

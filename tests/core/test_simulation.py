@@ -11,8 +11,11 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.simulation import (
+    MAX_SAMPLES,
+    MAX_SESSION_S,
     SESSION_START_NS,
     check_options,
+    check_session_size,
     exact_trajectory,
     quantize,
     random_stream,
@@ -76,3 +79,17 @@ def test_truth_is_exact() -> None:
     assert not flat.covariance.any()
     raised = exact_trajectory("a", "floor", time_ns, np.full((2, 3), 2.0), np.zeros(2))
     assert raised.position.tolist() == [[2.0] * 3] * 2
+
+
+def test_sessions_have_a_largest_size() -> None:
+    check_session_size(MAX_SAMPLES, MAX_SESSION_S)
+    assert stamps_ns(np.array([MAX_SESSION_S]))[0] > SESSION_START_NS
+    for samples, duration_s in (
+        (MAX_SAMPLES + 1, 1.0),
+        (math.inf, 1.0),
+        (math.nan, 1.0),
+        (2, 2 * MAX_SESSION_S),
+        (2, math.inf),
+    ):
+        with pytest.raises(InputError, match="a simulation of "):
+            check_session_size(samples, duration_s)

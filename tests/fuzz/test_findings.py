@@ -17,7 +17,7 @@ from locatk.core.landmarks.halls import HallSensors
 from locatk.core.landmarks.simulation.options import SimulationOptions
 from locatk.core.trajectory import Trajectory
 from locatk.formats import images
-from locatk.formats.artifacts.kinds import InvalidValueError, Number
+from locatk.formats.artifacts.kinds import POSITIVE, InvalidValueError, Number
 from locatk.formats.capture.redecoding import decode
 from locatk.formats.devices.lines.columns import without_overflow
 from locatk.formats.importers.landmark_csv import read_landmarks
@@ -84,6 +84,9 @@ def test_numbers_of_artifacts_have_a_limit() -> None:
     assert Number().parse(-1e12) == -1e12
     with pytest.raises(InvalidValueError, match=r"at most 1e\+12 in magnitude"):
         Number().parse(-1e308)
+    assert POSITIVE.parse(1e-12) == 1e-12
+    with pytest.raises(InvalidValueError, match="exceeds 0 by 1e-12"):
+        POSITIVE.parse(1e-300)
 
 
 def test_values_beyond_float32_are_missing() -> None:

@@ -27,7 +27,9 @@ from locatk.core.dots.simulation.printed_paper import PrintedPaper
 from locatk.core.errors import InputError
 from locatk.core.paper_sizes import paper_size
 from locatk.core.simulation import (
+    MAX_SAMPLES,
     check_options,
+    check_session_size,
     exact_trajectory,
     random_stream,
     require_fraction,
@@ -71,6 +73,10 @@ MAX_TILT_RAD = np.pi / 4
 
 MAX_DOT_PITCHES = 2 / 3
 """Largest diameter of a dot: dots that are displaced towards each other touch beyond that."""
+
+
+MAX_MOTION_PX = 100.0
+"""Longest motion blur that is simulated [px]: a frame is rendered several times per pixel of it."""
 
 
 def camera(distortion: float = LENS_DISTORTION) -> Camera:
@@ -173,19 +179,30 @@ class SimulationOptions:
     def __post_init__(self) -> None:
         tilt = np.hypot(self.pitch_rad, self.roll_rad) + abs(self.tilt_rad)
         scale = self.printer_scale or (1.0, 1.0)
+        max_blur_m = MAX_MOTION_PX * self.metres_per_px
+        is_blur_given = self.path != "curve" or self.motion_px is not None
         # Light from beyond the frame is blurred into it, so that the lens is evaluated there, too.
         margin_px = 0.75 * float(np.linalg.norm(self.camera.size))
         lens_slope = 1 + min(self.camera.radial_px, 0.0) * margin_px**2
         check_options(
             self,
             (
-                ("frames", self.frames >= 1, "at least 1"),
+                ("frames", 1 <= self.frames <= MAX_SAMPLES, f"1 to {MAX_SAMPLES}"),
                 *require_positive(self, "rate_hz", "metres_per_px"),
                 *require_not_negative(self, "speed_mps", "noise", "seed"),
                 *require_fraction(self, "missing", "dust", "contrast", "vignette", "gradient"),
                 ("path", self.path in PATHS, "one of " + ", ".join(PATHS)),
                 ("exposure_s", 0 <= self.exposure_s * self.rate_hz < 1, "less than a frame's time"),
-                ("motion_px", self.motion_px is None or 0 <= self.motion_px <= 100, "0 to 100"),
+                (
+                    "speed_mps",
+                    is_blur_given or self.speed_mps * self.exposure_s <= max_blur_m,
+                    f"a motion blur of at most {MAX_MOTION_PX:g} px, by speed and exposure",
+                ),
+                (
+                    "motion_px",
+                    self.motion_px is None or 0 <= self.motion_px <= MAX_MOTION_PX,
+                    f"0 to {MAX_MOTION_PX:g}",
+                ),
                 ("camera", lens_slope > 0.2, "a camera whose lens does not fold the frame"),
                 (
                     "tilt_rad",
@@ -267,6 +284,7 @@ def simulate(
         The manifest has no such sheet, or no such codec.
     """
     options, manifest = options or SimulationOptions(), manifest or sheet()
+    check_session_size(options.frames, options.frames / options.rate_hz)
     time_s = np.arange(options.frames) / options.rate_hz
     numbers = _visible_sheets(manifest, options.sheet)
     true_manifest = replace(manifest, scale=options.printer_scale or manifest.scale)

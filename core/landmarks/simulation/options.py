@@ -40,6 +40,10 @@ MAX_HEADING_OFFSET_RAD = math.pi / 4
 STRATEGIES = ("paper", "published", "path", "pass")
 
 
+MAX_LANDMARKS = 10_000
+"""Most landmarks that a robot visits. At a few seconds each, the sensors take about a million
+samples."""
+
 MAX_WAYPOINT_M = 1000.0
 """Largest coordinate of a waypoint [m]. At 0.1 m/s and 200 Hz, a drive over this distance has two
 million samples."""
@@ -267,7 +271,11 @@ class SimulationOptions:
             (
                 ("strategy", self.strategy in STRATEGIES, f"one of {', '.join(STRATEGIES)}"),
                 ("start", _finite(self.start), "three numbers"),
-                ("landmarks", self.landmarks is None or self.landmarks >= 1, "1 or more"),
+                (
+                    "landmarks",
+                    self.landmarks is None or 1 <= self.landmarks <= MAX_LANDMARKS,
+                    f"1 to {MAX_LANDMARKS}",
+                ),
                 ("spins", self.spins is None or self.spins >= 0, from_0),
                 ("waypoints", all(map(_finite, self.waypoints)), "numbers"),
                 (

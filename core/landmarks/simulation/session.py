@@ -31,12 +31,10 @@ from locatk.core.landmarks.simulation.options import SimulationOptions as Simula
 from locatk.core.landmarks.simulation.passes import trajectory
 from locatk.core.landmarks.simulation.robot import RobotLimits as RobotLimits
 from locatk.core.landmarks.simulation.strategy import VISIT_RADIUS_M, steer
+from locatk.core.simulation import check_session_size
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
-MAX_SESSION_SAMPLES = 1_000_000
-"""Largest number of samples of a session."""
 
 MAX_VISIT_GAP_NS = 1_000_000_000
 """Longest time without a sensor near the landmark within one visit [ns]: sensors on both sides of
@@ -142,11 +140,7 @@ def simulate(
         robot, notes, approaches = drive_closed_loop(floor, installed, options, instruments, driver)
     else:
         robot, notes = steer(floor, installed, options)
-    if robot.time_s * options.rate_hz >= MAX_SESSION_SAMPLES:
-        raise InputError(
-            f"a simulation of {robot.time_s * options.rate_hz:.0f} samples",
-            hint="Change the rate, the speed or the way",
-        )
+    check_session_size(robot.time_s * max(options.rate_hz, options.odometry_hz), robot.time_s)
     readout = instruments.read(robot)
     time_ns = readout.measurements.samples.time_ns
     return SimulatedSession(

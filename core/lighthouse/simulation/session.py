@@ -35,7 +35,9 @@ from locatk.core.lighthouse.simulation.optics import (
 )
 from locatk.core.lighthouse.simulation.paths import RobotPath
 from locatk.core.simulation import (
+    MAX_SAMPLES,
     check_options,
+    check_session_size,
     exact_trajectory,
     require_fraction_below_1,
     require_not_negative,
@@ -127,7 +129,7 @@ class SimulationOptions:
         check_options(
             self,
             (
-                ("robots", self.robots >= 1, "at least 1"),
+                ("robots", 1 <= self.robots <= MAX_SAMPLES, f"1 to {MAX_SAMPLES}"),
                 ("stations", 1 <= self.stations <= 16, "1 to 16"),
                 *require_positive(self, "duration_s", "report_hz"),
                 *require_not_negative(self, "noise_rad", "seed"),
@@ -179,6 +181,9 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
     rotor's zero in steps of the station's own clock: an error of that clock affects times only.
     """
     options = options or SimulationOptions()
+    photodiodes = 1 if options.receiver is None else len(options.receiver)
+    rate_hz = TRUTH_RATE_HZ + options.report_hz * options.stations * photodiodes
+    check_session_size(options.robots * options.duration_s * rate_hz, options.duration_s)
     # One random stream for each aspect: more noise, for example, leaves the paths as they are.
     station_rng, path_rng, report_rng, noise_rng, occlusion_rng, fault_rng = (
         np.random.default_rng(s) for s in np.random.SeedSequence(options.seed).spawn(6)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.polaris.tag import PlanarPose
+from locatk.core.simulation import check_session_size
 
 Array = NDArray[np.float64]
 
@@ -210,6 +211,7 @@ class ArrayTrajectory:
         self._speed_wobble, self._yaw_wobble, self._height_wobble = (Wobble(rng) for _ in range(3))
         # The table goes beyond the end of the path: the conversion of the last sample ends there.
         total_s = speed_profile.max_duration_s(path.length_m + wobble_length_m)
+        check_session_size(0, total_s)
         rest_s = speed_profile.rest_s
         step_s = max(
             wobble_length_m / speed_profile.speed_mps / NODES_PER_WOBBLE,

@@ -32,7 +32,12 @@ from locatk.core.polaris.simulation.sensors import (
     received_frames,
 )
 from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, Tags
-from locatk.core.simulation import MAX_SAMPLES, exact_trajectory, random_stream, stamps_ns
+from locatk.core.simulation import (
+    check_session_size,
+    exact_trajectory,
+    random_stream,
+    stamps_ns,
+)
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -128,7 +133,8 @@ def simulate(
     # A delay may be negative; the first sample is taken after the start of the drive.
     begin_s = max(0.0, -float(options.array.delay_s.min()))
     frames = (trajectory.duration_s - begin_s) * options.rate_hz + 1
-    if not 2 <= frames <= MAX_SAMPLES:
+    check_session_size(frames, trajectory.duration_s)
+    if frames < 2:
         raise InputError(
             f"a simulation of {frames:.0f} frames", hint="Change the rate, the speed or the route"
         )

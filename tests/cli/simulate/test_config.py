@@ -134,3 +134,32 @@ def test_help_has_groups_units_and_defaults(locatk, system: str) -> None:
         assert setting.flag.split("/")[0] in text
     assert " ".join(text.split()).count("[default: ") == len(flags)
     assert "--print-config > sim.toml" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "reason"),
+    [
+        ("polaris --run-up 1e308", 2, "at most 1e+12"),
+        ("lighthouse --duration 1e308", 2, "at most 1e+12"),
+        ("lighthouse --duration 1e6", 1, "samples"),
+        ("lighthouse --robots 300", 1, "samples"),
+        (f"lighthouse --robots {10**400}", 1, "robots"),
+        ("dots --duration 1e308", 2, "at most 1e+12"),
+        ("dots --duration 1e9", 1, "samples"),
+        ("dots --rate 1e-308", 2, "exceeds 0 by 1e-12"),
+        ("dots --rate 1e-12", 1, "1e+14 s"),
+        ("dots --speed 1000", 1, "motion blur"),
+        ("landmarks MAP --landmarks 1000000", 1, "1 to 10000"),
+        ("landmarks MAP --rate 1e9", 1, "samples"),
+    ],
+)
+def test_sizes_beyond_the_memory_are_refused(
+    locatk, tmp_path: Path, words: str, status: int, reason: str
+) -> None:
+    system = words.split()[0]
+    args = words.replace("MAP", " ".join(map(str, inputs(system, tmp_path)))).split()
+    result = locatk("simulate", *args, "-o", tmp_path / "run.mcap")
+    assert result.exit_code == status
+    assert reason in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "run.mcap").exists()

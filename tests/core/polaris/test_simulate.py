@@ -723,9 +723,10 @@ def test_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
         (Tags(), {"clearance_m": 2e-4}, "magnet"),
         (Tags(), {"clearance_m": 2e-3, "debris": 3}, "debris"),
         (Tags(), {"clearance_m": 0.01, "height_wobble_m": 0.01}, "magnet"),
-        (Tags(), {"speed_mps": 1e-6}, "frames"),
-        (Tags(), {"acceleration_mps2": 1e-12}, "frames"),
+        (Tags(), {"speed_mps": 1e-6}, "samples"),
+        (Tags(), {"acceleration_mps2": 1e-12}, "samples"),
         (Tags(), {"speed_mps": 1e3}, "frames"),
+        (Tags(), {"run_up_m": 1e12}, "simulation of .* s$"),
     ],
 )
 def test_settings_that_contradict_the_tags_are_refused(
