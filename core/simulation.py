@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 SESSION_START_NS = 1_767_225_600_000_000_000
 """Start of every simulated session, 2026-01-01T00:00:00Z [ns since 1970]."""
 
-MAX_SAMPLES = 1_000_000
-"""Largest number of samples of a session that is simulated as one array."""
+MAX_SAMPLES = 10_000_000
+"""Largest number of samples of a session that is simulated as one array, in about 10 GB."""
 
 MAX_SESSION_S = 1e9
 """Longest session that is simulated, 30 years [s]; int64 nanoseconds end after 236 years."""
