@@ -47,6 +47,14 @@ class PositiveNumber(click.FloatRange):
         return number
 
 
+    def _describe_range(self) -> str:
+        """Return the range for the help, without a limit that nobody comes near."""
+        return "x>0" if self.most >= MIN_HIDDEN_LIMIT else f"0<x<={self.most:g}"
+
+
+MIN_HIDDEN_LIMIT = 1e5
+"""Smallest upper limit of a number that the help does not show."""
+
 POSITIVE = PositiveNumber(1e-9, 1e9)
 """Positive numbers; the squares and ratios of much larger or smaller ones overflow."""
 

@@ -206,6 +206,10 @@ class _Number(click.FloatRange):
             max_open=kind.is_high_excluded,
         )
 
+    def _describe_range(self) -> str:
+        """Return the range for the help, nothing if there is none."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
