@@ -46,7 +46,6 @@ class PositiveNumber(click.FloatRange):
             self.fail(f"{number:g} is not from {self.least:g} to {self.most:g}.", param, ctx)
         return number
 
-
     def _describe_range(self) -> str:
         """Return the range for the help, without a limit that nobody comes near."""
         return "x>0" if self.most >= MIN_HIDDEN_LIMIT else f"0<x<={self.most:g}"
