@@ -39,6 +39,7 @@ def test_simulated_poses_agree_with_the_truth(locatk, simulated: Path, tmp_path:
     assert score["mae_m"] < 0.005
 
 
+@pytest.mark.slow
 def test_a_scene_of_another_site_gives_status_3(locatk, simulated: Path, tmp_path: Path) -> None:
     other, scene = tmp_path / "other.mcap", tmp_path / "scene.toml"
     args = ("--seed", 8, "--duration", 10)

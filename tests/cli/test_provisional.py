@@ -54,6 +54,7 @@ def test_text_and_json_of_solve(probability: float | None, shown: str | None) ->
     assert "0.97" in losses.get("provisional", "0.97")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("probability", [0.97, 0.9995, None])
 def test_info_and_report(locatk, tmp_path: Path, probability: float | None) -> None:
     path, page = tmp_path / "solved.mcap", tmp_path / "report.html"

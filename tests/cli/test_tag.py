@@ -80,6 +80,7 @@ def test_lengths_come_back_as_given(locatk, tmp_path: Path) -> None:
     assert (made.grade, made.remanence_t) == ("N42", 1.2)
 
 
+@pytest.mark.slow
 def test_a_family_and_its_bill(locatk, tmp_path: Path) -> None:
     path, bom = tmp_path / "tag.toml", tmp_path / "parts.csv"
     result = design(locatk, path, "--count", 20, "--min-distance", 3, "--bom", bom)

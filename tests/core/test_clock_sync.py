@@ -191,6 +191,7 @@ def test_many_wrong_ticks_in_one_call() -> None:
     assert np.all((steps >= (1 - SLEW_LIMIT) * 2000) & (steps <= 2000))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bits", [64, 32])
 def test_a_first_tick_that_is_wrong_does_not_last(bits: int) -> None:
     seconds = sampled(100, 0, 20)

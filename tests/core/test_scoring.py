@@ -79,6 +79,7 @@ def test_truth_out_of_order_and_empty_ones() -> None:
         evaluate_pair(TRUTH, empty, offset_s="auto")
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 10), min_size=1, max_size=50))
 def test_figures_follow_the_papers_convention(lengths: list[float]) -> None:
     time = np.arange(len(lengths)) * 0.1
@@ -126,6 +127,7 @@ def test_planar_alignments_do_not_shift_along_z_nor_unmirror() -> None:
     assert evaluate_pair(TRUTH, mirrored, align="sim2").mae > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [-0.3181, 0.0, 0.047, 0.9])
 @pytest.mark.parametrize("align", ["none", "sim2", "se3"])
 def test_offset_is_estimated_on_the_held_out_part(offset: float, align: str) -> None:

@@ -133,6 +133,7 @@ MODULES_WITH_OTHER_FILES = {
 }
 
 
+@pytest.mark.slow
 def test_all_readers_open_files_here() -> None:
     folder = Path(locatk.formats.__path__[0])
     found = []

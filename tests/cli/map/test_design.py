@@ -302,6 +302,7 @@ def test_check_proves_a_map(locatk, made: Path) -> None:
     assert all(len(line) <= 80 for line in result.stdout.splitlines()[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_terminal_shows_that_maps_are_checked(
     locatk, made: Path, monkeypatch: pytest.MonkeyPatch, count: int

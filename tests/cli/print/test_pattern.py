@@ -34,6 +34,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.slow
 def test_a_sheet_its_manifest_and_the_ledger(locatk, tmp_path: Path) -> None:
     out = tmp_path / "sheet.pdf"
     result = locatk("print", "pattern", "-o", out)
@@ -78,6 +79,7 @@ def test_json_is_all_that_is_printed(locatk, tmp_path: Path) -> None:
             assert tuple(said[key]) == getattr(sheet, key)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "width", "height"),
     [
@@ -158,6 +160,7 @@ def test_the_ledger_may_be_named_by_the_environment(
     assert names(tmp_path / "out") == ["a.toml", "a.txt"]
 
 
+@pytest.mark.slow
 def test_tiles_form_one_floor(locatk, tmp_path: Path) -> None:
     out = tmp_path / "floor.pdf"
     result = locatk("print", "pattern", "-o", out, "--size", "A5", "--tiles", "3x2", "--json")
@@ -242,6 +245,7 @@ def test_overlay(locatk, tmp_path: Path) -> None:
     assert source.read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.slow
 def test_bad_documents(locatk, tmp_path: Path) -> None:
     from reportlab.lib.pdfencrypt import StandardEncryption
 

@@ -32,6 +32,7 @@ def inputs(system: str, folder: Path) -> tuple[Path, ...]:
     return (path,)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_the_printed_file_changes_nothing(locatk, tmp_path: Path, system: str) -> None:
     printed = locatk("simulate", system, "--print-config")

@@ -125,6 +125,7 @@ def test_derivatives_are_those_of_the_model(name: str) -> None:
         assert by_shared[..., k] == pytest.approx((after - before) / (2 * small), abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [-1.5e-5, -3.5e-6, 5e-6])
 def test_without_noise_the_camera_comes_back_exactly(k: float) -> None:
     seen = views(8, k=k, noise=0.0)

@@ -44,6 +44,7 @@ def test_covariances_agree_with_the_errors(name: str, limits: tuple[float, float
     assert limits[0] < result.nees[:2].mean() < limits[1]
 
 
+@pytest.mark.slow
 def test_frames_of_a_level_camera_agree_with_the_truth() -> None:
     """The truth of the renderer is that of the solver within a hundredth of a pitch."""
     frames = render(Disturbance(noise=0.0), 3, 32)

@@ -132,6 +132,7 @@ def test_every_heading_and_pitch(pitch: float) -> None:
     assert np.abs(lattices.parameters[:, [grid.C_U, grid.C_V]]).max() <= 0.5 + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "share"),
     [

@@ -71,6 +71,7 @@ def test_a_rotation_by_90_degrees_is_counter_clockwise() -> None:
     np.testing.assert_array_equal(rotate_symbols(page, 7), rotate_symbols(page, -1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotation", range(4))
 @pytest.mark.parametrize("name", NAMES)
 def test_8x8_windows_at_any_position_section_and_rotation(name: str, rotation: int) -> None:
@@ -122,6 +123,7 @@ def test_libdots_6x6_with_two_positions_is_not_read() -> None:
     nothing(actual)
 
 
+@pytest.mark.slow
 def test_libdots_7x7_knows_all_but_one_string() -> None:
     windows, at, sections = draw("libdots", 3000, (7, 7), 5)
     actual = decode_exact(windows, codec("libdots"))
@@ -152,6 +154,7 @@ def test_only_requested_rotations() -> None:
     assert not decode_exact(half, codec("anoto"), (0, 1, 3)).ok.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_one_wrong_bit_of_8x8_is_always_detected(name: str) -> None:
     windows, _, _ = draw(name, 6, (8, 8), 8)

@@ -166,6 +166,7 @@ def test_interpolation_reproduces_nodes_and_lines(count: int) -> None:
     np.testing.assert_allclose(slopes @ nodes, 1, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_covariance_of_a_floor_is_that_of_its_sheets() -> None:
     """Against the scatter of positions on sheets that are drawn from the covariance."""
     rng = np.random.default_rng(2)

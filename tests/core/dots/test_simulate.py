@@ -508,6 +508,7 @@ def test_impossible_settings_are_refused(wrong: dict[str, object]) -> None:
 # ---- decoys
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_decoys_are_frames_and_differ(kind: str) -> None:
     frames = decoys(kind, 6, seed=1)

@@ -232,6 +232,7 @@ ALTERED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reason", ALTERED)
 def test_mirrored_and_inverted_frames_are_named(shoot: Shoot, reason: str) -> None:
     """Also if they are few among frames without a pattern, and those with one keep their poses."""

@@ -121,6 +121,7 @@ def wrong_cells(result: CellIdentification, path: Sequence[State]) -> list[int]:
 # ---- faults
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("shift_m", "rotation_deg"),
     [((0.02, 0.0), 0), ((0.1, -0.03), 0), ((0.19, 0.0), 0), ((0.0, 0.0), 10), ((0.03, 0.0), 45)],
@@ -203,6 +204,7 @@ def test_landmarks_that_differ_from_the_map_are_misread() -> None:
 # ---- other floors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [3, 4, 5, 6, 9])
 def test_readings_of_another_floor_are_never_believed(count: int) -> None:
     floor = random_floor(1)
@@ -235,6 +237,7 @@ def test_a_heading_is_no_evidence_of_a_compass_floor() -> None:
         assert identify(visits, floor).map_probability < 0.99
 
 
+@pytest.mark.slow
 def test_long_steps_are_no_evidence_of_this_floor() -> None:
     """Odometry over many pitches leaves many cells open, here and on any other floor."""
     hops = [((2 + 7 * (k % 2), 3 + 7 * k), 0) for k in range(5)]

@@ -98,6 +98,7 @@ def starts(floor: FloorMap, every: int) -> list[State]:
     return [start for start in all_of if inside(floor, walk(start, L))][::every]
 
 
+@pytest.mark.slow
 def test_every_l_is_identified(published: FloorMap) -> None:
     for number, start in enumerate(starts(published, 11)):
         path = walk(start, L)
@@ -106,6 +107,7 @@ def test_every_l_is_identified(published: FloorMap) -> None:
         assert min(one.probability for one in estimates) > 0.9
 
 
+@pytest.mark.slow
 def test_one_misread_of_three_is_never_certain(published: FloorMap) -> None:
     random = np.random.default_rng(1)
     wrong = 0
@@ -120,6 +122,7 @@ def test_one_misread_of_three_is_never_certain(published: FloorMap) -> None:
     assert wrong > 10  # the map contains many of these misread triples
 
 
+@pytest.mark.slow
 def test_wrong_landmark_counts_once(published: FloorMap) -> None:
     """For any number of visits to it."""
     random = np.random.default_rng(2)
@@ -169,6 +172,7 @@ def test_probabilities_agree_with_enumeration(seed: int) -> None:
     assert max(weight.values()) < 1.01 * weight[path[0]]
 
 
+@pytest.mark.slow
 def test_map_of_another_floor(published: FloorMap) -> None:
     for seed in range(25):
         other = FloorMap(np.random.default_rng(seed).integers(0, CODE_COUNT, published.shape))

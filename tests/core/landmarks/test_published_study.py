@@ -72,6 +72,7 @@ def test_the_papers_figures_are_reproduced() -> None:
     assert abs(result.error_m[result.lines == 3].max() * 1e3 - 17.9) < 0.5
 
 
+@pytest.mark.slow
 def test_the_literal_rule_fails_where_two_lines_hit() -> None:
     # 27 % over 20 mm; 27.8 mm in the mean with two lines, 8.1 with three
     result = study(3, method="literal")

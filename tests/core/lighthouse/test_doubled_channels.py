@@ -255,6 +255,7 @@ def test_counts_that_are_no_numbers(world: Any) -> None:
     find_doubled_channels(sweeps)
 
 
+@pytest.mark.slow
 def test_published_counts(recordings: Path) -> None:
     for name in (
         "twoLH-2D_scene/dataset/lighthouse/data.csv",

@@ -88,6 +88,7 @@ def test_the_order_of_stations_does_not_matter(world: Any, flat: bool) -> None:
         np.testing.assert_allclose(umeyama(b, a).apply(b), a, atol=2e-3 * np.ptp(a))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 def test_the_seed_does_not_matter(world: Any, flat: bool) -> None:
     lamps = world.lamps(2, 5)
@@ -101,6 +102,7 @@ def test_the_seed_does_not_matter(world: Any, flat: bool) -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [8, 12, 30])
 def test_few_places_in_space_are_enough(world: Any, n: int) -> None:
     # The paper's Fig. 12 needs 20 for 11 mm; here the arrangement itself must be right.
@@ -140,6 +142,7 @@ def test_a_station_without_common_positions_is_left_out(world: Any) -> None:
     assert np.all(found.chosen < 80)
 
 
+@pytest.mark.slow
 def test_stations_are_linked_through_others(world: Any) -> None:
     # 1 and 16 share no place, but both share with 2 and 5.
     lamps = world.lamps(1, 2, 5, 16)

@@ -64,6 +64,7 @@ def test_fragments_continue_their_sequence(light: Any) -> None:
     assert np.all(hit | (of[~read] == -1))
 
 
+@pytest.mark.slow
 def test_other_places_do_not(light: Any) -> None:
     for shift in (-30, 17, 400):
         of, read = judged(scene(light, shift))

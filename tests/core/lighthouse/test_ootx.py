@@ -47,6 +47,7 @@ def noise(n: int, seed: int) -> Bits:
     return np.random.default_rng(seed).integers(0, 2, n).astype(np.int8)
 
 
+@pytest.mark.slow
 @given(PAYLOADS)
 def test_encodes_as_documented(payload: bytes) -> None:
     bits = ootx.encode_frame(payload)
@@ -119,6 +120,7 @@ def test_a_wrong_bit_that_all_frames_share_is_no_frame(place: int) -> None:
     assert [(f.start_rotation, f.is_valid) for f in found] == [(443 + 18, True)]
 
 
+@pytest.mark.slow
 @given(PAYLOADS, st.integers(0, 442))
 def test_one_wrong_bit_never_passes(payload: bytes, place: int) -> None:
     bits = ootx.encode_frame(payload)
@@ -134,6 +136,7 @@ def test_a_wrong_frame_among_right_ones_is_counted_not_repaired() -> None:
     assert found[2].payload != STATION
 
 
+@pytest.mark.slow
 @given(PAYLOADS, st.sets(st.integers(0, 442), max_size=ootx.MAX_SOLVED_BITS))
 def test_few_missing_bits_are_solved_for(payload: bytes, missing: set[int]) -> None:
     bits = ootx.encode_frame(payload)
@@ -228,6 +231,7 @@ def test_channels_beyond_16_are_refused() -> None:
         ootx.decode_factory_data(bytes(payload))
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(
     st.lists(st.sampled_from([-1, 0, 1]), max_size=1500),
@@ -275,6 +279,7 @@ def slow_bits(path: Path) -> dict[int, Bits]:
     return found
 
 
+@pytest.mark.slow
 def test_four_stations_of_a_libsurvive_recording(data: Path) -> None:
     """Equal, field by field, to what libsurvive stored beside it.
 

@@ -259,6 +259,7 @@ def test_noise_and_faults_do_not_move_robots_or_stations() -> None:
         np.testing.assert_array_equal(a.position, b.position)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planar", [True, False])
 def test_counts_are_whole_and_of_one_rotation(planar: bool) -> None:
     session = simulate(SimulationOptions(robots=3, stations=16, outliers=0.3, planar=planar))
@@ -341,6 +342,7 @@ def test_photodiodes_receive_only_stations_that_they_face() -> None:
     assert len(rows) > 0.95 * 2 * 3 * 10 * 30
 
 
+@pytest.mark.slow
 def test_stations_are_mounted_realistically_and_have_real_calibrations() -> None:
     for seed in range(10):
         session = simulate(SimulationOptions(stations=11, duration_s=1.0, seed=seed))
@@ -440,6 +442,7 @@ def test_occlusion_hides_the_fraction_in_blocks() -> None:
     assert abs(np.corrcoef(visible[:n], other[:n])[0, 1]) < 0.5  # each on its own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fraction", "stations"), [(0.02, 2), (0.2, 2), (0.2, 1), (0.95, 3)])
 def test_outliers_are_the_requested_fraction(fraction: float, stations: int) -> None:
     options = SimulationOptions(robots=3, stations=stations)
@@ -458,6 +461,7 @@ def test_outliers_are_the_requested_fraction(fraction: float, stations: int) -> 
     assert not rows(faulty.sweeps, faulty.is_outlier) & every
 
 
+@pytest.mark.slow
 def test_outliers_jump_are_reflected_and_are_swapped() -> None:
     options = SimulationOptions(robots=3, noise_rad=0.0, duration_s=60.0)
     clean, faulty = simulate(options), simulate(replace(options, outliers=0.12))
@@ -481,6 +485,7 @@ def test_outliers_jump_are_reflected_and_are_swapped() -> None:
         assert kind == pytest.approx(total / 3, abs=6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_exchanged_stations_exchange_their_labels_once(seed: int) -> None:
     # A sweep that were exchanged with two others would change the number of each station.

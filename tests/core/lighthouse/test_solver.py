@@ -201,6 +201,7 @@ def test_markers_win_over_odometry(world: Any) -> None:
     assert errors(solution, drive).mean() < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 def test_a_solved_scene_serves_later_sessions(world: Any, flat: bool) -> None:
     lamps = world.lamps(1, 2, 5)
@@ -498,6 +499,7 @@ def test_markers_that_contradict_the_scene_are_reported(world: Any) -> None:
     assert "marker_misfit" in codes(wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [True, False])
 @pytest.mark.parametrize("channels", [(1, 2), (1, 2, 5)])
 def test_occlusion_costs_poses_not_accuracy(

@@ -103,6 +103,7 @@ def brute_force(
     return covariance[np.ix_(order, order)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nuisance", get_args(NuisanceModel))
 def test_agrees_with_brute_force(nuisance: NuisanceModel) -> None:
     sensors = SensorArray(bar(5, 0.016), noise_t=np.array([0.9, 0.8, 1.3]) * 1e-6)

@@ -85,6 +85,7 @@ designs = st.sampled_from([SMALL, DEFAULT, RELEASED, WIDE])
 # --- every id may occur
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(designs, st.data())
 def test_installed_tags_are_decoded(tags: Tags, data) -> None:
@@ -227,6 +228,7 @@ def test_a_tag_that_is_not_as_it_was_built_is_not_another() -> None:
 # --- families
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.data())
 def test_members_are_read_as_by_brute_force(data) -> None:
@@ -254,6 +256,7 @@ def test_members_are_read_as_by_brute_force(data) -> None:
         assert reading.corrected == corrected
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.data())
 def test_a_family_corrects_half_its_distance(data) -> None:
@@ -306,6 +309,7 @@ def _rotated_layouts(tag_id: int, by):
         yield replace(layout, symbols=tuple(symbols))
 
 
+@pytest.mark.slow
 def test_a_foreign_tag_is_not_in_the_family() -> None:
     tags = family(100, 6)
     near = {i for i in range(0, 327680, 997) if families.distance(tags, i, tags.ids[0]) > 0}
@@ -321,6 +325,7 @@ def test_a_foreign_tag_is_not_in_the_family() -> None:
     assert decode_tag(exact, *magnets(tags, foreign)).refused == "not_in_family"
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.data())
 def test_a_missing_magnet_reduces_the_distance_by_half_a_revolution(data) -> None:
@@ -487,6 +492,7 @@ def test_a_redundant_tag_as_built() -> None:
         assert decode_tag(tags, *magnets(tags, tag_id)).tag_id == tag_id
 
 
+@pytest.mark.slow
 def test_every_id_of_every_codec_is_read_as_itself() -> None:
     for tags in (SMALL, REDUNDANT, Tags(magnets=7, codec="redundant"), RELEASED):
         count = codec.capacity(tags)

@@ -87,6 +87,7 @@ def test_members_keep_the_distance(tags: Tags, data) -> None:
     families.check_family(replace(tags, ids=ids, min_distance=distance))
 
 
+@pytest.mark.slow
 def test_a_longer_family_begins_with_the_shorter() -> None:
     tags = Tags()
     long = families.generate_family(tags, 2000, 4)
@@ -201,6 +202,7 @@ def test_a_list_that_is_no_family_is_refused(ids, distance: int, said: str) -> N
 # ---- large families
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tags", "distance"),
     [

@@ -98,6 +98,7 @@ def test_side_of_the_normal_equations_is_the_slope_of_the_cost(world: Any) -> No
         assert side[2 * m + position] == pytest.approx(-slope / 2, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_descent_of_a_motion_is_the_slope_of_the_cost(world: Any) -> None:
     window, truth, _ = posed(world, known=True)
     window = replace(window, disc_correction_m2=0.0)
@@ -177,6 +178,7 @@ def test_skew_of_the_conversion_is_found(world: Any) -> None:
     assert unaware.rms_sigma > 1.3 * fitted.rms_sigma
 
 
+@pytest.mark.slow
 def test_covariance_is_that_of_many_noises(world: Any) -> None:
     """Errors over 30 draws of the noise against the covariance of one, way known."""
     _, truth, tag = posed(world, known=True)

@@ -97,6 +97,7 @@ def test_poses_on_the_site(world: Any, tour: tuple[Any, Samples]) -> None:
     assert len(poses) > 300
 
 
+@pytest.mark.slow
 def test_an_unsure_heading_makes_places_away_from_the_tag_unsure(
     world: Any, tour: tuple[Any, Samples]
 ) -> None:
@@ -109,6 +110,7 @@ def test_an_unsure_heading_makes_places_away_from_the_tag_unsure(
     assert growth == pytest.approx(np.median(poses.covariance[:, 5, 5]), rel=0.1)
 
 
+@pytest.mark.slow
 def test_without_a_site_the_first_tag_is_the_frame(world: Any, tour: tuple[Any, Samples]) -> None:
     course, recording = tour
     solution = solve([recording], TAGS)
@@ -125,6 +127,7 @@ def test_without_a_site_the_first_tag_is_the_frame(world: Any, tour: tuple[Any, 
         )
 
 
+@pytest.mark.slow
 def test_a_tag_outside_the_site_is_reported(tour: tuple[Any, Samples]) -> None:
     _, recording = tour
     known = {i: SITE[i] for i in IDS[:2]}
@@ -134,6 +137,7 @@ def test_a_tag_outside_the_site_is_reported(tour: tuple[Any, Samples]) -> None:
     assert solution.poses > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "off", [{}, {"scale": 1.02}, {"turn": 2.0}, {"scale": 0.98, "drift": 0.002}]
 )
@@ -164,6 +168,7 @@ def test_odometry_of_another_device_is_not_used(world: Any, tour: tuple[Any, Sam
     np.testing.assert_array_equal(with_other.position, alone.position)
 
 
+@pytest.mark.slow
 def test_corrections_lead_to_the_next_tag(world: Any, tour: tuple[Any, Samples]) -> None:
     """Paper 8.3.7. Checked by driving them: turn, then go straight as far as is said."""
     course, recording = tour
@@ -193,6 +198,7 @@ def test_along_counts_only_what_the_robot_looks_at(world: Any) -> None:
     assert distance_along(driven, driven.time_ns)[-1] == pytest.approx(0.5, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_error_of_odometry_widens_the_covariance_between_tags(
     world: Any, tour: tuple[Any, Samples]
 ) -> None:

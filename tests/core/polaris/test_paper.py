@@ -361,6 +361,7 @@ def test_windows_of_sparse_samples_have_the_points_of_the_templates() -> None:
     assert np.degrees(np.sqrt(np.mean(np.square(wrong)))) < 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heading_deg", [0, 90, 180])
 def test_a_wide_tag_flips_no_moment_across_the_track(heading_deg: int) -> None:
     # Templates beyond half the distance of the sensors look like the opposite moment's.

@@ -621,6 +621,7 @@ def test_odometry_has_scale_and_heading_errors() -> None:
 # ---- sessions
 
 
+@pytest.mark.slow
 def test_the_same_options_give_the_same_session() -> None:
     options = SimulationOptions(
         drift_t=1e-7,

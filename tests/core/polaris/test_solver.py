@@ -131,6 +131,7 @@ def test_iron_debris_is_no_magnet(world: Any) -> None:
     assert np.all(np.abs(errors(world, result, course, tag)) < [6e-4, 2e-4, np.radians(0.3)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_mm", [0.1, 0.4, 3.0, 7.0])
 def test_slow_and_fast(step_mm: float, world: Any) -> None:
     tag, course, recording = passed(world, course=world.line(length=0.26, speed=step_mm / 10))
@@ -269,6 +270,7 @@ def test_two_tags(ahead: float, aside: float, world: Any) -> None:
         assert np.all(np.abs(error) < np.maximum([8e-4, 1e-4, 3e-3], 3 * sigmas(result)))
 
 
+@pytest.mark.slow
 def test_order_is_that_of_time_and_the_site_places_the_array(world: Any) -> None:
     tags = [
         world.Tag(CELLS, SYMBOLS, x=0.0, y=0.01, heading=0.4),
@@ -380,6 +382,7 @@ def test_passes_are_merged_only_if_that_identifies_a_tag(
 # ---- before the robot starts, and how hosts stamp samples
 
 
+@pytest.mark.slow
 def test_drift_before_the_start_is_no_refused_pass(world: Any) -> None:
     """Three seconds at rest, while sensors warm up and a tool is laid down nearby."""
     tag = world.Tag(CELLS, SYMBOLS)

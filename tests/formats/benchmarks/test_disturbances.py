@@ -109,6 +109,7 @@ def test_a_sample_of_another_time_has_no_pose() -> None:
     assert samples.time_ns[middle + 1] in trajectory.time_ns
 
 
+@pytest.mark.slow
 def test_a_narrow_curve_is_named() -> None:
     disturbed = simulate_disturbed(Disturbance(radius_m=(0.05, 0.07)), 503)
     solution = solve([disturbed.samples], disturbed.tags, SolveOptions())
@@ -120,6 +121,7 @@ def test_a_narrow_curve_is_named() -> None:
     assert "curved_path" not in [each.code for each in solution.warnings]
 
 
+@pytest.mark.slow
 def test_a_path_that_turns_back_is_not_read_across_the_turn() -> None:
     """Over half of the tag, back by 0.1 m, and over all of it, within one pass."""
     for seed in range(FIRST_SEED, FIRST_SEED + 3):

@@ -168,6 +168,7 @@ def test_any_start_is_right_where_the_line_pauses(published: list[np.ndarray]) -
         assert (decoder.counts.bad, decoder.counts.skipped) == (0, 0)
 
 
+@pytest.mark.slow
 def test_three_sensors_are_told_from_nine(published: list[np.ndarray]) -> None:
     for values, data in of_kind(published, "three")[::2]:
         _, batches = decode(data)
@@ -178,6 +179,7 @@ def test_three_sensors_are_told_from_nine(published: list[np.ndarray]) -> None:
         assert decoder.remarks == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spare", [0.0, 3.7, -6.2598534e18], ids=["zero", "volts", "garbage"])
 def test_magx_is_right_from_any_byte_without_pauses(
     published: list[np.ndarray], spare: float

@@ -150,6 +150,7 @@ def test_no_device_is_taken_for_another(name: str) -> None:
     assert told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENDERS)
 def test_clean_frames_are_sure_soon(name: str) -> None:
     for _, pieces in sent(name):
@@ -327,6 +328,7 @@ def test_devices_of_other_packages() -> None:
     assert listen(framed(3), devices=devices).device == "raw"
 
 
+@pytest.mark.slow
 def test_a_decoder_that_takes_everything_is_not_believed() -> None:
     devices = [*DEVICES.values(), other("all", b"", 10)]
     assert listen(framed(100), devices=devices).device == "raw"
@@ -342,6 +344,7 @@ def test_a_decoder_that_doubts_is_not_sure() -> None:
     assert identifier.settle().device == "theirs"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["decode", "feed", "finish"])
 def test_a_decoder_that_fails_does_no_harm(where: str) -> None:
     devices = [other("theirs", b"\xaa\x55", 20, where), *DEVICES.values()]

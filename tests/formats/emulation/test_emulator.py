@@ -382,6 +382,7 @@ def test_a_failing_source_leaves_nothing_behind(port: PseudoPort) -> None:
     assert emulator.totals.sent == len(reader.data) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [1.0, float("inf")])
 def test_it_can_be_stopped_while_it_sends(port: PseudoPort, speed: float) -> None:
     packets = [(1_000_000 * k, bytes([k % 256]) * 100) for k in range(100_000)]

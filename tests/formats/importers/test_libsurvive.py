@@ -231,6 +231,7 @@ def test_a_tracker_that_starts_again_and_a_timecode_of_nowhere(tmp_path: Path) -
     assert np.ptp(session.sweeps.time_ns) < 3_100_000_000
 
 
+@pytest.mark.slow
 def test_factory_data_comes_from_the_syncs(tmp_path: Path) -> None:
     room = Room(seconds=19.0, channels=(4, 12)).build(lambda channel, n: n % 150 != 3)
     session = read_libsurvive([room.write(tmp_path)])

@@ -195,6 +195,7 @@ def test_without_truth_sigmas_are_shown() -> None:
     assert not any("MAE" in text for text in said)
 
 
+@pytest.mark.slow
 def test_a_solution_without_scale_is_not_compared_with_metres() -> None:
     said = texts(draw_picture(solution(scene=replace(SCENE, scale="unit")), TRUTH))
     assert "x [unit]" in said

@@ -280,6 +280,7 @@ def test_drawings_move_with_the_alignment() -> None:
     assert label_moved.clearance == pytest.approx(2 * label.clearance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [21, 0])
 def test_the_picture_shows_the_floor(n: int) -> None:
     """With a path, and without one if the robot is not localised."""

@@ -428,6 +428,7 @@ def test_the_search_ends_at_black_and_after_many_instructions(
     assert finder._instructions == 3
 
 
+@pytest.mark.slow
 def test_compressed_content_takes_little_memory() -> None:
     pdf = Pdf.new()
     content = form(pdf, b"q Q " * 30_000)

@@ -219,6 +219,7 @@ def test_small_and_as_a_printer_wants_it(assert_one_ink: Callable[[Any], None]) 
         assert_one_ink(pdf.pages[0])
 
 
+@pytest.mark.slow
 def test_same_sheet_same_bytes() -> None:
     assert pattern.render(sheets("A5")) == pattern.render(sheets("A5"))
     floor = floor_of_tiles()

@@ -89,6 +89,7 @@ def assert_dots_are_exact(page: Grey, made: Manifest, number: int = 0) -> None:
     assert ((wanted & ~ink).sum(), (ink & ~wanted).sum()) == (0, 0)
 
 
+@pytest.mark.slow
 def test_every_dot_is_on_its_pixels(rasteriser: Rasteriser, tmp_path: Path) -> None:
     """With the last dots at the edges of the mask, where some rasterisers clip."""
     if rasteriser.name in SLOW:
@@ -279,6 +280,7 @@ def test_templates_are_whole_and_at_true_size(draw: Callable[[], Page], tmp_path
     assert assert_drawn(page, draw(), 300) > 100
 
 
+@pytest.mark.slow
 def test_no_line_is_thinner_than_a_pixel_is_wide() -> None:
     """At 300 dpi, in any direction: 1.41 px. Also on a plan of small cells."""
     small = FloorMap(np.arange(36).reshape(6, 6) % 16, name="hall")

@@ -242,6 +242,7 @@ def test_a_solution_without_poses_has_a_report(empty: Solution) -> None:
     assert "Nothing was solved" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_few_poses_have_a_report(n: int) -> None:
     assert report_panels(evaluated(solution("red", n=n)))

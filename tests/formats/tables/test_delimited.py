@@ -141,6 +141,7 @@ def test_numpy_accepts_what_the_check_lets_pass() -> None:
             np.loadtxt(io.BytesIO(f"{cell},1\n".encode()), delimiter=",", comments=None)
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(st.integers(0, 2**63 - 1), st.floats(-1e3, 1e3, allow_nan=False)),
