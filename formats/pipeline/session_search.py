@@ -102,6 +102,10 @@ def _link_key(location: str) -> str:
 
 def _expand(name: str) -> list[str] | None:
     """Return the files of a folder or a pattern; None if the name is that of one file."""
+    if not name:
+        raise InputError("a file name is empty", hint="Check the variables of the shell")
+    if "\0" in name:
+        raise InputError("a file name with a zero byte", file=name)
     if is_url(name):
         return _expand_url(name)
     if os.path.isdir(name):
@@ -111,8 +115,6 @@ def _expand(name: str) -> list[str] | None:
         return None
     if glob.has_magic(name):
         return _require_files(sorted(_matching_files(name)), name, "no file matches the pattern")
-    if not name:
-        raise InputError("a file name is empty", hint="Check the variables of the shell")
     raise MissingDataError(
         "No such file or folder", file=name, hint="Check the spelling of the path"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from locatk.core.errors import LocatkError
@@ -10,6 +10,7 @@ from locatk.formats.pipeline.session_search import find_sessions
 
 
 @given(st.text(max_size=30))
+@example("\0/*")
 def test_any_name_is_found_or_one_error(name: str) -> None:
     try:
         found = find_sessions([name])
