@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any, Literal
 
 from locatk.core.errors import LocatkError, MissingDataError, OutputExistsError
+from locatk.formats.locks import lock_file
 
 
 def tool_version() -> str:
@@ -121,7 +122,7 @@ def _open_part(part: Path, mode: str, text: dict[str, Any]) -> IO[Any]:
     """
     while True:
         stream = open(part, mode.replace("w", "x"), **text)  # noqa: SIM115 - the caller closes it
-        _lock(stream.fileno(), wait=True)
+        lock_file(stream.fileno(), wait=True)
         if os.name == "nt" or os.fstat(stream.fileno()).st_nlink:
             return stream
         stream.close()
@@ -130,7 +131,8 @@ def _open_part(part: Path, mode: str, text: dict[str, Any]) -> IO[Any]:
 def remove_stale_parts(target: Path) -> None:
     """Remove unfinished outputs for ``target`` of processes that were killed.
 
-    Those of running processes are locked; on Windows, open files cannot be removed anyway.
+    Those of running processes are locked. On a file system without locks, all of them stay; on
+    Windows, open files cannot be removed anyway.
     """
     pattern = re.compile(re.escape(_part_prefix(target)) + r"[0-9a-f]{8}" + re.escape(PART_SUFFIX))
     with contextlib.suppress(OSError), os.scandir(target.parent) as entries:
@@ -138,21 +140,8 @@ def remove_stale_parts(target: Path) -> None:
             if not (pattern.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)):
                 continue
             with contextlib.suppress(OSError), open(entry.path, "rb") as stream:
-                if _lock(stream.fileno()):
+                if lock_file(stream.fileno()) or os.name == "nt":
                     os.unlink(entry.path)
-
-
-def _lock(descriptor: int, *, wait: bool = False) -> bool:
-    """Lock a file until it is closed; return False if another process has the lock."""
-    try:
-        import fcntl  # not on Windows
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except OSError:  # locked, or a file system without locks
-        return False
-    return True
 
 
 def _move_to_free_name(part: Path, target: Path) -> None:

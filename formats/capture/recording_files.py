@@ -23,6 +23,7 @@ from google.protobuf.message import Message
 
 from locatk.core.errors import LocatkError, OutputExistsError
 from locatk.formats.capture.ingestion import StampedMessage
+from locatk.formats.locks import lock_file
 from locatk.formats.output import check_output
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD, SESSION_RECORD
 from locatk.formats.sessions.messages import timestamp
@@ -280,7 +281,7 @@ class LiveFile:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(self.path)
             self._file = open(self.path, "xb", buffering=0)  # noqa: SIM115 - closed by close()
-            _lock(self._file.fileno())
+            lock_file(self._file.fileno())
         except LocatkError:
             raise
         except OSError as error:
@@ -395,7 +396,7 @@ def check_idle(path: Path) -> None:
     """
     try:
         with open(path, "rb") as stream:
-            busy = not _lock(stream.fileno())
+            busy = lock_file(stream.fileno()) is False
     except FileNotFoundError:
         return
     if busy:
@@ -404,21 +405,6 @@ def check_idle(path: Path) -> None:
             file=path,
             hint="End that program, or choose another name",
         )
-
-
-def _lock(descriptor: int) -> bool:
-    """Lock a file until it is closed; return False if another process has the lock."""
-    try:
-        import fcntl
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True  # The file system has no locks.
-    return True
 
 
 def _describe_errno(number: int | None) -> str:

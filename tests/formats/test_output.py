@@ -209,15 +209,15 @@ def test_an_output_is_locked_until_it_has_its_name(
 def test_an_output_that_was_taken_for_stale_is_created_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, calls = output._lock, []
+    real, calls = output.lock_file, []
 
-    def lock_late(descriptor: int, *, wait: bool = False) -> bool:
+    def lock_late(descriptor: int, *, wait: bool = False) -> bool | None:
         calls.append(wait)
         if len(calls) == 1:  # between creation and lock
             remove_stale_parts(tmp_path / "x.bin")
         return real(descriptor, wait=wait)
 
-    monkeypatch.setattr(output, "_lock", lock_late)
+    monkeypatch.setattr(output, "lock_file", lock_late)
     with atomic_write(tmp_path / "x.bin") as stream:
         stream.write(b"whole")
     assert calls == [True, False, True]

@@ -106,6 +106,22 @@ def detect_dots(images: NDArray[np.uint8], max_dots: int = 4096) -> DetectedDots
     return DetectedDots(np.where(valid[..., None], xy, np.float32(0)), valid)
 
 
+def detect_dots_halved(images: NDArray[np.uint8], level: int) -> DetectedDots:
+    """Detect the dots in images (n, h, w) that are halved ``level`` times.
+
+    Positions are those in the images at full size; incomplete blocks at the edges are left out.
+    """
+    if not level:
+        return detect_dots(images)
+    _, height, width = images.shape
+    size = (width >> level, height >> level)
+    cropped = images[:, : size[1] << level, : size[0] << level]
+    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in cropped]
+    dots = detect_dots(np.stack(small))
+    xy = (dots.xy + np.float32(0.5)) * np.float32(1 << level) - np.float32(0.5)
+    return DetectedDots(np.where(dots.valid[..., None], xy, np.float32(0)), dots.valid)
+
+
 @functools.cache
 def _smoothing_taps() -> NDArray[np.float32]:
     """Return one half of the symmetric smoothing kernel, the middle last."""

@@ -13,13 +13,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import Codec
-from locatk.core.dots.detection.blobs import DetectedDots, detect_dots
+from locatk.core.dots.detection.blobs import DetectedDots, detect_dots_halved
 from locatk.core.dots.detection.lattice import MIN_LATTICE_DOTS, DotLattices, fit_lattices
 from locatk.core.dots.identification.decoding import (
     MIN_CODE_CONFIDENCE,
@@ -198,12 +197,11 @@ def _detect_points(
     centre of the camera.
     """
     _, height, width = images.shape
-    dots = detect_dots(_shrink(images, level))
-    scale = np.float32(1 << level)
-    pixels = (dots.xy + np.float32(0.5)) * scale - np.float32(0.5)
+    dots = detect_dots_halved(images, level)
+    pixels = dots.xy.astype(np.float64)
     centre, half_diagonal = _normalization(height, width, camera)
     if camera is not None and camera.radial:
-        pixels = camera.undistort(pixels.astype(np.float64))
+        pixels = camera.undistort(pixels)
     return ((pixels - centre) / half_diagonal).astype(np.float32), dots
 
 
@@ -299,16 +297,6 @@ def _levels(height: int, width: int) -> list[int]:
     levels = range(max(MIN_TRIED_LEVELS, preferred + 1))
     possible = [level for level in levels if short >> level >= MIN_SIDE_PX]
     return sorted(possible, key=lambda level: (abs(level - preferred), level))
-
-
-def _shrink(images: Images, level: int) -> Images:
-    """Halve the size of images (n, h, w) ``level`` times, leaving out incomplete blocks."""
-    if not level:
-        return images
-    _, height, width = images.shape
-    size = (width >> level, height >> level)
-    cropped = images[:, : size[1] << level, : size[0] << level]
-    return np.stack([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in cropped])
 
 
 def _normalization(

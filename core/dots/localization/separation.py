@@ -25,7 +25,7 @@ from scipy.special import expit
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import DOT_DIRECTIONS, Codec
-from locatk.core.dots.detection.blobs import detect_dots
+from locatk.core.dots.detection.blobs import detect_dots_halved
 from locatk.core.dots.detection.lattice import (
     DotLattices,
     nearest_symbol_offset,
@@ -241,12 +241,8 @@ def _erase(image: Image, pixels: Array, pitch_px: float) -> Image:
 def _detect(image: Image, pitch_px: float) -> Array:
     """Return the positions (n, 2) in px of all dots of a frame, which is shrunk if large."""
     level = max(0, round(math.log2(pitch_px / DETECTED_PITCH_PX)))
-    height, width = (side >> level << level for side in image.shape)
-    size = (width >> level, height >> level)
-    small = cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA)
-    dots = detect_dots(np.asarray(small, np.uint8)[None])
-    pixels = dots.xy[0, dots.valid[0]].astype(np.float64)
-    return np.asarray((pixels + 0.5) * (1 << level) - 0.5)
+    dots = detect_dots_halved(image[None], level)
+    return dots.xy[0, dots.valid[0]].astype(np.float64)
 
 
 def _pitch_px(grid: Array, pixels: Array) -> float:
