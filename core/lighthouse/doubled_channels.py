@@ -126,17 +126,21 @@ def find_doubled_channels(sweeps: Sweeps) -> DoubledChannels:
 
 def doubled_channel_message(channels: Sequence[int]) -> str:
     """Format the message about channels with more than one station."""
-    listed = ", ".join(map(str, channels))
-    return f"more than one station sends on channel {listed}; its sweeps are not used"
+    whose = "its" if len(channels) == 1 else "their"
+    return f"more than one station sends on {_channels_text(channels)}; {whose} sweeps are not used"
 
 
 def possible_doubled_channel_message(channels: Sequence[int]) -> str:
     """Format the message about channels that may have more than one station."""
-    listed = ", ".join(map(str, channels))
     return (
-        f"more than one station may send on channel {listed}: in part of the recording its angles "
-        "jump between two levels"
+        f"more than one station may send on {_channels_text(channels)}: in part of the recording, "
+        "angles jump between two levels"
     )
+
+
+def _channels_text(channels: Sequence[int]) -> str:
+    """Return "channel 1", or "channels 1, 2"."""
+    return f"channel{'s' * (len(channels) > 1)} {', '.join(map(str, channels))}"
 
 
 def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, float]:
@@ -149,7 +153,7 @@ def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, floa
     evidence, alternating_evidence : float
         Logarithm of the likelihood ratio from the angles, of all windows and of those that change
         between two ranges of angles. Photodiodes of a device share its motion and hence count as
-        one; so do its two light planes, of which the more conclusive one counts.
+        one; so do its two light planes, of which the one with more evidence for two stations counts.
     """
     conflicts = paired = 0
     evidence = np.zeros(2)
@@ -229,7 +233,7 @@ def count_phase_conflicts(time_s: Array, zero_s: Array, period_s: float) -> tupl
 
     # Different from both: where the clock of the host is corrected, phases change continuously.
     differs_before = ~agrees(before, zero_s[:, None])
-    differs_after = (after - zero_s[:, None] < PHASE_WINDOW_S) & ~agrees(zero_s[:, None], after)
+    differs_after = ~agrees(zero_s[:, None], after)
     is_conflict = np.zeros(len(zero_s), bool)
     for k in range(NEIGHBOURS):
         differs = differs_before[:, k, None] & differs_after

@@ -61,6 +61,10 @@ MAX_INSTRUCTIONS = 2_000_000
 A vector map of 11 MB has about 0.3 million.
 """
 
+MAX_DOMAIN_TYPE = 3
+"""Last type of shadings whose colours are a function over the shading's own domain, 0 to 1 if it
+has none; those of meshes are one over the range of their values."""
+
 SHADING_STEPS = 64
 """Colours of a shading that are examined."""
 
@@ -150,7 +154,8 @@ class BlackFinder:
         ``area`` is the page in the units of the stream; without it, everything is on the page.
         """
         find = lambda: _Walk(self, resources, initial, area).is_black(stream)  # noqa: E731
-        key = ("content", *initial.black, *initial.visible, area and area.to_bbox())
+        corners = area and (*area.lower_left, *area.upper_right)
+        key = ("content", *initial.black, *initial.visible, corners)
         return self._once(key, stream, find)
 
     def count_instruction(self) -> bool:
@@ -289,7 +294,8 @@ class _Walk:
         elif operator in COLOUR_OPERATORS:
             self._set_black(is_line, self._is_black_colour(is_line, operands))
         elif operator in ("BMC", "BDC"):
-            self._sequences.append(operator == "BDC" and self._is_hidden(*operands))
+            self._sequences.append(False)  # Also if its operands are damaged, it ends at an EMC.
+            self._sequences[-1] = operator == "BDC" and self._is_hidden(*operands)
         elif operator == "EMC":
             del self._sequences[-1:]
         elif operator == "Tf":
@@ -299,10 +305,11 @@ class _Walk:
             state.text_mode = int(operands[0])
         elif operator in TEXT_POSITIONS:
             self._move_text(operator, operands)
-        is_black = not any(self._sequences) and self._paints(operator, operands)
-        if operator in PATH_ENDS:
-            self._path.clear()
-        return is_black
+        try:
+            return not any(self._sequences) and self._paints(operator, operands)
+        finally:
+            if operator in PATH_ENDS:
+                self._path.clear()
 
     def _paints(self, operator: str, operands: Any) -> bool:
         """Return True if an operator that is not hidden paints in black."""
@@ -496,6 +503,10 @@ def _is_black_shading(shaded: Any, spaces: Any) -> bool:
     if space is None or function is None or int(shaded.ShadingType) == 1:
         return space is not None
     transform = colours.read_function(function)
-    domain = numbers(function.Domain) if isinstance(function, Dictionary | Stream) else (0.0, 1.0)
+    domain: Any = (0.0, 1.0)
+    if "/Domain" in shaded:
+        domain = numbers(shaded.Domain)
+    elif int(shaded.ShadingType) > MAX_DOMAIN_TYPE and isinstance(function, Dictionary | Stream):
+        domain = numbers(function.Domain)
     along = np.linspace(domain[0], domain[1], SHADING_STEPS)
     return transform is None or _is_black(space, transform(along))
