@@ -153,7 +153,7 @@ def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, floa
     evidence, alternating_evidence : float
         Logarithm of the likelihood ratio from the angles, of all windows and of those that change
         between two ranges of angles. Photodiodes of a device share its motion and hence count as
-        one; so do its two light planes, of which the one with more evidence for two stations counts.
+        one; so do its two light planes, of which that with more evidence for two stations counts.
     """
     conflicts = paired = 0
     evidence = np.zeros(2)

@@ -476,8 +476,12 @@ def _is_black_image(image: Stream, named: Any) -> bool:
         return True
     try:
         space = colours.read_colour_space(image.get("/ColorSpace"), named)
-        if space is not None and (space.kind in ("tint", "inks") or not space.is_convertible):
-            # PdfImage does not read these.
+        # PdfImage makes RGB of masked CMYK, in which a mix of the other three inks looks black.
+        is_masked_cmyk = space == colours.CMYK and ("/SMask" in image or "/Mask" in image)
+        if space is not None and (
+            is_masked_cmyk or space.kind in ("tint", "inks") or not space.is_convertible
+        ):
+            # PdfImage does not read the others.
             return any(_is_black(space, values) for values in read_values(image, space))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # loss of bits

@@ -440,3 +440,28 @@ def test_compressed_content_takes_little_memory() -> None:
     tracemalloc.stop()
     assert converted.count(b"q") == 30_000
     assert peak < 4e6
+
+
+def test_a_form_is_judged_by_the_page_on_which_it_is_drawn() -> None:
+    """Pages of equal size may be at different places in the units of a common form."""
+    pdf = Pdf.new()
+    shared = form(pdf, b"0 g 110 110 9 9 re f")
+    finder = BlackFinder(pdf)
+    assert not finder.is_black(shared, PAGE)
+    assert finder.is_black(shared, Rectangle(100, 100, 200, 200))
+
+
+def test_a_damaged_start_of_marked_content_has_its_end(tmp_path: Path) -> None:
+    content = "/OC /Off BDC BDC EMC 0 g 0 0 9 9 re f EMC"
+    pdf = Pdf.open(document(tmp_path / "in.pdf", [content, content]))
+    (tmp_path / "saved.pdf").write_bytes(bytes_of(pdf))
+    assert overlay(tmp_path / "saved.pdf", stamp(2), strip_black=False).black_pages == 0
+
+
+@pytest.mark.parametrize(("pixel", "is_black"), [(b"\xff\xff\xff\0", False), (b"\0\0\0\xff", True)])
+def test_masked_images_of_inks(pixel: bytes, is_black: bool) -> None:
+    pdf = Pdf.new()
+    mask = pdf.make_indirect(image(pdf, b"\xff" * 4, Name.DeviceGray))
+    photo = pdf.make_indirect(image(pdf, pixel * 4, Name.DeviceCMYK, SMask=mask))
+    drawn = form(pdf, b"9 0 0 9 0 0 cm /Photo Do", Photo=photo)
+    assert BlackFinder(pdf).is_black(drawn, PAGE) == is_black
