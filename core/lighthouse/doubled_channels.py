@@ -44,8 +44,8 @@ single sweeps. If they are those of reports, agreement is by chance."""
 MAX_PHASE_DRIFT_PPM = 250.0
 """Largest deviation of a rotor from its nominal period in the clock of the receiver."""
 
-PHASE_WINDOW_S = 1.0
-"""Longest time between two rotations whose phases are compared [s]: two reports at 3 Hz."""
+MAX_PHASE_INTERVAL_S = 1.0
+"""Longest time between two rotations whose phases are compared [s]: four reports at 3 Hz."""
 
 NEIGHBOURS = 8
 """Number of rotations before and after that one is compared with."""
@@ -116,8 +116,8 @@ def find_doubled_channels(sweeps: Sweeps) -> DoubledChannels:
     for channel in np.unique(sweeps.channel).tolist():
         if channel not in CHANNELS:
             continue
-        has_phases, evidence, alternating_evidence = _compare_hypotheses(sweeps, channel)
-        if has_phases or evidence > MIN_LOG_EVIDENCE:
+        has_two_phases, evidence, alternating_evidence = _compare_hypotheses(sweeps, channel)
+        if has_two_phases or evidence > MIN_LOG_EVIDENCE:
             proven.append(channel)
         elif alternating_evidence > MIN_LOG_EVIDENCE:
             possible.append(channel)
@@ -148,7 +148,7 @@ def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, floa
 
     Returns
     -------
-    has_phases : bool
+    has_two_phases : bool
         True if the sweeps have two phases.
     evidence, alternating_evidence : float
         Logarithm of the likelihood ratio from the angles, of all windows and of those that change
@@ -177,8 +177,8 @@ def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, floa
                 [_angle_evidence(time_s[is_own][plane == k], angle_rad[plane == k]) for k in (0, 1)]
             )
         evidence += np.max(np.mean(sensor_evidence, axis=0), axis=0)
-    has_phases = conflicts >= max(MIN_CONFLICTS, MAX_PHASE_CONFLICT_FRACTION * paired)
-    return has_phases, float(evidence[0]), float(evidence[1])
+    has_two_phases = conflicts >= max(MIN_CONFLICTS, MAX_PHASE_CONFLICT_FRACTION * paired)
+    return has_two_phases, float(evidence[0]), float(evidence[1])
 
 
 def _is_paired(time_s: Array, zero_s: Array, period_s: float) -> Mask:
@@ -229,7 +229,7 @@ def count_phase_conflicts(time_s: Array, zero_s: Array, period_s: float) -> tupl
         interval_s = second - first
         error_s = np.abs(interval_s - np.rint(interval_s / period_s) * period_s)
         tolerance_s = MAX_PAIR_ERROR_S + MAX_PHASE_DRIFT_PPM * 1e-6 * interval_s
-        return (error_s < tolerance_s) & (interval_s < PHASE_WINDOW_S)
+        return (error_s < tolerance_s) & (interval_s < MAX_PHASE_INTERVAL_S)
 
     # Different from both: where the clock of the host is corrected, phases change continuously.
     differs_before = ~agrees(before, zero_s[:, None])

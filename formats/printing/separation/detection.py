@@ -39,15 +39,15 @@ MITER_FACTOR = 5.0
 TEXT_HEIGHT_EM = 2.0
 """Largest distance of a glyph from the line on which it is, in font sizes."""
 
-ENDLESS = 1e9
-"""Length of a line of text, whose ends are not known without the font."""
+HALF_LINE_LENGTH = 1e9
+"""Reach of a line of text to both sides, in its units; without the font, its ends are unknown."""
 
-FILLING = {"f", "F", "f*", "B", "B*", "b", "b*"}
-STROKING = {"S", "s", "B", "B*", "b", "b*"}
+FILL_OPERATORS = {"f", "F", "f*", "B", "B*", "b", "b*"}
+STROKE_OPERATORS = {"S", "s", "B", "B*", "b", "b*"}
 PATH_OPERATORS = {"m", "l", "c", "v", "y", "re"}
-PATH_ENDS = {*FILLING, *STROKING, "n"}
-TEXT_POSITIONS = {"BT", "Tm", "Td", "TD", "T*", "'", '"'}
-SHOWING = {"Tj", "TJ", "'", '"'}
+PATH_END_OPERATORS = {*FILL_OPERATORS, *STROKE_OPERATORS, "n"}
+TEXT_POSITION_OPERATORS = {"BT", "Tm", "Td", "TD", "T*", "'", '"'}
+TEXT_OPERATORS = {"Tj", "TJ", "'", '"'}
 
 FILLED_TEXT, STROKED_TEXT, INVISIBLE_TEXT = {0, 2, 4, 6}, {1, 2, 5, 6}, 3
 """Text rendering modes (ISO 32000-1 table 106); recognized text on scans is invisible."""
@@ -82,7 +82,7 @@ class _State:
     spaces : (ColourSpace or None, ColourSpace or None)
     font : Dictionary or None
     text_mode : int
-    text_height : float
+    font_size : float
         Font size.
     line_width : float
     matrix : Matrix
@@ -94,7 +94,7 @@ class _State:
     spaces: tuple[ColourSpace | None, ColourSpace | None] = (colours.GREY, colours.GREY)
     font: Any = None
     text_mode: int = 0
-    text_height: float = 0.0
+    font_size: float = 0.0
     line_width: float = 1.0
     matrix: Matrix = field(default_factory=Matrix)
 
@@ -130,7 +130,7 @@ class BlackFinder:
         """Return True if a page, given as a form, is printed with black ink within an area."""
         return self._content(form, form.get("/Resources", Dictionary()), _State(), area)
 
-    def _once(self, key: tuple[Any, ...], item: Any, find: Callable[[], bool]) -> bool:
+    def _cached(self, key: tuple[Any, ...], item: Any, find: Callable[[], bool]) -> bool:
         """Return the result of ``find`` for an object, which is called only once."""
         if item.is_indirect and (*key, item.objgen) in self._found:
             return self._found[*key, item.objgen]
@@ -153,10 +153,10 @@ class BlackFinder:
 
         ``area`` is the page in the units of the stream; without it, everything is on the page.
         """
-        find = lambda: _Walk(self, resources, initial, area).is_black(stream)  # noqa: E731
+        find = lambda: _ContentWalk(self, resources, initial, area).is_black(stream)  # noqa: E731
         corners = area and (*area.lower_left, *area.upper_right)
         key = ("content", *initial.black, *initial.visible, corners)
-        return self._once(key, stream, find)
+        return self._cached(key, stream, find)
 
     def count_instruction(self) -> bool:
         """Count an instruction; return True if there are too many to examine."""
@@ -181,7 +181,9 @@ class BlackFinder:
             "/AllOff": not all(hidden),
         }.get(policy, all(hidden))
 
-    def xobject(self, item: Any, resources: Any, state: _State, area: Rectangle | None) -> bool:
+    def is_black_xobject(
+        self, item: Any, resources: Any, state: _State, area: Rectangle | None
+    ) -> bool:
         """Return True if a form or an image is black."""
         if self.is_hidden(item.get("/OC")):
             return False
@@ -191,7 +193,7 @@ class BlackFinder:
             if item.get("/ImageMask", False):
                 return state.black[0]
             spaces = resources.get("/ColorSpace")
-            return self._once(("image",), item, lambda: _is_black_image(item, spaces))
+            return self._cached(("image",), item, lambda: _is_black_image(item, spaces))
         inner = state.inherited()
         if "/Group" in item:  # the opacity is that of the group
             if not state.visible[0]:
@@ -206,20 +208,20 @@ class BlackFinder:
             item, item.get("/Resources", resources), inner, area if matrix == Matrix() else None
         )
 
-    def pattern(self, item: Any, resources: Any, is_uncoloured_black: bool) -> bool:
+    def is_black_pattern(self, item: Any, resources: Any, is_uncoloured_black: bool) -> bool:
         """Return True if a pattern is black."""
         if "/Shading" in item:
-            return self.shading(item.Shading, resources)
+            return self.is_black_shading(item.Shading, resources)
         if int(item.get("/PaintType", 1)) == 2:
             return is_uncoloured_black
         return self._content(item, item.get("/Resources", resources), _State())
 
-    def shading(self, item: Any, resources: Any) -> bool:
+    def is_black_shading(self, item: Any, resources: Any) -> bool:
         """Return True if a shading is black."""
         spaces = resources.get("/ColorSpace")
-        return self._once(("shading",), item, lambda: _is_black_shading(item, spaces))
+        return self._cached(("shading",), item, lambda: _is_black_shading(item, spaces))
 
-    def text(self, state: _State, resources: Any) -> bool:
+    def is_black_text(self, state: _State, resources: Any) -> bool:
         """Return True if text is black."""
         font = state.font
         if font is None or font.get("/Subtype") != "/Type3":
@@ -238,7 +240,7 @@ UNIT_SQUARE = Rectangle(0, 0, 1, 1)
 """Square that each image fills, in its own units."""
 
 
-class _Walk:
+class _ContentWalk:
     """Walk through the operators of one content stream."""
 
     def __init__(
@@ -273,7 +275,7 @@ class _Walk:
         if operator in PATH_OPERATORS:
             self._extend_path(operator, operands)
             return False
-        state, is_line = self._state, operator.isupper()
+        state, is_stroke = self._state, operator.isupper()
         if operator == "q":
             self._stack.append(copy.copy(state))
         elif operator == "Q" and self._stack:
@@ -285,14 +287,14 @@ class _Walk:
         elif operator == "gs":
             self._set_parameters(self._resource("/ExtGState", operands[0]))
         elif operator.lower() in DEVICE_OPERATORS:
-            self._set_space(is_line, DEVICE_OPERATORS[operator.lower()])
-            self._set_black(is_line, self._is_black_colour(is_line, operands))
+            self._set_space(is_stroke, DEVICE_OPERATORS[operator.lower()])
+            self._set_black(is_stroke, self._is_black_colour(is_stroke, operands))
         elif operator in ("cs", "CS"):
             space = self._read_space(operands[0])
-            self._set_space(is_line, space)
-            self._set_black(is_line, space is not None and _is_black(space, [space.initial]))
+            self._set_space(is_stroke, space)
+            self._set_black(is_stroke, space is not None and _is_black(space, [space.initial]))
         elif operator in COLOUR_OPERATORS:
-            self._set_black(is_line, self._is_black_colour(is_line, operands))
+            self._set_black(is_stroke, self._is_black_colour(is_stroke, operands))
         elif operator in ("BMC", "BDC"):
             self._sequences.append(False)  # Also if its operands are damaged, it ends at an EMC.
             self._sequences[-1] = operator == "BDC" and self._is_hidden(*operands)
@@ -300,25 +302,27 @@ class _Walk:
             del self._sequences[-1:]
         elif operator == "Tf":
             state.font = self._resource("/Font", operands[0])
-            state.text_height = float(operands[1])
+            state.font_size = float(operands[1])
         elif operator == "Tr":
             state.text_mode = int(operands[0])
-        elif operator in TEXT_POSITIONS:
+        elif operator in TEXT_POSITION_OPERATORS:
             self._move_text(operator, operands)
         try:
             return not any(self._sequences) and self._paints(operator, operands)
         finally:
-            if operator in PATH_ENDS:
+            if operator in PATH_END_OPERATORS:
                 self._path.clear()
 
     def _paints(self, operator: str, operands: Any) -> bool:
         """Return True if an operator that is not hidden paints in black."""
         state = self._state
-        if operator in SHOWING:
-            return self._finder.text(state, self._resources) and not self._is_text_outside()
+        if operator in TEXT_OPERATORS:
+            return (
+                self._finder.is_black_text(state, self._resources) and not self._is_text_outside()
+            )
         if operator == "Do":
             item = self._resource("/XObject", operands[0])
-            return item is not None and self._finder.xobject(
+            return item is not None and self._finder.is_black_xobject(
                 item, self._resources, state, self._area
             )
         if operator == "sh":
@@ -326,7 +330,7 @@ class _Walk:
             return (
                 item is not None
                 and state.visible[0]
-                and self._finder.shading(item, self._resources)
+                and self._finder.is_black_shading(item, self._resources)
             )
         if operator == INLINE_IMAGE:
             if not state.visible[0] or _is_outside(UNIT_SQUARE, state.matrix, self._area):
@@ -337,27 +341,27 @@ class _Walk:
             with Pdf.new() as pdf:
                 stream = inline_stream(pdf, image)
                 return _is_black_image(stream, self._resources.get("/ColorSpace"))
-        fill = state.paints(fill=operator in FILLING)
-        stroke = state.paints(stroke=operator in STROKING)
+        fill = state.paints(fill=operator in FILL_OPERATORS)
+        stroke = state.paints(stroke=operator in STROKE_OPERATORS)
         return (fill or stroke) and not self._is_path_outside(stroke)
 
     # ---- state
 
-    def _set_space(self, is_line: bool, space: ColourSpace | None) -> None:
-        self._state.spaces = _with(self._state.spaces, is_line, space)
+    def _set_space(self, is_stroke: bool, space: ColourSpace | None) -> None:
+        self._state.spaces = _replaced(self._state.spaces, is_stroke, space)
 
-    def _set_black(self, is_line: bool, is_black: bool) -> None:
-        self._state.black = _with(self._state.black, is_line, is_black)
+    def _set_black(self, is_stroke: bool, is_black: bool) -> None:
+        self._state.black = _replaced(self._state.black, is_stroke, is_black)
 
     def _set_parameters(self, parameters: Any) -> None:
-        for is_line, key in enumerate(("/ca", "/CA")):
+        for is_stroke, key in enumerate(("/ca", "/CA")):
             if parameters is not None and key in parameters:
                 is_visible = float(parameters[key]) > MIN_BLACK
-                self._state.visible = _with(self._state.visible, is_line, is_visible)
+                self._state.visible = _replaced(self._state.visible, is_stroke, is_visible)
         if parameters is not None and "/LW" in parameters:
             self._state.line_width = float(parameters.LW)
         if parameters is not None and "/Font" in parameters:
-            self._state.font, self._state.text_height = (
+            self._state.font, self._state.font_size = (
                 parameters.Font[0],
                 float(parameters.Font[1]),
             )
@@ -402,8 +406,8 @@ class _Walk:
         encoding = font.get("/Encoding")
         if str(encoding).endswith("V") or isinstance(encoding, Stream):
             return False  # possibly vertical
-        height = TEXT_HEIGHT_EM * abs(self._state.text_height)
-        line = Rectangle(-ENDLESS, -height, ENDLESS, height)
+        height = TEXT_HEIGHT_EM * abs(self._state.font_size)
+        line = Rectangle(-HALF_LINE_LENGTH, -height, HALF_LINE_LENGTH, height)
         return _is_outside(line, self._line @ self._state.matrix, self._area)
 
     # ---- resources
@@ -419,15 +423,17 @@ class _Walk:
             return colours.read_colour_space(definition[1], spaces)
         return colours.read_colour_space(name, spaces)
 
-    def _is_black_colour(self, is_line: bool, operands: Any) -> bool:
-        space = self._state.spaces[is_line]
+    def _is_black_colour(self, is_stroke: bool, operands: Any) -> bool:
+        space = self._state.spaces[is_stroke]
         values = [float(value) for value in operands if not isinstance(value, Name)]
         is_black = (
             space is not None and len(values) == space.components and _is_black(space, [values])
         )
         if len(operands) and isinstance(operands[-1], Name):
             item = self._resource("/Pattern", operands[-1])
-            return item is not None and self._finder.pattern(item, self._resources, is_black)
+            return item is not None and self._finder.is_black_pattern(
+                item, self._resources, is_black
+            )
         return is_black
 
 
@@ -435,7 +441,7 @@ def _is_black(space: ColourSpace, values: Any) -> bool:
     return bool((space.black(np.asarray(values, float)) > MIN_BLACK).any())
 
 
-def _with(pair: tuple[Any, Any], index: int, value: Any) -> tuple[Any, Any]:
+def _replaced(pair: tuple[Any, Any], index: int, value: Any) -> tuple[Any, Any]:
     """Return a pair with another value at an index."""
     return (pair[0], value) if index else (value, pair[1])
 
