@@ -51,7 +51,7 @@ from locatk.core.lighthouse.channels import (
     period_ticks,
 )
 from locatk.core.lighthouse.lfsr import SEQUENCE_LENGTH
-from locatk.core.lighthouse.recording import UNKNOWN
+from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.formats.tables.delimited import Table
 from locatk.formats.tables.quantities import TIME_NAMES, split_unit
 
@@ -513,30 +513,36 @@ def _ages_by_rotors(
 # ---- planes of single sweeps
 
 
-def find_planes(rows: CountRows) -> NDArray[np.int32]:
-    """Return the plane (n,) of each single sweep: 0, 1 or ``UNKNOWN``.
+def find_planes(sweeps: Sweeps, slot: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the plane (n,) of each sweep: 0, 1 or ``UNKNOWN``.
 
     Robots keep the sweeps of a station in two slots by the time of their arrival. A slot holds one
     plane as long as the robot receives the station. Which one is found by comparing each sweep with
     the nearest ones of the other slot: the count of the first plane is smaller.
+
+    Parameters
+    ----------
+    sweeps : Sweeps
+        Ascending in time.
+    slot : (n,) int64 ndarray
     """
-    plane = np.full(len(rows), UNKNOWN, np.int32)
-    if rows.slot is None:
-        return plane
-    source = rows.device.astype(np.int64) * (POLYNOMIAL_COUNT + 1) + rows.channel[:, 0]
+    plane = np.full(len(sweeps), UNKNOWN, np.int32)
+    source = sweeps.device.astype(np.int64) * (POLYNOMIAL_COUNT + 1) + sweeps.channel
     for code in np.unique(source):
         index = np.flatnonzero(source == code)
-        slots = np.unique(rows.slot[index])
+        slots = np.unique(slot[index])
         if len(slots) != 2:
             continue
-        slot = rows.slot[index] == slots[1]
-        to_other = _differences_to_other_slot(rows.count[index, 0], rows.time_ns[index], slot)
+        is_second_slot = slot[index] == slots[1]
+        to_other = _differences_to_other_slot(
+            sweeps.count[index], sweeps.time_ns[index], is_second_slot
+        )
         is_compared = np.isfinite(to_other).any(axis=1)
         with np.errstate(invalid="ignore"):
             is_first = is_compared & ~np.any(to_other <= 0, axis=1)
             is_second = is_compared & ~np.any(to_other >= 0, axis=1)
         found = np.where(is_first, 0, np.where(is_second, 1, UNKNOWN))
-        for of_slot in (slot, ~slot):
+        for of_slot in (is_second_slot, ~is_second_slot):
             compared = found[of_slot & (found != UNKNOWN)]
             fraction = float(np.mean(compared)) if len(compared) >= MIN_SLOT_SWEEPS else 0.5
             if max(fraction, 1 - fraction) >= MIN_SLOT_FRACTION:

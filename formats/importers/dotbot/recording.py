@@ -9,6 +9,7 @@ reads the files that define the frame of the floor.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -124,8 +125,10 @@ def read_dotbot(
             hint=f"Give --calibration, or put it into {Path(truth[0]).parent}",
         )
     if calibration_file is not None:
-        square = read_calibration(calibration_file)
-        facts["calibration"] = f"{calibration_file} ({square.axes})"
+        span_ns = (int(rows.time_ns.min()), int(rows.time_ns.max()))
+        square = read_calibration(calibration_file, [Path(path) for path in paths], span_ns)
+        unused = f"; not used: {square.unused}" if square.unused else ""
+        facts["calibration"] = f"{calibration_file} ({square.axes}{unused})"
         scene = estimate_markers(square, rows, facts, warnings)
         if truth:
             files = [Path(path) for path in truth]
@@ -136,7 +139,6 @@ def read_dotbot(
 def _sweeps(rows: CountRows, is_new: NDArray[np.bool_], offset_us: NDArray[np.float64]) -> Sweeps:
     """Return each new count of each row as a sweep."""
     n, k = rows.count.shape
-    plane = find_planes(rows) if k == 1 else np.full(n * k, UNKNOWN, np.int32)
     sweeps = Sweeps(
         devices=rows.devices,
         time_ns=(rows.time_ns[:, None] + np.rint(1e3 * offset_us).astype(np.int64)).ravel(),
@@ -144,10 +146,15 @@ def _sweeps(rows: CountRows, is_new: NDArray[np.bool_], offset_us: NDArray[np.fl
         sensor=np.zeros(n * k, np.int32),
         channel=rows.channel.ravel(),
         polynomial=rows.polynomial.ravel(),
-        sweep=plane,
+        sweep=np.full(n * k, UNKNOWN, np.int32),
         count=rows.count.ravel(),
-    ).take(is_new.ravel())
-    return sweeps.take(np.argsort(sweeps.time_ns, kind="stable"))
+    )
+    # Columns that repeat sweeps are the slots of the robot; those of complete reports are not.
+    slot = rows.slot if k == 1 else None if np.all(is_new) else np.tile(np.arange(k), n)
+    order = np.flatnonzero(is_new.ravel())
+    order = order[np.argsort(sweeps.time_ns[order], kind="stable")]
+    sweeps = sweeps.take(order)
+    return sweeps if slot is None else replace(sweeps, sweep=find_planes(sweeps, slot[order]))
 
 
 def _truth_columns(rows: CountRows) -> list[Trajectory]:

@@ -458,8 +458,8 @@ def test_markers_name_the_device_that_stood_there(write: Write) -> None:
     [
         ("{", "JSON"),
         ("[]", "object"),
-        ("{}", "0 videos"),
-        (json.dumps({"a": SQUARE, "b": SQUARE}), "2 videos"),
+        ("{}", "no entries"),
+        (json.dumps({"a": SQUARE, "b": SQUARE}), "2 entries (a, b), of which none"),
         (json.dumps({"a": {}}), "corners_cm"),
         (json.dumps({"a": {"corners_cm": {"tl": [1, "x"]}}}), "finite"),
         (json.dumps({"a": {"corners_cm": {"tl": [1, float("nan")]}}}), "finite"),
@@ -478,6 +478,69 @@ def test_bad_calibration_is_named(write: Write, content: str, what: str) -> None
         read_dotbot([recording])
     assert caught.value.file == str(file)
     assert what in str(caught.value)
+
+
+def scenes() -> dict:
+    """Both scenes of alvarado24automatic: corners in space, stays, circles."""
+
+    def scene(day: int, shift: float) -> dict:
+        corners = {
+            "tl": [935, 452, 37],
+            "tr": [957, 54, 34],
+            "br": [557, 31, 31],
+            "bl": [539, 431, 34],
+        }
+        times = {
+            c: [f"2024-12-{day}T15:27:{k}0Z", f"2024-12-{day}T15:27:{k}9Z"]
+            for k, c in enumerate(corners, 1)
+        }
+        return {
+            "corners_mm": {c: [x + shift, y, z] for c, (x, y, z) in corners.items()},
+            "timestamps_lh2": times,
+            "circles": {"quantity": 2, "1": times["tl"], "2": times["tr"]},
+        }
+
+    return {"scene_1": scene(10, 0), "scene_2": scene(11, 40)}
+
+
+LABELLED = ",timestamp,db_time,lha_poly_0,lha_count_0,lha_poly_1,lha_count_1,"
+LABELLED += "lhb_poly_0,lhb_count_0,lhb_poly_1,lhb_count_1\n"
+LABELLED += "0,2024-12-11T15:27:15Z,5000000,1,36669,0,75076,3,37516,2,78457\n"
+LABELLED += "1,2024-12-11T15:27:45Z,35000000,1,36669,0,75076,3,37516,2,78457\n"
+
+
+def test_scenes_of_one_calibration(write: Write, tmp_path: Path) -> None:
+    """The folder of the recording names its scene, otherwise its times do."""
+    write(json.dumps(scenes()), "calibration.json")
+    (tmp_path / "scene_2").mkdir()
+    session = read_dotbot([write(LABELLED, "scene_2/lh_data.csv")])
+    assert session.scene is not None
+    markers = {marker.name: marker for marker in session.scene.markers}
+    # In the millimetres of the motion capture, z up, on a level floor.
+    np.testing.assert_allclose(markers["tl"].position, [0.975, 0.452, 0.034], atol=1e-12)
+    np.testing.assert_allclose(markers["br"].position, [0.597, 0.031, 0.034], atol=1e-12)
+    [visit] = markers["tl"].visits
+    assert (visit.device, visit.start_ns) == ("robot", 1733930830000000000)
+    assert [len(markers[name].visits) for name in CORNERS] == [1, 0, 0, 1]
+    assert "heights averaged over 6 mm; not used: 2 circles" in session.facts["calibration"]
+    by_time = read_dotbot([write(LABELLED, "run.csv")])
+    np.testing.assert_array_equal(
+        [m.position for m in by_time.scene.markers], [m.position for m in session.scene.markers]
+    )
+    other_day = LABELLED.replace("2024-12-11", "2024-12-20")
+    with pytest.raises(FormatError, match="of which none belong to the recording"):
+        read_dotbot([write(other_day, "run.csv")])
+    # A file of the folder above that does not name the folder is of something else.
+    (tmp_path / "scene_3").mkdir()
+    assert read_dotbot([write(LABELLED, "scene_3/lh_data.csv")]).scene is None
+
+
+def test_corners_at_different_heights_stay(write: Write) -> None:
+    table = scenes()
+    table["scene_1"]["corners_mm"]["tl"][2] = 700
+    write(json.dumps({"scene_1": table["scene_1"]}), "calibration.json")
+    session = read_dotbot([write(LABELLED.replace("2024-12-11", "2024-12-10"))])
+    assert session.scene.markers[0].position[2] == pytest.approx(0.7)
 
 
 def test_corners_on_a_line_are_refused(write: Write) -> None:
@@ -619,6 +682,9 @@ def test_held_counts_are_left_out(write: Write, stations: int, max_age_us: int) 
     assert np.abs(error_us).max() < 25_000
     rows, sweeps = int(session.facts["rows"]), len(session.sweeps)
     assert 0.9 * len(events) < sweeps <= len(events)
+    plane = {(e.polynomial, e.count): e.plane for e in events}
+    keys = zip(session.sweeps.polynomial.tolist(), session.sweeps.count.tolist(), strict=True)
+    assert [plane[key] for key in keys] == session.sweeps.sweep.tolist()
     assert "clocks of the robots" in session.facts["clock"]
     assert f"{rows * 2 * stations - sweeps} counts are repeated" in session.facts["repeated"]
 
