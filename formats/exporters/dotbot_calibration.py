@@ -63,11 +63,13 @@ UNCERTAIN_CHANNELS = (4, 14)
 """Channels whose period is wrong in some versions of the firmware: 951,000 instead of 949,000 ticks
 in 2025, and 901,900 instead of 901,000."""
 
-MARGIN_M = 0.2
-"""Margin of the floor around poses and markers, about twice the length of a robot."""
+MARGIN_M = 0.05
+"""Margin of the floor around poses and markers, the radius of a robot."""
 
-OUTLIER_FRACTION = 0.002
-"""Fraction of the poses at either end of an axis that does not extend the floor."""
+CELL_M = 0.1
+MIN_CELL_POSES = 3
+"""Size of the cells of the floor, and number of poses in a cell on which robots drive. Fewer are
+outliers, or of a robot that is carried: a driving one has about three (0.3 m/s, 10 Hz)."""
 
 MAX_FLOOR_RELIEF_M = 0.05
 """Largest difference of height of poses that are on one floor."""
@@ -222,11 +224,15 @@ def write_calibration(
 
 
 def _known_points(trajectories: Sequence[Array], markers: Sequence[Array]) -> Array:
-    """Return the markers and the poses (n, 3) without the farthest ones, in metres."""
+    """Return the markers and the poses (n, 3) on which robots drive, in metres."""
     poses = np.concatenate([np.zeros((0, 3)), *trajectories])
     if len(poses):
-        low, high = np.quantile(poses, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
-        poses = poses[np.all((poses >= low) & (poses <= high), axis=1)]
+        _, cell, number = np.unique(
+            np.floor(poses[:, :2] / CELL_M), axis=0, return_inverse=True, return_counts=True
+        )
+        is_driven = number[cell.ravel()] >= MIN_CELL_POSES
+        if is_driven.mean() > 0.5:
+            poses = poses[is_driven]
     return np.concatenate([poses, np.reshape(np.array(markers, float), (-1, 3))])
 
 
