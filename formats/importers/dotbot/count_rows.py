@@ -71,8 +71,10 @@ PLANE_COLUMNS = ("x", "y")
 MILLIMETRES_PER_METRE = 1000
 
 MAX_SLOT = 255
+"""Largest number of a slot; robots have two."""
+
 MAX_INDEX = 10**9
-"""Largest numbers of slots and rows."""
+"""Largest number of a row."""
 
 MAX_TRUTH_MM = 1e6
 """Largest coordinate of the truth, 1 km: larger ones are damaged or in another unit."""
@@ -525,13 +527,14 @@ def find_planes(sweeps: Sweeps, slot: NDArray[np.int64]) -> NDArray[np.int32]:
     sweeps : Sweeps
         Ascending in time.
     slot : (n,) int64 ndarray
+        ``UNKNOWN`` if the source does not report it.
     """
     plane = np.full(len(sweeps), UNKNOWN, np.int32)
     source = sweeps.device.astype(np.int64) * (POLYNOMIAL_COUNT + 1) + sweeps.channel
     for code in np.unique(source):
         index = np.flatnonzero(source == code)
         slots = np.unique(slot[index])
-        if len(slots) != 2:
+        if len(slots) != 2 or slots[0] == UNKNOWN:
             continue
         is_second_slot = slot[index] == slots[1]
         to_other = _differences_to_other_slot(
