@@ -226,6 +226,7 @@ def write_calibration(
 def _known_points(trajectories: Sequence[Array], markers: Sequence[Array]) -> Array:
     """Return the markers and the poses (n, 3) on which robots drive, in metres."""
     poses = np.concatenate([np.zeros((0, 3)), *trajectories])
+    poses = poses[np.isfinite(poses).all(axis=1)]
     if len(poses):
         _, cell, number = np.unique(
             np.floor(poses[:, :2] / CELL_M), axis=0, return_inverse=True, return_counts=True

@@ -163,6 +163,11 @@ def test_the_floor_comes_from_poses_and_markers() -> None:
     )
     spoiled = np.concatenate([POINTS, [[9, 9], [9, 9.01], [-3, 0]]])
     assert np.abs(build_calibration(SCENE, [drive(spoiled)]).area_mm).max() < 1300
+    # A robot that stands still, and one that drove a line.
+    for few in (POINTS[:1], np.linspace([0, 0], [1, 1], 50)):
+        unknown = np.full((3, 2), np.nan)
+        calibration = build_calibration(SCENE, [drive(np.concatenate([few, unknown]))])
+        assert all(station.max_mm < 30 for station in calibration.stations)
 
 
 def test_a_floor_in_a_scene_in_space() -> None:
