@@ -321,7 +321,7 @@ def _speed_on_grid(data: Path) -> Figure:
 
     def measure() -> list[Figure]:
         _grid_session(data)  # reports missing data with its path
-        return [measure_single_threaded(declared, f"lighthouse.time_grid({str(data)!r})")]
+        return [measure_single_threaded(declared, f"lighthouse.suite.time_grid({str(data)!r})")]
 
     return measure_or_explain(measure, declared)[0]
 
@@ -340,12 +340,12 @@ def _speed_on_simulation() -> list[Figure]:
             Figure("1,000,000 sweeps in a known scene", None, "s",
                    f"solve(): grouping, angles, positions and covariances, {clock}", 1.0,
                    workload="numpy"),
-            f"lighthouse.time_known_scene({SIMULATED_SWEEPS})",
+            f"lighthouse.suite.time_known_scene({SIMULATED_SWEEPS})",
         ),
         measure_single_threaded(
             Figure("session of 1,000,000 sweeps read", None, "s",
                    f"{{0:.0f}} MB of MCAP to arrays, {clock}", 2.0, workload="numpy"),
-            f"lighthouse.time_reading({SIMULATED_SWEEPS})",
+            f"lighthouse.suite.time_reading({SIMULATED_SWEEPS})",
         ),
     ]  # fmt: skip
 
