@@ -109,8 +109,8 @@ DEVIATION_SIGMA = np.array([[1.2e-3, 0.5e-3, 0.1, 0.0, 0.0, 0.06, 0.0]] * 2)
 phase up to 2.5 mrad beside them; curve and ogee are the least certain terms)."""
 
 FIELD_RAD, FIELD_WAVELENGTH_RAD, FIELD_WAVES = 0.15e-3, (0.7, 1.4), 6
-"""Rms and wavelengths over direction of what no parameter describes (recordings: the median residual
-with the best model is 0.14 mrad)."""
+"""Rms and wavelengths over direction of what no parameter describes (recordings: the median
+residual with the best model is 0.14 mrad)."""
 
 CLOCK_PPM, WANDER_S = 20.0, 1.0e-6
 """Largest error of the period [ppm], and standard deviation of the wander of the rotor's zero [s]
@@ -127,11 +127,11 @@ ANGLE_NOISE_RAD, COMMON_NOISE_RAD = 45e-6, 10e-6
 65 microradians together with the rounding)."""
 
 DECK_SCALE, DIODE_SIGMA_M = 0.015, 2e-4
-"""Relative standard deviation of length and width of the deck, and that of the effective position of
-each photodiode [m] (recordings)."""
+"""Relative standard deviation of length and width of the deck, and that of the effective position
+of each photodiode [m] (recordings)."""
 
 GROUP_LOSS, PARTIAL_LOSS = 0.04, 0.15
-"""Fractions of groups that are lost, and of which one to three photodiodes are lost (recordings)."""
+"""Fractions of groups that are lost, and of which only some photodiodes are lost (recordings)."""
 
 SHADED_COSINE, LIT_COSINE = 0.05, 0.2
 """Cosine of the angle of incidence below which no light is received, and above which all is."""
@@ -186,7 +186,8 @@ class FlightOptions:
     wrong : float
         Fraction of the sweeps that are replaced by wrong ones.
     reflections, occlusion : float
-        Fractions of the time in which a station is received by reflection, and in which it is hidden.
+        Fractions of the time in which a station is received by reflection, and in which it is
+        hidden.
     is_station_moved : bool
         True if the last station is displaced during the flight.
     """
@@ -284,8 +285,8 @@ class Unit:
     factory, parameters : (2, 7) ndarray
         Factory data, and the parameters that describe the unit best.
     field : (2, k, 4) ndarray
-        Waves of what no parameter describes: amplitude [rad], wave numbers in azimuth and elevation,
-        and phase.
+        Waves of what no parameter describes: amplitude [rad], wave numbers in azimuth and
+        elevation, and phase.
     zero_s, period_s : float
         First passage of the rotor's zero, and duration of a rotation.
     wander_s : callable
@@ -317,9 +318,9 @@ class Unit:
         return np.where(is_moved, (points - self.moved_position) @ self.moved_rotation, before)
 
     def angles(self, local: Array) -> Array:
-        """Return the rotor angles of real planes through points (n, 2, ..., 3): axis 1 is the plane.
+        """Return the rotor angles of real planes through points; see :func:`libsurvive_angles`.
 
-        0 is straight ahead; ``nan`` if no plane crosses the point.
+        ``nan`` if no plane crosses a point.
         """
         angle = libsurvive_angles(local, self.parameters)
         azimuth = np.arctan2(local[..., 1], local[..., 0])
@@ -685,7 +686,7 @@ def _diodes(motion: Motion, diodes_m: Array, time_s: Array) -> tuple[Array, Arra
     """Return positions of photodiodes and their optical axes, each (turns, 2, sensors, 3)."""
     flat_s = time_s.ravel()
     rotation = motion.rotation(flat_s)
-    offset = np.broadcast_to(diodes_m, (*time_s.shape, 3)).reshape(-1, 3)
+    offset = np.tile(diodes_m, (flat_s.size // len(diodes_m), 1))
     position = motion.position(flat_s) + rotation.apply(offset)
     axis = rotation.apply([0.0, 0.0, 1.0])
     return position.reshape(*time_s.shape, 3), axis.reshape(*time_s.shape, 3)
@@ -700,7 +701,7 @@ def _quantize(rng: np.random.Generator, elapsed: Array, is_lit: Mask) -> Array:
     order = np.where(is_lit, rng.random(elapsed.shape), np.inf)
     decoded = np.take_along_axis(elapsed, np.argmin(order, axis=-1)[..., None], axis=-1)
     ticks = TICK_HZ / LFSR_HZ
-    return np.asarray(np.floor(decoded) + np.rint((elapsed - decoded) * ticks) / ticks + 0.5)
+    return np.asarray(np.rint(decoded) + np.rint((elapsed - decoded) * ticks) / ticks)
 
 
 def _lost(rng: np.random.Generator, shape: tuple[int, int, int]) -> Mask:
