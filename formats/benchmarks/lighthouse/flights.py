@@ -33,6 +33,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import Sweeps
@@ -44,6 +45,7 @@ Mask = NDArray[np.bool_]
 START_NS = 1_700_000_000_000_000_000
 """Time stamp of the start of each flight [ns since the Unix epoch]."""
 
+DEVICE = "flight"
 GRAVITY_MPS2 = 9.81
 
 # ---- motion
@@ -376,14 +378,13 @@ class Flight:
     Attributes
     ----------
     sweeps : Sweeps
-        One device, ``"flight"``; planes are known, polynomials are not.
+        One device, :data:`DEVICE`; planes are known, polynomials are not.
     scene : Scene
         Given stations, or factory calibrations only.
     receivers : dict of str to Receiver
         Nominal deck; empty for a single photodiode.
-    imu_s, acceleration, angular_rate : ndarray
-        Times (n,) in seconds since :data:`START_NS`, specific force (n, 3) [m/s^2] and rates
-        (n, 3) [rad/s].
+    imu : InertialSamples
+        Stamped by the clock of the sweeps; the values are older by the delay of the filters.
     motion : Motion
         Truth.
     units : tuple of Unit
@@ -396,9 +397,7 @@ class Flight:
     sweeps: Sweeps
     scene: Scene
     receivers: dict[str, Receiver]
-    imu_s: Array
-    acceleration: Array
-    angular_rate: Array
+    imu: InertialSamples
     motion: Motion
     units: tuple[Unit, ...]
     is_wrong: Mask
@@ -428,7 +427,7 @@ def make_flight(seed: int, **options: object) -> Flight:
     rows = _lose_collisions(rows[np.argsort(rows["time_s"], kind="stable")])
     _falsify(rows, chosen.wrong, fault_rng)
     sweeps = Sweeps(
-        devices=("flight",),
+        devices=(DEVICE,),
         time_ns=_stamps_ns(rows["time_s"]),
         device=np.zeros(len(rows), np.int32),
         sensor=rows["sensor"],
@@ -437,14 +436,11 @@ def make_flight(seed: int, **options: object) -> Flight:
         sweep=rows["plane"],
         count=rows["count"],
     )
-    imu_s, acceleration, rate = _measure_inertia(motion, chosen.duration_s, imu_rng)
     return Flight(
         sweeps,
         _known_scene(units, chosen, geometry_rng),
-        {"flight": DECK} if chosen.diodes > 1 else {},
-        imu_s,
-        acceleration,
-        rate,
+        {DEVICE: DECK} if chosen.diodes > 1 else {},
+        _measure_inertia(motion, chosen.duration_s, imu_rng),
         motion,
         units,
         rows["is_wrong"],
@@ -820,8 +816,8 @@ def _falsify(rows: NDArray[np.void], fraction: float, rng: np.random.Generator) 
 
 def _measure_inertia(
     motion: Motion, duration_s: float, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """Return the times (n,) and measurements (n, 3) of accelerometer and gyroscope."""
+) -> InertialSamples:
+    """Return the samples of accelerometer and gyroscope."""
     time_s = np.arange(0.0, duration_s, 1 / IMU_HZ)
     measured_s = time_s - rng.uniform(*IMU_DELAY_S)
     mounting = _random_turn(rng, IMU_MOUNTING_RAD)
@@ -832,4 +828,4 @@ def _measure_inertia(
     force += rng.normal(0, ACCELERATION_BIAS_MPS2, 3) + noise * rng.normal(size=shape)
     rate = motion.angular_rate(measured_s) @ mounting
     rate += rng.normal(0, GYRO_BIAS_RADPS, 3) + GYRO_NOISE_RADPS * rng.normal(size=shape)
-    return time_s, force, rate
+    return InertialSamples(DEVICE, _stamps_ns(time_s), force, rate)
