@@ -167,11 +167,10 @@ def score_flight(
 def _is_valid(covariance: Array) -> Mask:
     """Return which covariances (n, 6, 6) are finite and positive definite.
 
-    Not considered are coordinates that are known (their row is zero, as of the height over a
-    floor), and the orientation if all its variances are ``nan``.
+    Not considered are coordinates that are known (without variance, as the height over a floor), and the orientation if all its variances are ``nan``.
     """
     has_orientation = np.isfinite(covariance[:, range(3, 6), range(3, 6)]).any(axis=1)
-    is_estimated = np.any(covariance != 0.0, axis=2)
+    is_estimated = np.einsum("nii->ni", covariance) != 0.0
     is_estimated[~has_orientation, 3:] = False
     is_pair = is_estimated[:, :, None] & is_estimated[:, None, :]
     block = np.where(is_pair, covariance, np.eye(6))
