@@ -18,7 +18,7 @@ average if the covariance is honest. It depends on the frame in which errors are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,9 @@ from locatk.formats.benchmarks.lighthouse.flights import START_NS, Flight
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+TruePoses = Callable[[NDArray[np.int64]], tuple[Array, Rotation]]
+"""From time stamps (n,) to positions (n, 3) and rotations."""
 
 INTERVAL_S = 0.02
 """Length of the intervals of the coverage [s]: a rotation of a station."""
@@ -103,14 +106,43 @@ def score_flight(
     with_scale: bool = False,
     shared: Array | None = None,
 ) -> FlightScore:
-    """Compare a trajectory with the truth of a flight.
+    """Compare a trajectory with the truth of an independent flight.
+
+    ``scene`` is the solved one, for the NEES in the frame of the first station; the other
+    parameters are those of :func:`score_trajectory`.
+    """
+    start_s, end_s = flight.motion.flying_s
+    flying_ns = (START_NS + round(start_s * 1e9), START_NS + round(end_s * 1e9))
+    return score_trajectory(
+        trajectory,
+        flight.true_poses,
+        flying_ns,
+        None if scene is None or with_scale else _station_frame(flight, scene),
+        with_scale=with_scale,
+        shared=shared,
+    )
+
+
+def score_trajectory(
+    trajectory: Trajectory,
+    true_poses: TruePoses,
+    flying_ns: tuple[int, int],
+    station_frame: Similarity | None = None,
+    *,
+    with_scale: bool = False,
+    shared: Array | None = None,
+) -> FlightScore:
+    """Compare a trajectory with the truth.
 
     Parameters
     ----------
-    flight : Flight
     trajectory : Trajectory
-    scene : Scene, optional
-        Solved scene, for the NEES in the frame of the first station.
+    true_poses : callable
+        From time stamps (n,) to positions (n, 3) and rotations.
+    flying_ns : (int, int)
+        Start and end of the time in which poses are expected.
+    station_frame : Similarity, optional
+        Rigid motion that moves the first station from its solved to its true pose.
     with_scale : bool
         True if the scale of the trajectory is unknown.
     shared : (n, 3, m) ndarray, optional
@@ -122,7 +154,7 @@ def score_flight(
     DegenerateError
         The trajectory has too few poses for an alignment.
     """
-    position, rotation = flight.true_poses(trajectory.time_ns)
+    position, rotation = true_poses(trajectory.time_ns)
     estimate, covariance = trajectory.position, trajectory.covariance[:, :3, :3]
     rigid = umeyama(estimate, position, with_scale=False)
     similarity = umeyama(estimate, position)
@@ -138,8 +170,8 @@ def score_flight(
         return error**2 / np.where(variance == 0.0, np.nan, variance)
 
     station_nees, projected_nees = undefined, undefined
-    if scene is not None and scene.stations and not with_scale:
-        station_nees = nees(_station_frame(flight, scene), covariance)
+    if station_frame is not None:
+        station_nees = nees(station_frame, covariance)
     if shared is not None:
         remaining = _project(shared, estimate, with_scale)
         projected_nees = nees(fit, covariance - shared @ shared.mT + remaining @ remaining.mT)
@@ -151,7 +183,7 @@ def score_flight(
         )
         turn_rad[has_orientation] = (turned * rotation[has_orientation].inv()).magnitude()
     return FlightScore(
-        _covered(flight, trajectory),
+        _covered(trajectory.time_ns, flying_ns),
         np.linalg.norm(estimate - position, axis=1),
         np.linalg.norm(rigid.apply(estimate) - position, axis=1),
         np.linalg.norm(similarity.apply(estimate) - position, axis=1),
@@ -167,10 +199,11 @@ def score_flight(
 def _is_valid(covariance: Array) -> Mask:
     """Return which covariances (n, 6, 6) are finite and positive definite.
 
-    Not considered are coordinates that are known (without variance, as the height over a floor), and the orientation if all its variances are ``nan``.
+    Not considered are coordinates that are known (without variance, as the height over a floor),
+    and the orientation if all its variances are ``nan``.
     """
     has_orientation = np.isfinite(covariance[:, range(3, 6), range(3, 6)]).any(axis=1)
-    is_estimated = np.einsum("nii->ni", covariance) != 0.0
+    is_estimated = np.asarray(np.einsum("nii->ni", covariance) != 0.0)
     is_estimated[~has_orientation, 3:] = False
     is_pair = is_estimated[:, :, None] & is_estimated[:, None, :]
     block = np.where(is_pair, covariance, np.eye(6))
@@ -182,12 +215,12 @@ def _is_valid(covariance: Array) -> Mask:
     return np.asarray(is_finite & (np.linalg.eigvalsh(scaled)[:, 0] > 0))
 
 
-def _station_frame(flight: Flight, scene: Scene) -> Similarity:
+def _station_frame(flight: Flight, scene: Scene) -> Similarity | None:
     """Return the rigid motion that moves the first station from its solved to its true pose."""
     unit = flight.units[0]
     station = scene.station(unit.channel)
     if station is None:
-        return Similarity(1.0, np.eye(3), np.full(3, np.nan))
+        return None
     rotation = unit.rotation @ station.rotation.T
     return Similarity(1.0, rotation, unit.position - rotation @ station.position)
 
@@ -206,12 +239,10 @@ def _project(shared: Array, position: Array, with_scale: bool) -> Array:
     return np.asarray((errors - absorbed).reshape(shared.shape))
 
 
-def _covered(flight: Flight, trajectory: Trajectory) -> Mask:
+def _covered(time_ns: NDArray[np.int64], flying_ns: tuple[int, int]) -> Mask:
     """Return which intervals of :data:`INTERVAL_S` of the flight contain a pose."""
-    start_s, end_s = flight.motion.flying_s
-    edges_s = np.arange(start_s, end_s, INTERVAL_S)
-    time_s = (trajectory.time_ns - START_NS) * 1e-9
-    return np.histogram(time_s, edges_s)[0] > 0
+    edges_ns = np.arange(*flying_ns, round(INTERVAL_S * 1e9))
+    return np.diff(np.searchsorted(np.sort(time_ns), edges_ns)) > 0
 
 
 def summarize(score: FlightScore) -> dict[str, float]:

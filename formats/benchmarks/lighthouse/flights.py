@@ -405,7 +405,7 @@ class Flight:
 
     def true_poses(self, time_ns: NDArray[np.int64]) -> tuple[Array, Rotation]:
         """Return the true positions (n, 3) and rotations of the device at time stamps."""
-        time_s = (np.asarray(time_ns) - START_NS) * 1e-9
+        time_s = (time_ns - START_NS).astype(float) * 1e-9
         return self.motion.position(time_s), self.motion.rotation(time_s)
 
 
@@ -622,7 +622,7 @@ def _receive(
 ) -> NDArray[np.void]:
     """Return the sweeps of one station that the device receives, in any order."""
     turns = int(options.duration_s / unit.period_s)
-    start_s = unit.zero_s + unit.period_s * np.arange(1, turns + 1)
+    start_s: Array = unit.zero_s + unit.period_s * np.arange(1.0, turns + 1.0)
     start_s = start_s + unit.wander_s(start_s)
     shape = (turns, 2, len(diodes_m))
 
@@ -737,7 +737,8 @@ def _intervals(
     """Return ascending, disjoint intervals (k, 2) that cover about a fraction of a duration."""
     if fraction <= 0:
         return np.zeros((0, 2))
-    intervals, end_s = [], 0.0
+    intervals: list[tuple[float, float]] = []
+    end_s = 0.0
     mean_s = float(np.mean(range_s))
     while True:
         start_s = end_s + rng.exponential(mean_s * (1 - fraction) / fraction)

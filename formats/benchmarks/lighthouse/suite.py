@@ -32,6 +32,7 @@ from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Duration, Figure, measure_or_explain
+from locatk.formats.benchmarks.lighthouse.motion import motion_figures
 from locatk.formats.benchmarks.timing import measure_single_threaded, time_call
 from locatk.formats.importers.dotbot.recording import read_dotbot
 from locatk.formats.importers.imported_session import ImportedSession
@@ -84,7 +85,12 @@ def figures(data: Path) -> list[Figure]:
         declared = [Figure(name, None, "mm", "", mm) for name, mm in targets_mm.items()]
         measured = measure_or_explain(partial(measure, data / "lighthouse"), *declared)
         rows += [replace(row, target=targets_mm.get(row.name)) for row in measured]
-    return [*rows, _speed_on_grid(data / "lighthouse"), *_speed_on_simulation()]
+    return [
+        *rows,
+        *motion_figures(),
+        _speed_on_grid(data / "lighthouse"),
+        *_speed_on_simulation(),
+    ]
 
 
 # ---- accuracy
