@@ -203,11 +203,11 @@ def _is_valid(covariance: Array) -> Mask:
     and the orientation if all its variances are ``nan``.
     """
     has_orientation = np.isfinite(covariance[:, range(3, 6), range(3, 6)]).any(axis=1)
-    is_estimated = np.asarray(np.einsum("nii->ni", covariance) != 0.0)
+    is_estimated = covariance[:, range(6), range(6)] != 0.0
     is_estimated[~has_orientation, 3:] = False
     is_pair = is_estimated[:, :, None] & is_estimated[:, None, :]
     block = np.where(is_pair, covariance, np.eye(6))
-    is_finite = np.isfinite(block).all(axis=(1, 2))
+    is_finite: Mask = np.asarray(np.isfinite(block).all(axis=(1, 2)))
     block = np.where(is_finite[:, None, None], block, np.eye(6))
     # Scaled to unit variances, so that metres and radians are comparable.
     sigma = np.sqrt(np.abs(np.einsum("nii->ni", block)) + np.finfo(float).tiny)

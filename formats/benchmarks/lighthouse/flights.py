@@ -628,7 +628,7 @@ def _receive(
 
     hidden_s = _intervals(fault_rng, options.occlusion, OCCLUSION_S, options.duration_s)
     mirrored_s = _intervals(fault_rng, options.reflections, REFLECTION_S, options.duration_s)
-    walls = _draw_walls(fault_rng, len(mirrored_s))
+    walls = _draw_walls(fault_rng, len(mirrored_s), unit.position)
     run = _interval_of(start_s, mirrored_s)
     is_mirrored = np.zeros((turns, 2), bool)
     # In a third of the reflections, only one of the planes has no direct light.
@@ -756,12 +756,15 @@ def _interval_of(time_s: Array, intervals_s: Array) -> NDArray[np.intp]:
     return np.where((index >= 0) & (time_s < intervals_s[index, 1]), index, -1)
 
 
-def _draw_walls(rng: np.random.Generator, count: int) -> Array:
+def _draw_walls(rng: np.random.Generator, count: int, station_m: Array) -> Array:
     """Return vertical walls (count + 1, 4): unit normal, and distance from the centre [m].
 
-    The last one is not used; an index of -1 stands for no wall.
+    They are opposite to a station or beside it. The last one is not used; an index of -1 stands
+    for no wall.
     """
-    azimuth = rng.integers(0, 4, count + 1) * np.pi / 2 + rng.normal(0, 0.02, count + 1)
+    side = rng.choice([-0.5, 0.0, 0.0, 0.5], count + 1)
+    azimuth = np.arctan2(-station_m[1], -station_m[0]) + np.pi * side
+    azimuth += rng.normal(0, 0.1, count + 1)
     return np.stack(
         [np.cos(azimuth), np.sin(azimuth), 0 * azimuth, rng.uniform(*WALL_M, count + 1)], axis=1
     )
