@@ -105,7 +105,10 @@ def test_rounding_is_common_to_the_photodiodes_of_a_group(monkeypatch: pytest.Mo
     flight = make_flight(1, **QUICK, deck_error=0.0)
     sweeps, errors = flight.sweeps, crossing_errors(flight)
     step = 2 * np.pi / (959000 / 8)
-    assert errors.std() == pytest.approx(step / np.sqrt(12) * np.sqrt(1 + 1 / 16), rel=0.05)
+    # At rest the rounding of a photodiode is always the same.
+    is_moving = np.abs((sweeps.time_ns - START_NS) * 1e-9 - 4.0) < 2.0
+    uniform = step / np.sqrt(12) * np.sqrt(1 + 1 / 16)
+    assert errors[is_moving].std() == pytest.approx(uniform, rel=0.05)
     is_pair = (np.diff(sweeps.time_ns) < 300_000) & (np.diff(sweeps.channel) == 0)
     assert is_pair.sum() > 1000
     # Within a group only the rounding of the 24 MHz time stamps differs, a quarter of a step.
