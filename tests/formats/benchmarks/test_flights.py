@@ -116,6 +116,7 @@ def test_rounding_is_common_to_the_photodiodes_of_a_group(monkeypatch: pytest.Mo
     assert np.mean(sweeps.count == np.rint(sweeps.count)) < 0.6
 
 
+@pytest.mark.slow
 def test_equal_seeds_give_equal_flights_and_other_motions_leave_the_stations() -> None:
     first, second = make_flight(2, **QUICK), make_flight(2, **QUICK)
     np.testing.assert_array_equal(first.sweeps.count, second.sweeps.count)
@@ -136,6 +137,7 @@ def test_wrong_sweeps_have_the_requested_number_and_are_marked() -> None:
     assert np.mean(errors[flight.is_wrong] > 1.5e-3) > 0.95
 
 
+@pytest.mark.slow
 def test_reflections_come_in_runs_and_are_seen_behind_walls() -> None:
     flight = make_flight(4, motion="slow", duration_s=30.0, reflections=0.15, deck_error=0.0)
     errors = np.abs(crossing_errors(flight))
@@ -158,6 +160,7 @@ def test_a_moved_station_keeps_its_light_but_not_its_pose() -> None:
     assert np.median(before[is_moved]) > 2e-3
 
 
+@pytest.mark.slow
 def test_hidden_stations_and_the_back_of_the_deck_receive_nothing() -> None:
     visible = make_flight(7, **QUICK)
     hidden = make_flight(7, motion="slow", duration_s=40.0, occlusion=0.3)
@@ -170,6 +173,7 @@ def test_hidden_stations_and_the_back_of_the_deck_receive_nothing() -> None:
     assert np.sum(ray * rotation.apply([0.0, 0.0, 1.0]), axis=1).min() > 0.03
 
 
+@pytest.mark.slow
 def test_given_geometry_and_factory_data_differ_from_the_truth() -> None:
     offsets, tilts = [], []
     for seed in range(8):
@@ -185,6 +189,7 @@ def test_given_geometry_and_factory_data_differ_from_the_truth() -> None:
     assert not make_flight(0, **QUICK, geometry="unknown", calibration=False).scene.calibrations
 
 
+@pytest.mark.slow
 def test_the_imu_measures_the_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("GYRO_BIAS_RADPS", "GYRO_NOISE_RADPS", "ACCELERATION_BIAS_MPS2",
                  "ACCELERATION_NOISE_MPS2", "VIBRATION_MPS2", "IMU_MOUNTING_RAD"):  # fmt: skip
@@ -295,6 +300,7 @@ def test_the_frame_of_the_first_station_is_no_alignment(flight: Flight) -> None:
     assert np.mean(score.aligned_nees) < 1.2
 
 
+@pytest.mark.slow
 def test_the_projection_removes_only_what_the_alignment_absorbs(flight: Flight) -> None:
     exact = estimate(flight, 1e-9)
     truth = exact.position
