@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from locatk.core.errors import LocatkError
 from locatk.core.lighthouse import solve
+from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
+from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure
@@ -37,8 +39,8 @@ FLIGHT_S = 24.0
 MAX_TRUTH_GAP_NS = 15_000_000
 """Largest distance in time from a pose to a sample of the truth that is compared with it [ns]."""
 
-Flights = tuple[Mapping[str, Any], ...]
-"""Options of each flight, those of ``FlightOptions`` in ``flights``."""
+Options = Mapping[str, Any] | SimulationOptions
+"""Options of a flight: those of ``FlightOptions`` in ``flights`` by name, or of the simulator."""
 
 
 @dataclass(frozen=True)
@@ -48,33 +50,48 @@ class Case:
     Attributes
     ----------
     name, how : str
-    flights : Flights
+    flights : tuple of Options
+        Those of the independent generator, or of the simulator of ``locatk simulate lighthouse``.
     nees : str
         Frame in which errors are compared with covariances, as described in
         :mod:`~locatk.formats.benchmarks.lighthouse.flight_scores`.
     alignment : str
-        ``"rigid"`` or ``"similarity"``.
+        ``"rigid"``, ``"similarity"`` or ``"no"``.
     is_precise : bool
         True if the errors have targets: those of a device in its own scene, in metres.
-    duration_s : float
     """
 
     name: str
     how: str
-    flights: Flights
+    flights: tuple[Options, ...]
     nees: str = "station"
     alignment: str = "rigid"
     is_precise: bool = False
-    duration_s: float = FLIGHT_S
 
 
-def _vary(flights: Flights, **options: Any) -> Flights:
+def _vary(flights: tuple[Mapping[str, Any], ...], **options: Any) -> tuple[Mapping[str, Any], ...]:
     return tuple({**flight, **options} for flight in flights)
 
 
 SLOW, AGILE = {"motion": "slow"}, {"motion": "agile"}
 FOUR_DIODES = _vary(({"motion": "hover"}, SLOW, AGILE, {"motion": "hand"}), geometry="unknown")
 FAULTY = _vary((SLOW, AGILE), geometry="unknown")
+
+FLOWN = SimulationOptions(
+    planar=False,
+    flying=True,
+    receiver=DECK,
+    report_hz=120.0,
+    duration_s=36.0,
+    outliers=0.05,
+    noise_rad=ANGLE_SIGMA_RAD,
+    reflections=0.05,
+    calibration_error_rad=1e-3,
+    factory_data=True,
+)
+REPORTED = SimulationOptions(
+    planar=False, duration_s=60.0, outliers=0.1, noise_rad=ANGLE_SIGMA_RAD
+)  # fmt: skip
 
 CASES = (
     Case("four diodes", "hovering, slow, agile, by hand; stations unknown", FOUR_DIODES,
@@ -94,20 +111,11 @@ CASES = (
          _vary(FAULTY, occlusion=0.25)),
     Case("moved station", "four diodes, stations given; one is displaced by 50 mm and 2 degrees",
          _vary(FAULTY, geometry="given", is_station_moved=True), "raw"),
+    Case("own simulator", "four diodes, markers; factory data off by 1 mrad, 5 % wrong sweeps, "
+         "5 % of the time in reflections", (FLOWN,) * 2, "raw", "no"),
+    Case("10 reports a second", "own simulator, one diode, markers; 10 % wrong sweeps",
+         (REPORTED,) * 2, "raw", "no"),
 )  # fmt: skip
-"""Cases of the independent generator."""
-
-REPORTS = SimulationOptions(planar=False, duration_s=60.0, outliers=0.1, noise_rad=1.15e-4)
-"""A photodiode under two stations that reports ten times a second, with 10 % wrong sweeps."""
-
-REPORT_SESSIONS = 2
-REPORTS_CASE = Case(
-    "10 reports a second",
-    "own simulator: one diode, 10 % wrong sweeps",
-    (),
-    "raw",
-    duration_s=REPORTS.duration_s,
-)
 
 
 def motion_figures() -> list[Figure]:
@@ -116,16 +124,13 @@ def motion_figures() -> list[Figure]:
     pooled: list[FlightScore] = []
     for case in CASES:
         scores, refused = [], []
-        for k, options in enumerate(case.flights):
+        for k, flight in enumerate(case.flights):
             try:
-                scores.append(_score_flight(FIRST_SEED + k, options, case.alignment))
+                scores.append(_score(flight, FIRST_SEED + k, case))
             except LocatkError as error:
                 refused.append(str(error))
         rows += case_figures(case, scores, refused)
         pooled += scores
-    scores = [_score_reports(FIRST_SEED + k) for k in range(REPORT_SESSIONS)]
-    rows += case_figures(REPORTS_CASE, scores)
-    pooled += scores
     invalid = sum(int(np.count_nonzero(score.is_invalid)) for score in pooled)
     how = f"of {sum(map(len, pooled))} poses of all flights"
     return [*rows, Figure("motion: poses without a valid covariance", invalid, "poses", how, 0)]
@@ -135,7 +140,7 @@ def case_figures(
     case: Case, scores: Sequence[FlightScore], refused: Sequence[str] = ()
 ) -> list[Figure]:
     """Return the figures of a case from the scores of its flights, or from refusals."""
-    flights = f"{len(scores)} flights of {case.duration_s:g} s"
+    flights = f"{len(scores)} flights"
     if refused:
         flights += f", {len(refused)} refused ({refused[0]})"
     how = f"{case.how}; {flights}; {case.alignment} alignment"
@@ -153,7 +158,9 @@ def case_figures(
         return [figure.missing(refused[0]) for figure in declared.values()]
     score = FlightScore.concatenate(scores)
     found = summarize(score)
-    distance_m = score.rigid_m if case.alignment == "rigid" else score.similarity_m
+    distance_m = score.raw_m
+    if case.alignment != "no":
+        distance_m = score.rigid_m if case.alignment == "rigid" else score.similarity_m
     nees = found[f"{case.nees} NEES"]
     values: dict[str, float | None] = {
         "median": 1e3 * float(np.median(distance_m)),
@@ -167,21 +174,24 @@ def case_figures(
     return [replace(declared[key], value=value) for key, value in values.items()]
 
 
-def _score_flight(seed: int, options: Mapping[str, Any], alignment: str) -> FlightScore:
+def _score(options: Options, seed: int, case: Case) -> FlightScore:
+    """Simulate a flight, solve it and score its poses."""
+    if isinstance(options, SimulationOptions):
+        return _score_simulated(replace(options, seed=seed))
     flight = make_flight(seed, **{"duration_s": FLIGHT_S, **options})
     solution = solve(flight.sweeps, flight.scene, receivers=flight.receivers)
-    return score_flight(
-        flight,
-        solution.trajectories[0],
-        solution.artifact,
-        with_scale=alignment == "similarity",
-    )
+    with_scale = case.alignment == "similarity"
+    (trajectory,) = solution.trajectories
+    return score_flight(flight, trajectory, solution.artifact, with_scale=with_scale)
 
 
-def _score_reports(seed: int) -> FlightScore:
-    simulated = simulate(replace(REPORTS, seed=seed))
-    solution = solve(simulated.sweeps, simulated.scene)
-    truth, estimate = simulated.truth[0], solution.trajectories[0]
+def _score_simulated(options: SimulationOptions) -> FlightScore:
+    """Score the poses of the first robot of the simulator of locatk, if their truth is known."""
+    simulated = simulate(options)
+    (device,) = simulated.sweeps.devices
+    receivers = {} if options.receiver is None else {device: options.receiver}
+    solution = solve(simulated.sweeps, simulated.scene, receivers=receivers)
+    (truth,), (estimate,) = simulated.truth, solution.trajectories
     nearest = np.clip(np.searchsorted(truth.time_ns, estimate.time_ns), 0, len(truth) - 1)
     is_known = np.abs(truth.time_ns[nearest] - estimate.time_ns) < MAX_TRUTH_GAP_NS
     flying_ns = (int(truth.time_ns[0]), int(truth.time_ns[-1]))
