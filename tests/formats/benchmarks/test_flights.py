@@ -327,7 +327,7 @@ def test_covariances_that_are_none_are_counted(flight: Flight) -> None:
     covariance = exact.covariance.copy()
     covariance[0, 0, 0] = -1e-6
     covariance[1, 1, 1] = np.nan
-    covariance[2, 0, 1] = covariance[2, 1, 0] = 2 * covariance[2, 0, 0]
+    covariance[2, 0, 1] = covariance[2, 1, 0] = 1.5 * covariance[2, 0, 0]
     covariance[3, 4, 4] = np.nan
     covariance[4, 3:, :] = covariance[4, :, 3:] = np.nan  # a single photodiode
     covariance[5, 2, :] = covariance[5, :, 2] = 0.0  # a known height
