@@ -62,8 +62,9 @@ class FlightScore:
         valid. The alignment is a similarity if the scale is unknown, otherwise rigid.
     is_invalid : (n,) bool ndarray
         True for poses whose covariance is not finite or not positive definite.
-    turn_rad : (n,) ndarray
-        Errors of the orientation after the alignment; ``nan`` without an orientation.
+    turn_rad, turn_nees : (n,) and (n, 3) ndarray
+        Angles between estimated and true orientations after the alignment, and the NEES of their
+        components; ``nan`` without an orientation.
     """
 
     is_covered: Mask
@@ -76,6 +77,7 @@ class FlightScore:
     projected_nees: Array
     is_invalid: Mask
     turn_rad: Array
+    turn_nees: Array
 
     def __len__(self) -> int:
         return len(self.rigid_m)
@@ -175,13 +177,15 @@ def score_trajectory(
     if shared is not None:
         remaining = _project(shared, estimate, with_scale)
         projected_nees = nees(fit, covariance - shared @ shared.mT + remaining @ remaining.mT)
-    turn_rad = np.full(len(trajectory), np.nan)
+    turn = np.full_like(position, np.nan)
     has_orientation = np.isfinite(trajectory.covariance[:, 5, 5])
     if np.any(has_orientation):
-        turned = Rotation.from_matrix(fit.rotation) * Rotation.from_quat(
-            trajectory.quaternion[has_orientation]
-        )
-        turn_rad[has_orientation] = (turned * rotation[has_orientation].inv()).magnitude()
+        frame = Rotation.from_matrix(fit.rotation)
+        turned = frame * Rotation.from_quat(trajectory.quaternion[has_orientation])
+        error = (turned * rotation[has_orientation].inv()).as_rotvec()
+        turn[has_orientation] = frame.inv().apply(error)
+    turn_variance = np.einsum("nii->ni", trajectory.covariance)[:, 3:]
+    turn_variance = np.where(is_invalid[:, None], np.nan, turn_variance)
     return FlightScore(
         _covered(trajectory.time_ns, flying_ns),
         np.linalg.norm(estimate - position, axis=1),
@@ -192,7 +196,8 @@ def score_trajectory(
         nees(fit, covariance),
         projected_nees,
         is_invalid,
-        turn_rad,
+        np.linalg.norm(turn, axis=1),
+        turn**2 / turn_variance,
     )
 
 
@@ -259,7 +264,7 @@ def summarize(score: FlightScore) -> dict[str, float]:
     for name, distance_m in (("rigid", score.rigid_m), ("similarity", score.similarity_m)):
         median, high, largest = 1e3 * np.quantile(distance_m, [0.5, 0.95, 1.0])
         figures |= {f"{name} median": median, f"{name} p95": high, f"{name} max": largest}
-    for name in ("raw", "station", "aligned", "projected"):
+    for name in ("raw", "station", "aligned", "projected", "turn"):
         nees = getattr(score, f"{name}_nees")
         nees = nees[np.isfinite(nees)]
         figures[f"{name} NEES"] = float(nees.mean()) if len(nees) else np.nan

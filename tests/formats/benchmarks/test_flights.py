@@ -241,7 +241,8 @@ def estimate(
     start_s, end_s = flight.motion.flying_s
     time_ns = START_NS + np.round(np.arange(start_s, end_s, 0.02) * 1e9 + 5e6).astype(np.int64)
     position, rotation = flight.true_poses(time_ns)
-    noise = np.random.default_rng(seed).normal(0, sigma_m, position.shape)
+    noise, turns = np.random.default_rng(seed).normal(0, sigma_m, (2, *position.shape))
+    rotation = Rotation.from_rotvec(turns) * rotation
     covariance = np.tile(np.eye(6), (len(time_ns), 1, 1)) * (reported_m or sigma_m) ** 2
     return Trajectory("flight", "floor", time_ns, position + noise, rotation.as_quat(), covariance)
 
@@ -254,7 +255,9 @@ def test_honest_covariances_have_a_nees_of_one(flight: Flight) -> None:
     assert figures["coverage"] == 1.0
     assert (figures["beyond"], figures["far"], figures["invalid"]) == (0.0, 0.0, 0.0)
     assert figures["rigid median"] == pytest.approx(2 * 1.538, rel=0.1)
-    assert figures["orientation"] < 0.1
+    # Metres and radians have the same standard deviation.
+    assert figures["orientation"] == pytest.approx(np.degrees(0.002 * 1.538), rel=0.1)
+    assert figures["turn NEES"] == pytest.approx(1.0, abs=0.15)
     optimistic = score_flight(flight, estimate(flight, reported_m=0.0002), flight.scene)
     assert flight_scores.summarize(optimistic)["aligned NEES"] == pytest.approx(100, rel=0.15)
     assert optimistic.is_beyond.mean() > 0.8
@@ -272,7 +275,8 @@ def test_a_rigid_motion_and_a_scale_are_aligned(flight: Flight) -> None:
     assert score.raw_m.min() > 1.0
     assert 1e-3 < np.median(score.rigid_m) < 0.05
     assert score.similarity_m.max() < 1e-5
-    assert score.turn_rad.max() < 1e-5
+    assert score.turn_rad.max() < 2e-5
+    assert np.mean(score.turn_nees) == pytest.approx(1.0, rel=0.1)
     # Errors and variances have the scale of the trajectory, in which the noise is larger.
     assert np.mean(score.aligned_nees) == pytest.approx(1.02**2, rel=0.05)
 
