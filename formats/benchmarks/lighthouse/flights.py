@@ -46,6 +46,8 @@ START_NS = 1_700_000_000_000_000_000
 """Time stamp of the start of each flight [ns since the Unix epoch]."""
 
 DEVICE = "flight"
+"""Name of the device."""
+
 GRAVITY_MPS2 = 9.81
 
 # ---- motion
@@ -72,6 +74,8 @@ SHAKE_RAD = {"hover": 0.008, "slow": 0.012, "agile": 0.03, "hand": 0.35}
 """Standard deviation of the attitude from that of an ideal quadrotor [rad]."""
 
 SHAKE_CUTOFF_HZ = {"hover": 3.0, "slow": 3.0, "agile": 4.0, "hand": 0.4}
+"""Bandwidth of this deviation [Hz]."""
+
 REST_S = 2.0
 """Time at rest on the floor before the take-off and after the landing [s]."""
 
@@ -90,6 +94,7 @@ LENS_SERIES = (-8.0108022e-06, 0.0028679863, 5.3685255e-06, 0.0076069798, 0.0, 0
 """Coefficients of libsurvive's curvature, highest power first (survive_reproject_gen2.c)."""
 
 PHASE, TILT, CURVE, GIBMAG, GIBPHASE, OGEEMAG, OGEEPHASE = range(7)
+"""Columns of the parameters of a plane."""
 
 UNIT_MEAN = np.array(
     [
@@ -127,6 +132,8 @@ BEAM_HALF_WIDTH_RAD = (1.30, 0.90)
 # ---- deck
 
 TICK_HZ, LFSR_HZ = 24e6, 6e6
+"""Rates of the clock of the receiver and of the LFSR [Hz] (bitcraze/lighthouse-fpga)."""
+
 ANGLE_NOISE_RAD, COMMON_NOISE_RAD = 45e-6, 10e-6
 """Noise of a crossing, of each photodiode and common to all of a group [rad] (recordings: 50 to
 65 microradians together with the rounding)."""
@@ -163,6 +170,8 @@ IMU_HZ, IMU_DELAY_S = 100.0, (0.0, 0.005)
 GYRO_BIAS_RADPS, GYRO_NOISE_RADPS = 0.008, 0.004
 ACCELERATION_BIAS_MPS2, ACCELERATION_NOISE_MPS2, VIBRATION_MPS2 = 0.08, 0.05, 0.3
 IMU_MOUNTING_RAD = 0.015
+"""Rate of the samples, and range of the delay of the filters; standard deviations of biases, noise,
+vibration in flight, and rotation of the IMU against the deck, along each axis."""
 
 
 @dataclass(frozen=True)
@@ -540,7 +549,7 @@ def _draw_units(rng: np.random.Generator, options: FlightOptions) -> list[Unit]:
         channel = k + 1
         period_s = PERIOD_TICKS[channel] / 48e6 * (1 + rng.uniform(-1, 1) * CLOCK_PPM * 1e-6)
         nodes_s = np.linspace(-5.0, options.duration_s + 5.0, 24)
-        wander = BSpline(*make_interp_spline(nodes_s, rng.normal(0, WANDER_S, 24)).tck)
+        wander = make_interp_spline(nodes_s, rng.normal(0, WANDER_S, 24))
         units.append(
             Unit(
                 channel,
