@@ -37,7 +37,7 @@ from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene, Station
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -81,6 +81,15 @@ REST_S = 2.0
 
 CLIMB_S = 1.5
 """Duration of take-off and of landing [s]."""
+
+MARKERS_M = np.array([[0.6, -0.6, 0.03], [0.6, 0.6, 0.03], [-0.6, 0.6, 0.03], [-0.6, -0.6, 0.03]])
+"""(4, 3) positions of the deck on the markers [m]."""
+
+MARKER_SIGMA_M = 0.002
+"""Standard deviation along each axis of the error of a measured marker [m]."""
+
+VISIT_S, CARRY_S, CARRY_HEIGHT_M = 2.0, 1.5, 0.15
+"""Rest on a marker, and duration and height of the way by hand to the next one."""
 
 GRID_HZ = 100.0
 """Rate of the nodes of the splines of position and attitude [Hz]."""
@@ -204,6 +213,8 @@ class FlightOptions:
         hidden.
     is_station_moved : bool
         True if the last station is displaced during the flight.
+    has_markers : bool
+        True if the device rests on measured markers before the take-off.
     """
 
     motion: str = "slow"
@@ -218,6 +229,7 @@ class FlightOptions:
     reflections: float = 0.0
     occlusion: float = 0.0
     is_station_moved: bool = False
+    has_markers: bool = False
 
 
 class Motion:
@@ -227,10 +239,15 @@ class Motion:
     ----------
     flying_s : (float, float)
         Start of the take-off and end of the landing.
+    visits_s : (k, 2) ndarray
+        Start and end of the rest on each of :data:`MARKERS_M`, before the take-off; k may be 0.
     """
 
-    def __init__(self, rng: np.random.Generator, kind: str, duration_s: float) -> None:
-        self.flying_s = (REST_S, duration_s - REST_S)
+    def __init__(self, rng: np.random.Generator, options: FlightOptions) -> None:
+        kind, duration_s = options.motion, options.duration_s
+        arrival_s = (VISIT_S + CARRY_S) * np.arange(len(MARKERS_M) * options.has_markers)
+        self.visits_s = np.stack([arrival_s, arrival_s + VISIT_S], axis=1)
+        self.flying_s = (float(np.max(self.visits_s, initial=REST_S)), duration_s - REST_S)
         self._is_carried = kind == "hand"
         margin_s = 1.0
         time_s = np.arange(-margin_s, duration_s + margin_s, 1 / GRID_HZ)
@@ -242,7 +259,11 @@ class Motion:
             [_smooth_noise(rng, len(time_s), 0.6, 3) for _ in range(3)], axis=1
         )
         floor = np.array([*rng.uniform(-0.3, 0.3, 2), 0.03])
-        position = floor + airborne[:, None] * (path - floor)
+        if options.has_markers:
+            floor = MARKERS_M[-1]
+        position = airborne[:, None] * (path - floor) + (
+            _carried_path(self.visits_s, time_s) if options.has_markers else floor
+        )
         self._position = _spline(time_s, gaussian_filter1d(position, 3.0, axis=0))
         self._acceleration = self._position.derivative(2)
         heading = rng.uniform(-np.pi, np.pi) + airborne * TURN_RAD[kind] * _smooth_noise(
@@ -427,7 +448,7 @@ def make_flight(seed: int, **options: object) -> Flight:
     # A generator for each aspect: another motion, for example, leaves the stations as they are.
     streams = [np.random.default_rng([seed, k]) for k in range(6)]
     motion_rng, station_rng, deck_rng, fault_rng, imu_rng, geometry_rng = streams
-    motion = Motion(motion_rng, chosen.motion, chosen.duration_s)
+    motion = Motion(motion_rng, chosen)
     units = tuple(_draw_units(station_rng, chosen))
     diodes_m = np.zeros((1, 3))
     if chosen.diodes > 1:
@@ -450,7 +471,7 @@ def make_flight(seed: int, **options: object) -> Flight:
     )
     return Flight(
         sweeps,
-        _known_scene(units, chosen, geometry_rng),
+        _known_scene(units, chosen, motion.visits_s, geometry_rng),
         {DEVICE: DECK} if chosen.diodes > 1 else {},
         _measure_inertia(motion, chosen.duration_s, imu_rng),
         motion,
@@ -498,6 +519,17 @@ def _waypoint_path(
         path += progress[:, None] * (target - here)
         here = target
         start_s += leg_s + rng.uniform(*PAUSE_S[kind])
+    return path
+
+
+def _carried_path(visits_s: Array, time_s: Array) -> Array:
+    """Return positions (n, 3) from marker to marker, and on the last one from then on."""
+    path = np.tile(MARKERS_M[0], (len(time_s), 1))
+    for k, leg in enumerate(np.diff(MARKERS_M, axis=0)):
+        progress = (time_s - visits_s[k, 1]) / CARRY_S
+        path += _minimum_jerk(progress)[:, None] * leg
+        height = _minimum_jerk(2 * progress) * _minimum_jerk(2 - 2 * progress)
+        path[:, 2] += CARRY_HEIGHT_M * height
     return path
 
 
@@ -581,7 +613,7 @@ def _random_turn(rng: np.random.Generator, sigma_rad: float) -> Array:
 
 
 def _known_scene(
-    units: tuple[Unit, ...], options: FlightOptions, rng: np.random.Generator
+    units: tuple[Unit, ...], options: FlightOptions, visits_s: Array, rng: np.random.Generator
 ) -> Scene:
     """Return what is known of the stations before the flight."""
     calibrations = {}
@@ -591,9 +623,8 @@ def _known_scene(
             u.channel: Calibration(u.factory.astype(np.float16).astype(float), "factory")
             for u in units
         }
-    if options.geometry == "unknown":
-        return Scene(planar=False, calibrations=calibrations)
-    if not calibrations:
+    is_known = options.geometry != "unknown"
+    if is_known and not calibrations:
         raise ValueError("stations with a given pose need a calibration")
     scale = 1.0 if options.geometry == "given" else 0.0
     stations = tuple(
@@ -604,8 +635,24 @@ def _known_scene(
             calibrations[u.channel],
         )
         for u in units
+        if is_known
     )
-    return Scene(stations, planar=False, scale="markers", calibrations=calibrations)
+    visits_ns = START_NS + np.round(1e9 * visits_s).astype(np.int64)
+    markers = tuple(
+        Marker(
+            f"marker-{k + 1}",
+            MARKERS_M[k] + rng.normal(0.0, MARKER_SIGMA_M, 3),
+            (MarkerVisit(DEVICE, int(start_ns), int(end_ns)),),
+        )
+        for k, (start_ns, end_ns) in enumerate(visits_ns)
+    )
+    return Scene(
+        stations,
+        markers,
+        planar=False,
+        scale="markers" if stations or markers else "unit",
+        calibrations=calibrations,
+    )
 
 
 # ---- light

@@ -58,7 +58,7 @@ class Case:
     alignment : str
         ``"rigid"``, ``"similarity"`` or ``"no"``.
     is_precise : bool
-        True if the errors have targets: those of a device in its own scene, in metres.
+        True if the errors have targets: those of the deck in its own scene.
     """
 
     name: str
@@ -96,6 +96,8 @@ REPORTED = SimulationOptions(
 CASES = (
     Case("four diodes", "hovering, slow, agile, by hand; stations unknown", FOUR_DIODES,
          is_precise=True),
+    Case("four diodes, markers", "the same flights after rests on four measured markers",
+         _vary(FOUR_DIODES, has_markers=True, duration_s=34.0), "raw", is_precise=True),
     Case("four diodes, stations given", "the same flights; stations off by 10 mm and 3 mrad",
          _vary(FOUR_DIODES, geometry="given"), "raw"),
     Case("one diode", "slow and agile; stations unknown", _vary(FAULTY, diodes=1), "aligned",

@@ -26,7 +26,7 @@ ALLOWED_IMPORTS = {
     "locatk.core.lighthouse.calibration": {"Calibration"},
     "locatk.core.lighthouse.receiver": {"DECK", "Receiver"},
     "locatk.core.lighthouse.recording": {"Sweeps"},
-    "locatk.core.lighthouse.scene": {"Scene", "Station"},
+    "locatk.core.lighthouse.scene": {"Marker", "MarkerVisit", "Scene", "Station"},
 }
 """Classes of results, which the generator may use."""
 
@@ -187,6 +187,28 @@ def test_given_geometry_and_factory_data_differ_from_the_truth() -> None:
     unknown = make_flight(0, **QUICK, geometry="unknown").scene
     assert (unknown.stations, len(unknown.calibrations)) == ((), 2)
     assert not make_flight(0, **QUICK, geometry="unknown", calibration=False).scene.calibrations
+
+
+def test_the_device_rests_on_its_markers_before_the_flight() -> None:
+    flight = make_flight(5, motion="slow", duration_s=22.0, geometry="unknown", has_markers=True)
+    assert len(flight.scene.markers) == 4
+    errors = []
+    for marker in flight.scene.markers:
+        [visit] = marker.visits
+        assert visit.start_ns is not None
+        assert visit.end_ns is not None
+        inside_ns = np.arange(visit.start_ns + 200_000_000, visit.end_ns - 200_000_000, 10**8)
+        position, _ = flight.true_poses(inside_ns)
+        assert np.ptp(position, axis=0).max() < 1e-6
+        errors.append(marker.position - position[0])
+    assert 5e-4 < np.std(errors) < 5e-3
+    start_s, _ = flight.motion.flying_s
+    assert visit.end_ns == START_NS + round(start_s * 1e9)
+    time_ns = START_NS + np.arange(0, 22 * 10**9, 10**7)
+    position, _ = flight.true_poses(time_ns)
+    assert np.linalg.norm(np.diff(position, axis=0), axis=1).max() < 0.03
+    assert position[:, 2].max() > 0.4
+    assert flight.sweeps.time_ns[0] < START_NS + 10**8
 
 
 @pytest.mark.slow
