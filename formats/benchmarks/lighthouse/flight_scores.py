@@ -87,12 +87,6 @@ class FlightScore:
         """Poses (n,) that are wrong for a user after a rigid alignment."""
         return self.rigid_m > FAR_M
 
-    @property
-    def is_beyond(self) -> Mask:
-        """Poses (n,) with an axis whose error the reported covariance excludes."""
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.any(self.aligned_nees > FAR_SIGMAS**2, axis=1))
-
     @classmethod
     def concatenate(cls, scores: Sequence[FlightScore]) -> FlightScore:
         """Pool the poses of several flights."""
@@ -250,6 +244,12 @@ def _covered(time_ns: NDArray[np.int64], flying_ns: tuple[int, int]) -> Mask:
     return np.diff(np.searchsorted(np.sort(time_ns), edges_ns)) > 0
 
 
+def exceeds_sigmas(nees: Array) -> Mask:
+    """Return which poses have an axis beyond :data:`FAR_SIGMAS`, from the NEES (n, 3) of axes."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.any(nees > FAR_SIGMAS**2, axis=1))
+
+
 def summarize(score: FlightScore) -> dict[str, float]:
     """Return the figures of a score: lengths in mm, angles in degrees, fractions from 0 to 1.
 
@@ -272,7 +272,7 @@ def summarize(score: FlightScore) -> dict[str, float]:
         figures[f"{name} NEES median"] = median
     turn_rad = score.turn_rad[np.isfinite(score.turn_rad)]
     return figures | {
-        "beyond": float(np.mean(score.is_beyond)),
+        "beyond": float(np.mean(exceeds_sigmas(score.aligned_nees))),
         "far": float(np.mean(score.is_far)),
         "invalid": float(np.mean(score.is_invalid)),
         "orientation": float(np.degrees(np.median(turn_rad))) if len(turn_rad) else np.nan,

@@ -282,7 +282,7 @@ def test_honest_covariances_have_a_nees_of_one(flight: Flight) -> None:
     assert figures["turn NEES"] == pytest.approx(1.0, abs=0.15)
     optimistic = score_flight(flight, estimate(flight, reported_m=0.0002), flight.scene)
     assert flight_scores.summarize(optimistic)["aligned NEES"] == pytest.approx(100, rel=0.15)
-    assert optimistic.is_beyond.mean() > 0.8
+    assert flight_scores.exceeds_sigmas(optimistic.aligned_nees).mean() > 0.8
 
 
 def test_a_rigid_motion_and_a_scale_are_aligned(flight: Flight) -> None:
@@ -405,3 +405,8 @@ def test_far_poses_and_excluded_ones_are_counted(flight: Flight) -> None:
     assert rows["motion, a case: beyond 5 sigma"].value == pytest.approx(percent)
     assert rows["motion, a case: over 50 mm"].met is False
     assert rows["motion, a case: beyond 5 sigma"].met is False
+    # Errors of the frame count only without an alignment.
+    shifted = score_flight(flight, replace(exact, position=exact.position + 0.1))
+    for alignment, value in (("no", 100.0), ("rigid", 0.0)):
+        rows_of = motion.case_figures(replace(case, alignment=alignment), [shifted])
+        assert [r.value for r in rows_of if "over" in r.name or "sigma" in r.name] == [value] * 2
