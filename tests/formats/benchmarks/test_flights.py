@@ -409,4 +409,4 @@ def test_far_poses_and_excluded_ones_are_counted(flight: Flight) -> None:
     shifted = score_flight(flight, replace(exact, position=exact.position + 0.1))
     for alignment, value in (("no", 100.0), ("rigid", 0.0)):
         rows_of = motion.case_figures(replace(case, alignment=alignment), [shifted])
-        assert [r.value for r in rows_of if "over" in r.name or "sigma" in r.name] == [value] * 2
+        assert [r.value for r in rows_of if "over 50" in r.name or "sigma" in r.name] == [value] * 2
