@@ -12,7 +12,7 @@ from locatk.cli import console, options
 from locatk.cli.command import Command
 
 BENCHES = {
-    "lighthouse": "locatk.formats.benchmarks.lighthouse:figures",
+    "lighthouse": "locatk.formats.benchmarks.lighthouse.suite:figures",
     "dots": "locatk.formats.benchmarks.dots.suite:figures",
     "polaris": "locatk.formats.benchmarks.polaris.suite:figures",
     "landmarks": "locatk.formats.benchmarks.landmarks.suite:figures",

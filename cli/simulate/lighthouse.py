@@ -18,7 +18,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Simulate robots that drive under Lighthouse stations into a session with truth.
+    """Simulate robots that drive or fly under Lighthouse stations into a session with truth.
 
     The same settings and seed give the same sweeps. The session contains markers, as a user would
     measure them, but not the stations: the solver estimates these.
@@ -29,6 +29,7 @@ def command(
       locatk simulate lighthouse -o swarm.mcap --robots 20 --stations 4
       locatk simulate lighthouse -o hard.mcap --3d --occlusion 0.2 --seed 7
       locatk simulate lighthouse -o deck.mcap --3d --receiver deck
+      locatk simulate lighthouse -o flight.mcap --flight --receiver deck
       locatk simulate lighthouse --robots 20 --print-config > sim.toml
       locatk simulate lighthouse --config sim.toml -o swarm.mcap --seed 2
     """

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from locatk.core.errors import FormatError
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -30,6 +31,7 @@ from locatk.formats.artifacts.tags import attached_tags as read_tags
 from locatk.formats.sessions import capture_record
 from locatk.formats.sessions.field_samples import read_halls, read_magnetometers
 from locatk.formats.sessions.frames import read_frames
+from locatk.formats.sessions.inertial import imu_streams, read_imu
 from locatk.formats.sessions.messages import MAX_BATCH_NS, SWEEPS, TimedMessage, batch_edges
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution, read_trajectories, write_solution
@@ -51,6 +53,7 @@ __all__ = [
     "read_camera",
     "read_frames",
     "read_halls",
+    "read_imu",
     "read_magnetometers",
     "read_manifest",
     "read_map",
@@ -193,6 +196,7 @@ def write_session(
     sweeps: Sweeps,
     truth: Sequence[Trajectory] = (),
     odometry: Sequence[Trajectory] = (),
+    imu: Sequence[InertialSamples] = (),
     scene: Scene | None = None,
     facts: Mapping[str, object] | None = None,
     stations: Sequence[StationReport] = (),
@@ -214,6 +218,8 @@ def write_session(
         viewers on ``/truth/<device>``.
     odometry : sequence of Trajectory
         The planar part (x, y, heading) is written on ``/odometry/<device>``.
+    imu : sequence of InertialSamples
+        Accelerometer and gyroscope, on ``/imu/<device>``.
     scene : Scene, optional
         Attached as ``scene.toml``.
     facts : mapping, optional
@@ -233,14 +239,14 @@ def write_session(
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.atomic_write`.
     InputError
-        A time is before 1970, two trajectories have the same device or two stations the same
-        channel, or a receiver is impossible.
+        A time is before 1970, two trajectories or two IMUs have the same device or two stations
+        the same channel, or a receiver or a sample of an IMU is impossible.
     """
     records = station_records(stations)
     scene = add_station_data(scene, stations)
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
     receiver_texts = receiver_attachments(receivers or {}, devices)
-    streams = [sweep_messages(sweeps), *reference_streams(truth, odometry)]
+    streams = [sweep_messages(sweeps), *reference_streams(truth, odometry), *imu_streams(imu)]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if scene is not None:

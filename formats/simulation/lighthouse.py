@@ -17,6 +17,7 @@ from locatk.formats.artifacts.kinds import (
     Boolean,
     FilePath,
     Integer,
+    Number,
 )
 from locatk.formats.artifacts.receiver import read_receiver
 from locatk.formats.sessions import observations
@@ -42,7 +43,7 @@ CONFIG = SimulationConfig(
         Setting(
             "robots.planar",
             Boolean(),
-            "Robots drive on the floor; otherwise they are moved through space",
+            "Robots drive on the floor; otherwise they are moved through space, or fly",
             "planar",
             "--planar/--3d",
         ),
@@ -58,7 +59,27 @@ CONFIG = SimulationConfig(
             example=DECK_NAME,
             metavar="deck|FILE",
         ),
+        Setting(
+            "robots.flying",
+            Boolean(),
+            "Robots are quadrotors with an IMU that take off, fly through space and land",
+            "flying",
+            "--flight/--no-flight",
+        ),
+        Setting(
+            "robots.speed_mps",
+            POSITIVE,
+            "Largest speed of flights, without take-off and landing",
+            "speed_mps",
+        ),
+        Setting("robots.imu_hz", NOT_NEGATIVE, "Rate of the IMU of flights; 0: none", "imu_hz"),
         Setting("stations.count", Integer(1, 16), "Number of stations", "stations", "--stations"),
+        Setting(
+            "stations.factory_data",
+            Boolean(),
+            "The session contains the factory calibrations of the stations",
+            "factory_data",
+        ),
         Setting(
             "errors.noise_udeg",
             NOT_NEGATIVE,
@@ -82,9 +103,29 @@ CONFIG = SimulationConfig(
             "outliers",
             "--outliers",
         ),
+        Setting(
+            "errors.reflection_fraction",
+            FRACTION_BELOW_1,
+            "Fraction of the time in which a robot receives a station by reflection only",
+            "reflections",
+        ),
+        Setting(
+            "errors.calibration_deg",
+            NOT_NEGATIVE,
+            "Standard deviation of tilts and phases of the light planes from the factory "
+            "calibration; real ones are up to 0.06 and 0.15 degrees off",
+            "calibration_error_rad",
+        ),
+        Setting(
+            "errors.station_turn_deg",
+            Number(),
+            "Angle by which the last station is turned in the middle of the session",
+            "station_turn_rad",
+        ),
         Setting("random.seed", Integer(0), "Seed of all random numbers", "seed", "--seed"),
     ),
     SimulationOptions(),
+    conflicts=((("robots.flying",), ("robots.planar",)),),
 )
 """Settings of the command."""
 
@@ -102,6 +143,7 @@ def simulation_options(settings: Mapping[str, Any]) -> SimulationOptions:
     values = CONFIG.in_si(settings)
     noise_udeg = values.pop("errors.noise_udeg", NOISE_UDEG)
     receiver = _read_receiver(values.pop("robots.receiver", None))
+    values.setdefault("planar", not values.get("flying", False))
     return SimulationOptions(
         **values,
         noise_rad=math.radians(noise_udeg * 1e-6),
@@ -136,6 +178,7 @@ def write_simulation(
         sweeps=sweeps,
         scene=simulated.scene,
         truth=simulated.truth,
+        imu=simulated.imu,
         receivers={} if receiver is None else dict.fromkeys(sweeps.devices, receiver),
         overwrite=overwrite,
     )

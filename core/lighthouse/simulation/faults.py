@@ -83,13 +83,66 @@ def _reflect(
     chosen = rng.permutation(np.flatnonzero(is_complete))[:events]
     for index in np.unique(pairs.link[chosen]):
         rows = chosen[pairs.link[chosen] == index]
-        link = links[index]
         noise = rng.normal(0.0, noise_rad, (len(rows), 2))
-        time_s, count = link.source.observe(pairs.start_s[rows], _mirror_position(link), noise)
+        time_s, count = _reflected(pairs.start_s[rows], links[index], noise)
         is_received = np.isfinite(count).all(axis=1)
         rows = rows[is_received]
         pairs.time_s[rows], pairs.count[rows] = time_s[is_received], count[is_received]
         pairs.is_outlier[rows] = True
+
+
+def reflect_in_runs(
+    pairs: SweepPairs,
+    links: Sequence[OpticalLink],
+    edges_s: Sequence[Array],
+    noise_rad: float,
+    rng: np.random.Generator,
+) -> None:
+    """Replace the sweeps of whole intervals by their reflection in the wall ahead of the station.
+
+    The direct light is hidden meanwhile: a sweep without a reflection is lost.
+
+    Parameters
+    ----------
+    pairs : SweepPairs
+        Changed in place.
+    links : sequence of OpticalLink
+    edges_s : sequence of (2 k,) ndarray
+        For each link, ascending starts and ends of the intervals.
+    noise_rad : float
+        Standard deviation of the rotor angles.
+    rng : Generator
+    """
+    for index, (link, edges) in enumerate(zip(links, edges_s, strict=True)):
+        is_hidden = (pairs.link == index) & (np.searchsorted(edges, pairs.start_s) % 2 == 1)
+        rows = np.flatnonzero(is_hidden & np.isfinite(pairs.count).any(axis=1))
+        noise = rng.normal(0.0, noise_rad, (len(rows), 2))
+        time_s, count = _reflected(pairs.start_s[rows], link, noise)
+        count[~np.isfinite(pairs.count[rows])] = np.nan
+        pairs.time_s[rows], pairs.count[rows] = time_s, count
+        pairs.is_outlier[rows] = True
+
+
+def draw_intervals(
+    rng: np.random.Generator, fraction: float, mean_s: float, duration_s: float
+) -> Array:
+    """Return ascending starts and ends (2 k,) of intervals in a session [s].
+
+    Their total is exactly the given fraction of its duration.
+    """
+    total_s = fraction * duration_s
+    count = int(np.ceil(total_s / mean_s))
+    if count == 0:
+        return np.zeros(0)
+    durations_s = np.zeros(2 * count)
+    durations_s[0::2] = rng.dirichlet(np.ones(count + 1))[:-1] * (duration_s - total_s)
+    durations_s[1::2] = rng.dirichlet(np.full(count, 2.0)) * total_s
+    return np.cumsum(durations_s)
+
+
+def _reflected(start_s: Array, link: OpticalLink, noise: Array) -> tuple[Array, Array]:
+    """Return the times and counts (n, 2) of the reflections in rotations from ``start_s`` on."""
+    return link.source.observe(start_s, _mirror_position(link), noise)
 
 
 def _mirror_position(link: OpticalLink) -> PositionFunction:

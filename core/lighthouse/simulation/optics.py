@@ -42,12 +42,26 @@ class SimulatedStation:
         Duration of a rotation.
     bits : (k,) int ndarray
         Slow bit (OOTX) of each rotation.
+    turned_rotation : (3, 3) ndarray or None
+        Rotation of the station from ``turned_s`` on; None if it is never turned.
+    turned_s : float
     """
 
     station: Station
     zero_s: float
     period_s: float
     bits: NDArray[np.int64]
+    turned_rotation: Array | None = None
+    turned_s: float = np.inf
+
+    def to_local(self, points: Array, time_s: Array) -> Array:
+        """Return points (..., 3) in the axes that the station has at times (...)."""
+        offset = points - self.station.position
+        local = offset @ self.station.rotation
+        if self.turned_rotation is None:
+            return local
+        is_turned = (time_s >= self.turned_s)[..., None]
+        return np.where(is_turned, offset @ self.turned_rotation, local)
 
     def observe(
         self, start_s: Array, position: PositionFunction, noise: Array
@@ -78,7 +92,7 @@ class SimulatedStation:
         nominal_s = start_s[:, None] + self.period_s * np.array([1 / 3, 2 / 3])
         time_s = nominal_s
         for _ in range(4):
-            local = (position(time_s) - self.station.position) @ self.station.rotation
+            local = self.to_local(position(time_s), time_s)
             # Points are (n, 2, 3), one per plane at its own time: of the angles (n, 2, 2) only
             # that of the same plane is used.
             angle = predict_angles(local, self.station.calibration)[..., [0, 1], [0, 1]]
@@ -126,21 +140,14 @@ class OpticalLink:
     def position(self, time_s: Array) -> Array:
         """Return the positions (..., 3) of the photodiode in metres at times (...)."""
         origin = self.path.position(time_s)
-        return origin if self.offset_m is None else origin + self._to_world(self.offset_m, time_s)
+        return origin if self.offset_m is None else origin + self.path.rotate(self.offset_m, time_s)
 
     def is_facing(self, time_s: Array) -> NDArray[np.bool_]:
         """Return True if the photodiode points towards the station at times (...)."""
         if self.normal is None:
             return np.ones(np.shape(time_s), bool)
         to_station = self.source.station.position - self.position(time_s)
-        return np.sum(to_station * self._to_world(self.normal, time_s), axis=-1) > 0
-
-    def _to_world(self, vector: Array, time_s: Array) -> Array:
-        """Rotate a vector (3,) of the robot's axes by the heading at times (...) to (..., 3)."""
-        heading = self.path.heading(time_s)
-        cos, sin = np.cos(heading), np.sin(heading)
-        x, y, z = vector
-        return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=-1)
+        return np.sum(to_station * self.path.rotate(self.normal, time_s), axis=-1) > 0
 
 
 @dataclass
@@ -198,7 +205,7 @@ def observe_reports(
     """
     source, station = link.source, link.source.station
     # The last complete rotation is that whose second plane has crossed the photodiode.
-    local = (link.position(reports_s) - station.position) @ station.rotation
+    local = source.to_local(link.position(reports_s), reports_s)
     second_angle = predict_angles(local, station.calibration)[:, 1]
     crossing_turns = (second_angle - ROTOR_ZERO_RAD[1]) / (2 * np.pi)
     elapsed_turns = (reports_s - DECODING_DELAY_S - source.zero_s) / source.period_s

@@ -1,12 +1,18 @@
-"""Trajectories of simulated robots: smooth closed curves, driven in legs with rests between them.
+"""Trajectories of simulated robots: smooth closed curves, driven in legs with rests between them,
+and flights of quadrotors.
 
-All of it is in closed form, so that a simulator can evaluate any time.
+All positions are in closed form, so that a simulator can evaluate any time.
 """
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
+
+from locatk.core.geometry import quaternion_from_heading, quaternion_from_matrix
+from locatk.core.inertial import STANDARD_GRAVITY_M_S2
 
 Array = NDArray[np.float64]
 
@@ -27,6 +33,16 @@ LEG_DURATION_S, REST_DURATION_S = (5.0, 12.0), (0.5, 2.0)
 
 MARKER_VISIT_S, CARRY_S = 2.0, 1.0
 """Time for which a robot rests on each marker, and for which it is carried to the next one [s]."""
+
+FLIGHT_CENTRE_M, FLIGHT_HALF_RANGE_M = np.array([0.0, 0.0, 0.75]), np.array([0.8, 0.8, 0.4])
+"""Centre of the volume in which robots fly, and half of its size [m]."""
+
+FLOOR_REST_S, CLIMB_S = 1.0, 2.0
+"""Rest before the take-off and after the landing, and duration of each of these [s]."""
+
+STEP_S = 1e-3
+"""Step of the numerical derivatives of a flight [s]. Errors of the accelerations are below 1e-5 of
+their size, and rounding adds 1e-9 m/s^2."""
 
 
 class ClosedCurve:
@@ -128,11 +144,74 @@ class StopAndGo:
         )
 
 
-class RobotPath:
-    """Pose of one robot as a function of time.
+class MarkerTour:
+    """Rests on markers, before a robot moves by itself.
 
-    The robot is set on each marker in turn, then drives along a :class:`ClosedCurve`. In a
-    session that is too short for this, the markers are visited faster, in its first half.
+    In a session that is too short, the markers are visited faster, in its first half.
+
+    Parameters
+    ----------
+    duration_s : float
+        Duration of the session.
+    markers : (k, 3) ndarray
+        Positions of the markers in metres; k may be 0.
+    destination : (3,) ndarray
+        Position to which the robot is carried in the end.
+
+    Attributes
+    ----------
+    visits_s : (k, 2) ndarray
+        Start and end of the rest on each marker.
+    carry_edges_s : (2 k,) ndarray
+        Ascending starts and ends of the times in which it is carried.
+    end_s : float
+        Time from which on the robot moves by itself.
+    """
+
+    def __init__(self, duration_s: float, markers: Array, destination: Array) -> None:
+        k = len(markers)
+        time_scale = min(1.0, duration_s / 2 / (k * (MARKER_VISIT_S + CARRY_S))) if k else 1.0
+        arrival_s = time_scale * (MARKER_VISIT_S + CARRY_S) * np.arange(k, dtype=float)
+        departure_s = arrival_s + time_scale * MARKER_VISIT_S
+        self.visits_s = np.stack([arrival_s, departure_s], axis=1)
+        self.end_s = time_scale * (MARKER_VISIT_S + CARRY_S) * k
+        carry_end_s = np.r_[arrival_s[1:], [self.end_s][:k]]
+        self.carry_edges_s = np.stack([departure_s, carry_end_s], axis=1).ravel()
+        if k:
+            self._progress = StopAndGo(departure_s, np.full(k, time_scale * CARRY_S), np.ones(k))
+            self._stops = np.vstack([markers, destination])
+
+    def place(self, position: Array, time_s: Array) -> None:
+        """Replace the positions (..., 3) at times (...) of the tour, in place."""
+        on_tour = time_s < self.end_s
+        if len(self.carry_edges_s) and np.any(on_tour):
+            stop = self._progress(time_s[on_tour])
+            stops = np.arange(len(self._stops))
+            position[on_tour] = np.stack(
+                [np.interp(stop, stops, self._stops[:, i]) for i in range(3)], axis=-1
+            )
+
+
+class RobotPath(Protocol):
+    """Pose of one robot as a function of time: first on markers, then on its own."""
+
+    tour: MarkerTour
+
+    def position(self, time_s: Array) -> Array:
+        """Return positions (..., 3) in metres at times (...)."""
+        ...
+
+    def quaternion(self, time_s: Array) -> Array:
+        """Return orientations (..., 4) as (x, y, z, w) at times (...)."""
+        ...
+
+    def rotate(self, vector: Array, time_s: Array) -> Array:
+        """Rotate a vector (3,) of the robot's axes at times (...) to (..., 3)."""
+        ...
+
+
+class DrivenPath:
+    """Path of a robot that drives along a :class:`ClosedCurve`; see :class:`RobotPath`.
 
     Parameters
     ----------
@@ -143,13 +222,6 @@ class RobotPath:
         Duration of the session.
     markers : (k, 3) ndarray
         Positions of the markers in metres; k may be 0.
-
-    Attributes
-    ----------
-    visits_s : (k, 2) ndarray
-        Start and end of the rest on each marker.
-    carry_edges_s : (2 k,) ndarray
-        Ascending starts and ends of the times in which it is carried.
     """
 
     def __init__(
@@ -157,38 +229,124 @@ class RobotPath:
     ) -> None:
         self._curve = ClosedCurve(rng, planar)
         self._start_distance_m = rng.uniform(0.0, self._curve.length_m)
-        k = len(markers)
-        time_scale = min(1.0, duration_s / 2 / (k * (MARKER_VISIT_S + CARRY_S))) if k else 1.0
-        arrival_s = time_scale * (MARKER_VISIT_S + CARRY_S) * np.arange(k, dtype=float)
-        departure_s = arrival_s + time_scale * MARKER_VISIT_S
-        self.visits_s = np.stack([arrival_s, departure_s], axis=1)
-        self._drive_start_s = time_scale * (MARKER_VISIT_S + CARRY_S) * k
-        carry_end_s = np.r_[arrival_s[1:], [self._drive_start_s][:k]]
-        self.carry_edges_s = np.stack([departure_s, carry_end_s], axis=1).ravel()
-        if k:
-            self._tour = StopAndGo(departure_s, np.full(k, time_scale * CARRY_S), np.ones(k))
-            self._stops = np.vstack(
-                [markers, self._curve.position(np.array(self._start_distance_m))]
-            )
-
+        start = self._curve.position(np.array(self._start_distance_m))
+        self.tour = MarkerTour(duration_s, markers, start)
         legs = int(duration_s / LEG_DURATION_S[0]) + 1
         leg_s, rest_s = rng.uniform(*LEG_DURATION_S, legs), rng.uniform(*REST_DURATION_S, legs)
-        start_s = self._drive_start_s + np.r_[0.0, np.cumsum(leg_s + rest_s)[:-1]]
+        start_s = self.tour.end_s + np.r_[0.0, np.cumsum(leg_s + rest_s)[:-1]]
         advance_m = rng.uniform(*TOP_SPEED_MPS, legs) * leg_s / StopAndGo.PEAK_SPEED_RATIO
         self._drive = StopAndGo(start_s, leg_s, advance_m)
 
     def position(self, time_s: Array) -> Array:
         """Return positions (..., 3) in metres at times (...)."""
         position = self._curve.position(self._start_distance_m + self._drive(time_s))
-        on_tour = time_s < self._drive_start_s
-        if len(self.carry_edges_s) and np.any(on_tour):
-            stop = self._tour(time_s[on_tour])
-            stops = np.arange(len(self._stops))
-            position[on_tour] = np.stack(
-                [np.interp(stop, stops, self._stops[:, i]) for i in range(3)], axis=-1
-            )
+        self.tour.place(position, time_s)
         return position
 
     def heading(self, time_s: Array) -> Array:
         """Return headings (...) in radians; on markers, that with which it will start to drive."""
         return self._curve.heading(self._start_distance_m + self._drive(time_s))
+
+    def quaternion(self, time_s: Array) -> Array:
+        """Return orientations (..., 4) as (x, y, z, w) at times (...)."""
+        return quaternion_from_heading(self.heading(time_s))
+
+    def rotate(self, vector: Array, time_s: Array) -> Array:
+        """Rotate a vector (3,) of the robot's axes at times (...) to (..., 3)."""
+        heading = self.heading(time_s)
+        cos, sin = np.cos(heading), np.sin(heading)
+        x, y, z = vector
+        return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=-1)
+
+
+class FlownPath:
+    """Path of a quadrotor that takes off, flies and lands; see :class:`RobotPath`.
+
+    Each coordinate is a sum of waves. The aircraft tilts so that its rotors push along its
+    acceleration plus gravity, and turns slowly about its vertical axis.
+
+    Parameters
+    ----------
+    rng : Generator
+    duration_s : float
+        Duration of the session. It ends with a rest after the landing.
+    markers : (k, 3) ndarray
+        Positions of the markers in metres; k may be 0.
+    top_speed_mps : float
+        Bound of the speed between take-off and landing.
+
+    Attributes
+    ----------
+    flying_s : (float, float)
+        Start of the take-off and end of the landing.
+    """
+
+    WAVES = 3
+    """Waves for each coordinate, and for the heading."""
+
+    def __init__(
+        self, rng: np.random.Generator, duration_s: float, markers: Array, top_speed_mps: float
+    ) -> None:
+        start = np.append(rng.uniform(-0.5, 0.5, 2), 0.0)
+        self.tour = MarkerTour(duration_s, markers, start)
+        rest_s = min(FLOOR_REST_S, (duration_s - self.tour.end_s) / 6)
+        self.flying_s = (self.tour.end_s + rest_s, duration_s - rest_s)
+        self._climb_s = min(CLIMB_S, (self.flying_s[1] - self.flying_s[0]) / 3)
+        self._floor = start
+        amplitude = rng.dirichlet(np.ones(self.WAVES), 3) * FLIGHT_HALF_RANGE_M[:, None]
+        frequency = rng.uniform(1.0, 3.0, (3, self.WAVES))
+        # The speed of a coordinate is at most the sum of the speeds of its waves.
+        bound = np.linalg.norm(np.sum(amplitude * frequency, axis=1))
+        self._amplitude = amplitude
+        self._frequency = frequency * (top_speed_mps / bound)
+        self._phase = rng.uniform(0, 2 * np.pi, (3, self.WAVES))
+        self._heading = rng.uniform(-np.pi, np.pi)
+        self._heading_waves = rng.uniform(0.1, 0.4, self.WAVES), rng.uniform(0, 6, self.WAVES)
+
+    def position(self, time_s: Array) -> Array:
+        """Return positions (..., 3) in metres at times (...)."""
+        time_s = np.asarray(time_s)
+        waves = np.sin(self._frequency * time_s[..., None, None] + self._phase)
+        flown = FLIGHT_CENTRE_M + np.sum(self._amplitude * waves, axis=-1)
+        height = _smooth_step((time_s - self.flying_s[0]) / self._climb_s) * _smooth_step(
+            (self.flying_s[1] - time_s) / self._climb_s
+        )
+        position = self._floor + height[..., None] * (flown - self._floor)
+        self.tour.place(position, time_s)
+        return position
+
+    def acceleration(self, time_s: Array) -> Array:
+        """Return accelerations (..., 3) in the room at times (...) [m/s^2]."""
+        before, after = self.position(time_s - STEP_S), self.position(time_s + STEP_S)
+        return (before - 2 * self.position(time_s) + after) / STEP_S**2
+
+    def axes(self, time_s: Array) -> Array:
+        """Return rotations (..., 3, 3) from the aircraft to the room at times (...)."""
+        is_flying = (time_s > self.flying_s[0]) & (time_s < self.flying_s[1])
+        thrust = np.where(is_flying[..., None], self.acceleration(time_s), 0.0)
+        thrust[..., 2] += STANDARD_GRAVITY_M_S2
+        up = thrust / np.linalg.norm(thrust, axis=-1, keepdims=True)
+        rate, phase = self._heading_waves
+        flown_s = np.clip(time_s, *self.flying_s)
+        heading = self._heading + 0.5 * np.sum(np.sin(rate * flown_s[..., None] + phase), axis=-1)
+        ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1)
+        left = np.cross(up, ahead)
+        left /= np.linalg.norm(left, axis=-1, keepdims=True)
+        return np.stack([np.cross(left, up), left, up], axis=-1)
+
+    def quaternion(self, time_s: Array) -> Array:
+        """Return orientations (..., 4) as (x, y, z, w) at times (...)."""
+        return quaternion_from_matrix(self.axes(time_s))
+
+    def rotate(self, vector: Array, time_s: Array) -> Array:
+        """Rotate a vector (3,) of the robot's axes at times (...) to (..., 3)."""
+        return self.axes(time_s) @ vector
+
+
+def _smooth_step(x: Array) -> Array:
+    """Return the transition from 0 to 1 without speed, acceleration and jerk at both ends.
+
+    The angular rate of an aircraft follows the jerk and must not jump.
+    """
+    x = np.clip(x, 0.0, 1.0)
+    return x**4 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x)))

@@ -11,34 +11,43 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.calibration import (
     FACTORY_UNITS,
     GENERIC_CALIBRATION,
     IDEAL_CALIBRATION,
+    PHASE,
+    TILT,
     Calibration,
 )
 from locatk.core.lighthouse.channels import TICK_HZ, period_ticks
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene, Station
-from locatk.core.lighthouse.simulation.faults import inject_faults
+from locatk.core.lighthouse.simulation.faults import (
+    draw_intervals,
+    inject_faults,
+    reflect_in_runs,
+)
+from locatk.core.lighthouse.simulation.inertia import measure_inertia
 from locatk.core.lighthouse.simulation.optics import (
     OpticalLink,
     SimulatedStation,
     SweepPairs,
     observe_reports,
 )
-from locatk.core.lighthouse.simulation.paths import RobotPath
+from locatk.core.lighthouse.simulation.paths import DrivenPath, FlownPath, RobotPath
 from locatk.core.simulation import (
     MAX_SAMPLES,
     check_options,
     check_session_size,
-    exact_trajectory,
+    require_finite,
     require_fraction_below_1,
     require_not_negative,
     require_positive,
@@ -59,8 +68,9 @@ MAX_CLOCK_ERROR_PPM = 25.0
 """Largest error of a station's clock, drawn uniformly [ppm]. Two stations of the published captures
 are off by 15 and 19 ppm (rotation periods of DotBots/alvarado23lighthouse, benchmarks)."""
 
-MEAN_OCCLUSION_S = 1.0
-"""Mean duration for which an obstacle is between a station and a robot [s]."""
+MEAN_OCCLUSION_S, MEAN_REFLECTION_S = 1.0, 0.5
+"""Mean durations for which an obstacle is between a station and a robot, and for which a robot
+receives the reflection of a station [s]."""
 
 FLOOR_MARKERS_M = np.array([[0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0], [-0.5, -0.5, 0.0]])
 """(4, 3) markers of planar sessions: a square of 1 m on the floor."""
@@ -103,6 +113,20 @@ class SimulationOptions:
         True if the receiver reports polynomials.
     receiver : Receiver, optional
         Photodiodes that each robot carries. Default: one at its origin.
+    flying : bool
+        True for quadrotors, which tilt as they accelerate; not if ``planar``.
+    speed_mps : float
+        Bound of the speed of a flight, without take-off and landing.
+    imu_hz : float
+        Rate of the inertial measurement units of quadrotors; 0 for none.
+    reflections : float
+        Fraction of the time in which a robot receives a station by reflection only, 0 to below 1.
+    station_turn_rad : float
+        Angle by which the last station is turned in the middle of the session.
+    calibration_error_rad : float
+        Standard deviation of the tilts and phases of the stations from their factory data.
+    factory_data : bool
+        True if the scene contains the factory data of the stations.
     seed : int
         At least 0.
 
@@ -123,6 +147,13 @@ class SimulationOptions:
     calibration: str = "units"
     labelled: bool = True
     receiver: Receiver | None = None
+    flying: bool = False
+    speed_mps: float = 0.5
+    imu_hz: float = 100.0
+    reflections: float = 0.0
+    station_turn_rad: float = 0.0
+    calibration_error_rad: float = 0.0
+    factory_data: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -131,9 +162,11 @@ class SimulationOptions:
             (
                 ("robots", 1 <= self.robots <= MAX_SAMPLES, f"1 to {MAX_SAMPLES}"),
                 ("stations", 1 <= self.stations <= 16, "1 to 16"),
-                *require_positive(self, "duration_s", "report_hz"),
-                *require_not_negative(self, "noise_rad", "seed"),
-                *require_fraction_below_1(self, "occlusion", "outliers"),
+                *require_positive(self, "duration_s", "report_hz", "speed_mps"),
+                *require_not_negative(self, "noise_rad", "imu_hz", "calibration_error_rad", "seed"),
+                *require_finite(self, "station_turn_rad"),
+                *require_fraction_below_1(self, "occlusion", "outliers", "reflections"),
+                ("flying", not (self.flying and self.planar), "planar=False: robots fly in space"),
                 (
                     "calibration",
                     self.calibration in CALIBRATIONS,
@@ -154,12 +187,14 @@ class SimulatedSession:
     scene : Scene
         Knowledge of a user before solving: the markers, and when robot 1 was on them.
     truth : tuple of Trajectory
-        True poses of each robot at 100 Hz; x points along its path. Robot 1 has neither truth
-        nor sweeps while it is carried from marker to marker.
+        True poses of each robot at 100 Hz; x points along its path, or ahead of a quadrotor.
+        Robot 1 has neither truth nor sweeps while it is carried from marker to marker.
     true_scene : Scene
         ``scene`` with the true stations.
     is_outlier : (n,) bool ndarray
         True for the sweeps that were replaced by outliers.
+    imu : tuple of InertialSamples
+        One of each quadrotor.
     """
 
     sweeps: Sweeps
@@ -167,6 +202,7 @@ class SimulatedSession:
     truth: tuple[Trajectory, ...]
     true_scene: Scene
     is_outlier: Mask
+    imu: tuple[InertialSamples, ...] = ()
 
 
 def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
@@ -183,37 +219,57 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
     options = options or SimulationOptions()
     photodiodes = 1 if options.receiver is None else len(options.receiver)
     rate_hz = TRUTH_RATE_HZ + options.report_hz * options.stations * photodiodes
+    rate_hz += options.imu_hz * options.flying
     check_session_size(options.robots * options.duration_s * rate_hz, options.duration_s)
     # One random stream for each aspect: more noise, for example, leaves the paths as they are.
-    station_rng, path_rng, report_rng, noise_rng, occlusion_rng, fault_rng = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(options.seed).spawn(6)
-    )
+    streams = (np.random.default_rng(s) for s in np.random.SeedSequence(options.seed).spawn(9))
+    station_rng, path_rng, report_rng, noise_rng, occlusion_rng, fault_rng = islice(streams, 6)
+    reflection_rng, deviation_rng, imu_rng = streams
     stations = _simulate_stations(station_rng, options)
+    factory_data = {s.station.channel: s.station.calibration for s in stations}
+    stations = [_deviate(station, deviation_rng, options) for station in stations]
+    if options.station_turn_rad:
+        stations[-1] = _turn(stations[-1], options)
     markers_m = FLOOR_MARKERS_M if options.planar else RAISED_MARKERS_M
     paths: list[RobotPath] = []
     links: list[OpticalLink] = []
     parts: list[SweepPairs] = []
+    reflections_s: list[Array] = []
     for robot in range(options.robots):
         visited_m = markers_m[: 0 if robot else None]
-        path = RobotPath(path_rng, options.planar, options.duration_s, visited_m)
+        path: RobotPath
+        if options.flying:
+            path = FlownPath(path_rng, options.duration_s, visited_m, options.speed_mps)
+        else:
+            path = DrivenPath(path_rng, options.planar, options.duration_s, visited_m)
         paths.append(path)
         reports_s = _report_times(report_rng, options)
         for station in stations:
-            hidden_s = (path.carry_edges_s, _occlusion_edges(occlusion_rng, options))
+            occlusion_s = draw_intervals(
+                occlusion_rng, options.occlusion, MEAN_OCCLUSION_S, options.duration_s
+            )
+            hidden_s = (path.tour.carry_edges_s, occlusion_s)
+            reflection_s = draw_intervals(
+                reflection_rng, options.reflections, MEAN_REFLECTION_S, options.duration_s
+            )
             for link in _optical_links(robot, path, station, options.receiver):
                 noise = noise_rng.normal(0.0, options.noise_rad, (len(reports_s), 2))
                 links.append(link)
                 parts.append(observe_reports(link, len(parts), reports_s, hidden_s, noise))
+                reflections_s.append(reflection_s)
     pairs = SweepPairs.concatenate(parts)
     inject_faults(pairs, links, options.outliers, options.noise_rad, fault_rng)
+    if options.reflections:
+        reflect_in_runs(pairs, links, reflections_s, options.noise_rad, reflection_rng)
 
     digits = len(str(options.robots))
     names = tuple(f"robot-{k + 1:0{digits}d}" for k in range(options.robots))
     sweeps, is_outlier = _to_sweeps(pairs, links, names, options.labelled)
     scene = Scene(
-        markers=_visited_markers(markers_m, names[0], paths[0].visits_s),
+        markers=_visited_markers(markers_m, names[0], paths[0].tour.visits_s),
         planar=options.planar,
         scale="markers",
+        calibrations=factory_data if options.factory_data else {},
     )
     return SimulatedSession(
         sweeps,
@@ -221,6 +277,11 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
         tuple(_truth(n, p, options.duration_s) for n, p in zip(names, paths, strict=True)),
         replace(scene, stations=tuple(station.station for station in stations)),
         is_outlier,
+        tuple(
+            measure_inertia(imu_rng, name, path, options.duration_s, options.imu_hz)
+            for name, path in zip(names, paths, strict=True)
+            if isinstance(path, FlownPath) and options.imu_hz
+        ),
     )
 
 
@@ -253,6 +314,25 @@ def _simulate_stations(
         bits = rng.integers(0, 2, int(options.duration_s / period_s) + 2)
         stations.append(SimulatedStation(station, -period_s * rng.random(), period_s, bits))
     return stations
+
+
+def _deviate(
+    source: SimulatedStation, rng: np.random.Generator, options: SimulationOptions
+) -> SimulatedStation:
+    """Return a station whose planes differ from its factory data in tilt and phase."""
+    if options.calibration_error_rad == 0:
+        return source
+    parameters = source.station.calibration.sweeps.copy()
+    parameters[:, [PHASE, TILT]] += rng.normal(0.0, options.calibration_error_rad, (2, 2))
+    calibration = replace(source.station.calibration, sweeps=parameters)
+    return replace(source, station=replace(source.station, calibration=calibration))
+
+
+def _turn(source: SimulatedStation, options: SimulationOptions) -> SimulatedStation:
+    """Return a station that is turned about the vertical in the middle of the session."""
+    turn = rotation_exp([0.0, 0.0, options.station_turn_rad])
+    rotation = turn @ source.station.rotation
+    return replace(source, turned_rotation=rotation, turned_s=options.duration_s / 2)
 
 
 def _look_at(position: Array, target: Array) -> Array:
@@ -292,21 +372,6 @@ def _report_times(rng: np.random.Generator, options: SimulationOptions) -> Array
     interval_s = 1.0 / options.report_hz
     nominal_s = np.arange(rng.uniform(0, interval_s), options.duration_s, interval_s)
     return nominal_s - rng.uniform(0, 0.02 * interval_s, len(nominal_s))
-
-
-def _occlusion_edges(rng: np.random.Generator, options: SimulationOptions) -> Array:
-    """Return ascending starts and ends (2 k,) of the times in which a station is hidden [s].
-
-    Their total is exactly the requested fraction of the session.
-    """
-    hidden_s = options.occlusion * options.duration_s
-    count = int(np.ceil(hidden_s / MEAN_OCCLUSION_S))
-    if count == 0:
-        return np.zeros(0)
-    durations_s = np.zeros(2 * count)
-    durations_s[0::2] = rng.dirichlet(np.ones(count + 1))[:-1] * (options.duration_s - hidden_s)
-    durations_s[1::2] = rng.dirichlet(np.full(count, 2.0)) * hidden_s
-    return np.cumsum(durations_s)
 
 
 # ---- results
@@ -349,7 +414,7 @@ def _visited_markers(markers_m: Array, device: str, visits_s: Array) -> tuple[Ma
 def _truth(device: str, path: RobotPath, duration_s: float) -> Trajectory:
     """Return the true poses of one robot, except while it is carried."""
     time_s = np.arange(int(np.ceil(duration_s * TRUTH_RATE_HZ)) + 1) / TRUTH_RATE_HZ
-    time_s = time_s[np.searchsorted(path.carry_edges_s, time_s) % 2 == 0]
-    return exact_trajectory(
-        device, "floor", stamps_ns(time_s), path.position(time_s), path.heading(time_s)
-    )
+    time_s = time_s[np.searchsorted(path.tour.carry_edges_s, time_s) % 2 == 0]
+    no_covariance = np.zeros((len(time_s), 6, 6))
+    position, quaternion = path.position(time_s), path.quaternion(time_s)
+    return Trajectory(device, "floor", stamps_ns(time_s), position, quaternion, no_covariance)

@@ -9,6 +9,8 @@ import pytest
 
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.formats.artifacts import maps
+from locatk.formats.sessions import observations
+from locatk.formats.sessions.reader import Session
 from locatk.formats.simulation import dots, landmarks, lighthouse, polaris
 
 SYSTEMS = {"dots": dots, "landmarks": landmarks, "lighthouse": lighthouse, "polaris": polaris}
@@ -164,3 +166,38 @@ def test_sizes_beyond_the_memory_are_refused(
     assert reason in result.stderr
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "run.mcap").exists()
+
+
+@pytest.mark.slow
+def test_flights_of_lighthouse(locatk, tmp_path: Path) -> None:
+    config = tmp_path / "sim.toml"
+    config.write_text(
+        lighthouse.CONFIG.dumps(
+            {
+                "robots.imu_hz": 50.0,
+                "stations.factory_data": True,
+                "errors.reflection_fraction": 0.1,
+                "errors.calibration_deg": 0.06,
+                "errors.station_turn_deg": 1.0,
+            }
+        )
+    )
+    options = lighthouse.simulation_options(
+        lighthouse.CONFIG.read(config) | {"robots.flying": True}
+    )
+    assert options.flying
+    assert not options.planar
+    assert options.calibration_error_rad == pytest.approx(np.radians(0.06))
+    assert options.station_turn_rad == pytest.approx(np.radians(1.0))
+    output = tmp_path / "flight.mcap"
+    arguments = ("-o", output, "--receiver", "deck", "--duration", 6, "--config", config)
+    result = locatk("simulate", "lighthouse", "--flight", *arguments)
+    assert result.exit_code == 0, result.stderr
+    session = Session.open(output)
+    [imu] = observations.read_imu(session)
+    assert (imu.device, len(imu)) == ("robot-1", 300)
+    assert set(observations.read_scene(session).calibrations) == {1, 2}
+    [truth] = observations.read_truth(session)
+    assert np.abs(truth.quaternion[:, :2]).max() > 1e-3
+    result = locatk("simulate", "lighthouse", "--flight", "--planar", *arguments)
+    assert (result.exit_code, "--flight or --planar" in result.stderr) == (2, True)

@@ -32,6 +32,7 @@ from locatk.core.lighthouse.scene import Distance, MarkerVisit, Scene, Station
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Duration, Figure, measure_or_explain
+from locatk.formats.benchmarks.lighthouse.motion import motion_figures
 from locatk.formats.benchmarks.timing import measure_single_threaded, time_call
 from locatk.formats.importers.dotbot.recording import read_dotbot
 from locatk.formats.importers.imported_session import ImportedSession
@@ -84,7 +85,12 @@ def figures(data: Path) -> list[Figure]:
         declared = [Figure(name, None, "mm", "", mm) for name, mm in targets_mm.items()]
         measured = measure_or_explain(partial(measure, data / "lighthouse"), *declared)
         rows += [replace(row, target=targets_mm.get(row.name)) for row in measured]
-    return [*rows, _speed_on_grid(data / "lighthouse"), *_speed_on_simulation()]
+    return [
+        *rows,
+        *motion_figures(),
+        _speed_on_grid(data / "lighthouse"),
+        *_speed_on_simulation(),
+    ]
 
 
 # ---- accuracy
@@ -321,7 +327,7 @@ def _speed_on_grid(data: Path) -> Figure:
 
     def measure() -> list[Figure]:
         _grid_session(data)  # reports missing data with its path
-        return [measure_single_threaded(declared, f"lighthouse.time_grid({str(data)!r})")]
+        return [measure_single_threaded(declared, f"lighthouse.suite.time_grid({str(data)!r})")]
 
     return measure_or_explain(measure, declared)[0]
 
@@ -340,12 +346,12 @@ def _speed_on_simulation() -> list[Figure]:
             Figure("1,000,000 sweeps in a known scene", None, "s",
                    f"solve(): grouping, angles, positions and covariances, {clock}", 1.0,
                    workload="numpy"),
-            f"lighthouse.time_known_scene({SIMULATED_SWEEPS})",
+            f"lighthouse.suite.time_known_scene({SIMULATED_SWEEPS})",
         ),
         measure_single_threaded(
             Figure("session of 1,000,000 sweeps read", None, "s",
                    f"{{0:.0f}} MB of MCAP to arrays, {clock}", 2.0, workload="numpy"),
-            f"lighthouse.time_reading({SIMULATED_SWEEPS})",
+            f"lighthouse.suite.time_reading({SIMULATED_SWEEPS})",
         ),
     ]  # fmt: skip
 
