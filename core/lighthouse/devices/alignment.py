@@ -1,0 +1,135 @@
+"""Alignment of a scene and of trajectories of rigid devices with markers on which they rested."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import DegenerateError
+from locatk.core.geometry import (
+    Similarity,
+    quaternion_from_matrix,
+    quaternion_multiply,
+    transform_covariance,
+    umeyama,
+)
+from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
+from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M
+from locatk.core.solution import SolverWarning
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+MIN_MARKERS = 3
+"""Minimum number of visited markers that determine a frame."""
+
+
+@dataclass(frozen=True)
+class MarkerAlignment:
+    """Similarity transform from the frame of an estimated scene to that of its markers.
+
+    Attributes
+    ----------
+    transform : Similarity
+    misfit_m : float
+        Rms distance of the markers from the transformed positions of the devices, in metres.
+    visits : int
+        Number of visits during which a device has poses.
+    """
+
+    transform: Similarity
+    misfit_m: float
+    visits: int
+
+
+def align_to_markers(
+    markers: Sequence[Marker], trajectories: Sequence[Trajectory]
+) -> MarkerAlignment | None:
+    """Estimate the transform from devices that rested on markers to the frame of the markers.
+
+    It includes the scale: markers are farther from each other than the photodiodes of a device.
+    None if fewer than ``MIN_MARKERS`` visits have a pose, or if they are collinear.
+    """
+    marker_positions, device_positions = [], []
+    for marker in markers:
+        for visit in marker.visits:
+            position = _visit_position(visit, trajectories)
+            if position is not None:
+                marker_positions.append(marker.position)
+                device_positions.append(position)
+    if len(marker_positions) < MIN_MARKERS:
+        return None
+    try:
+        transform = umeyama(np.stack(device_positions), np.stack(marker_positions))
+    except DegenerateError:
+        return None
+    offset = transform.apply(device_positions) - marker_positions
+    misfit_m = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
+    return MarkerAlignment(transform, misfit_m, len(marker_positions))
+
+
+def _visit_position(visit: MarkerVisit, trajectories: Sequence[Trajectory]) -> Array | None:
+    """Return the median position (3,) of a device during a visit; None without a pose."""
+    for trajectory in trajectories:
+        if trajectory.device == visit.device:
+            start_ns, end_ns = visit.start_ns or 0, visit.end_ns or 0
+            is_inside = (trajectory.time_ns >= start_ns) & (trajectory.time_ns <= end_ns)
+            if np.any(is_inside):
+                return np.asarray(np.median(trajectory.position[is_inside], axis=0))
+    return None
+
+
+def transform_scene(scene: Scene, transform: Similarity, frame: str) -> Scene:
+    """Transform the stations of a scene into the frame of its markers."""
+    stations = tuple(
+        replace(
+            station,
+            position=transform.apply(station.position),
+            rotation=transform.rotation @ station.rotation,
+            covariance=None
+            if station.covariance is None
+            else transform_covariance(station.covariance, transform.scale, transform.rotation),
+        )
+        for station in scene.stations
+    )
+    return replace(scene, stations=stations, frame=frame, scale="markers")
+
+
+def transform_trajectory(trajectory: Trajectory, transform: Similarity, frame: str) -> Trajectory:
+    """Transform a trajectory into another frame.
+
+    The distances of the photodiodes on the device do not change: the scale differs from 1 by less
+    than 1 %, or a warning reports that the markers do not fit.
+    """
+    rotation = quaternion_from_matrix(transform.rotation)
+    return replace(
+        trajectory,
+        frame=frame,
+        position=transform.apply(trajectory.position),
+        quaternion=quaternion_multiply(rotation, trajectory.quaternion),
+        covariance=transform_covariance(trajectory.covariance, transform.scale, transform.rotation),
+    )
+
+
+def alignment_warnings(alignment: MarkerAlignment | None) -> list[SolverWarning]:
+    """Return the doubts about an alignment; None stands for too few markers."""
+    if alignment is None:
+        return [
+            SolverWarning(
+                "too_few_markers",
+                f"a device rested on fewer than {MIN_MARKERS} markers that are not on one line: "
+                "the frame is not that of the markers",
+            )
+        ]
+    if alignment.misfit_m > MAX_MARKER_MISFIT_M:
+        return [
+            SolverWarning(
+                "marker_misfit",
+                f"the markers are {1e3 * alignment.misfit_m:.0f} mm (rms) from the positions of "
+                "the device on them: a marker was measured wrong, or the scene is wrong",
+            )
+        ]
+    return []
