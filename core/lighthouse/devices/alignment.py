@@ -16,7 +16,7 @@ from locatk.core.geometry import (
     transform_covariance,
     umeyama,
 )
-from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
+from locatk.core.lighthouse.scene import Marker, MarkerVisit
 from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -80,22 +80,6 @@ def _visit_position(visit: MarkerVisit, trajectories: Sequence[Trajectory]) -> A
             if np.any(is_inside):
                 return np.asarray(np.median(trajectory.position[is_inside], axis=0))
     return None
-
-
-def transform_scene(scene: Scene, transform: Similarity, frame: str) -> Scene:
-    """Transform the stations of a scene into the frame of its markers."""
-    stations = tuple(
-        replace(
-            station,
-            position=transform.apply(station.position),
-            rotation=transform.rotation @ station.rotation,
-            covariance=None
-            if station.covariance is None
-            else transform_covariance(station.covariance, transform.scale, transform.rotation),
-        )
-        for station in scene.stations
-    )
-    return replace(scene, stations=stations, frame=frame, scale="markers")
 
 
 def transform_trajectory(trajectory: Trajectory, transform: Similarity, frame: str) -> Trajectory:

@@ -18,7 +18,6 @@ from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.devices.alignment import (
     align_to_markers,
     alignment_warnings,
-    transform_scene,
     transform_trajectory,
 )
 from locatk.core.lighthouse.devices.device_sweeps import (
@@ -122,7 +121,12 @@ def solve_devices(
         warnings.extend(alignment_warnings(alignment))
         if alignment is not None:
             transform = alignment.transform
-            solved = transform_scene(solved, transform, scene.frame)
+            solved = replace(
+                solved.transformed(transform),
+                frame=scene.frame,
+                scale="markers",
+                frame_source="markers",
+            )
             trajectories = tuple(
                 transform_trajectory(t, transform, scene.frame) for t in trajectories
             )

@@ -253,7 +253,9 @@ def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
     )
     state = adjustment.state
     raised = replace(state, positions=state.positions + np.array([0.0, 0.0, floor_z]))
-    framed = FramedState(raised, adjustment.station_covariance, floor_z, "markers", prior.frame)
+    framed = FramedState(
+        raised, adjustment.station_covariance, floor_z, "markers", prior.frame, "markers"
+    )
     warnings = (
         *generic_calibration_warnings(epochs.channels.tolist(), state.calibrations),
         *unused_visits_warnings(prior.markers, len(marker_points)),
@@ -416,6 +418,7 @@ def _build_scene(
         framed.scale,
         framed.frame,
         tuple(warning.message for warning in warnings),
+        frame_source=framed.frame_source,
     )
 
 
