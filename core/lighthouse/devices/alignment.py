@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.geometry import (
-    Similarity,
-    quaternion_from_matrix,
-    quaternion_multiply,
-    transform_covariance,
-    umeyama,
-)
-from locatk.core.lighthouse.scene import Marker, MarkerVisit
+from locatk.core.geometry import Similarity, umeyama
+from locatk.core.lighthouse.scene import Marker
 from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M
+from locatk.core.lighthouse.scene.reframing import median_position
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -56,7 +51,7 @@ def align_to_markers(
     marker_positions, device_positions = [], []
     for marker in markers:
         for visit in marker.visits:
-            position = _visit_position(visit, trajectories)
+            position = median_position(trajectories, visit)
             if position is not None:
                 marker_positions.append(marker.position)
                 device_positions.append(position)
@@ -69,33 +64,6 @@ def align_to_markers(
     offset = transform.apply(device_positions) - marker_positions
     misfit_m = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
     return MarkerAlignment(transform, misfit_m, len(marker_positions))
-
-
-def _visit_position(visit: MarkerVisit, trajectories: Sequence[Trajectory]) -> Array | None:
-    """Return the median position (3,) of a device during a visit; None without a pose."""
-    for trajectory in trajectories:
-        if trajectory.device == visit.device:
-            start_ns, end_ns = visit.start_ns or 0, visit.end_ns or 0
-            is_inside = (trajectory.time_ns >= start_ns) & (trajectory.time_ns <= end_ns)
-            if np.any(is_inside):
-                return np.asarray(np.median(trajectory.position[is_inside], axis=0))
-    return None
-
-
-def transform_trajectory(trajectory: Trajectory, transform: Similarity, frame: str) -> Trajectory:
-    """Transform a trajectory into another frame.
-
-    The distances of the photodiodes on the device do not change: the scale differs from 1 by less
-    than 1 %, or a warning reports that the markers do not fit.
-    """
-    rotation = quaternion_from_matrix(transform.rotation)
-    return replace(
-        trajectory,
-        frame=frame,
-        position=transform.apply(trajectory.position),
-        quaternion=quaternion_multiply(rotation, trajectory.quaternion),
-        covariance=transform_covariance(trajectory.covariance, transform.scale, transform.rotation),
-    )
 
 
 def alignment_warnings(alignment: MarkerAlignment | None) -> list[SolverWarning]:

@@ -18,7 +18,6 @@ from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.devices.alignment import (
     align_to_markers,
     alignment_warnings,
-    transform_trajectory,
 )
 from locatk.core.lighthouse.devices.device_sweeps import (
     MIN_SENSORS,
@@ -46,6 +45,7 @@ from locatk.core.lighthouse.results import (
 )
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.frame import unused_visits_warnings
+from locatk.core.lighthouse.scene.reframing import transform_trajectory
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution, SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
