@@ -236,10 +236,11 @@ def frame_text(frame: FrameFacts, report: SolveReport) -> str:
     ]
     known = ", ".join(f"{name} {value}" for name, value in figures if value is not None)
     parts = [console.wrapped(f"frame: from {frame.source}{f', sigma: {known}' if known else ''}")]
-    if frame.up_deviation_rad is not None and frame.up_sigma_rad is not None:
+    deviation_rad, sigma_rad = frame.up_deviation_rad, frame.up_sigma_rad
+    if deviation_rad is not None and sigma_rad is not None and frame.source != "gravity":
         parts.append(
-            f"gravity: {math.degrees(frame.up_deviation_rad):.1f} deg from z by the accelerometers "
-            f"of the stations (sigma {math.degrees(frame.up_sigma_rad):.1f} deg)"
+            f"gravity: {math.degrees(deviation_rad):.1f} deg from z by the accelerometers of the "
+            f"stations (sigma {math.degrees(sigma_rad):.1f} deg)"
         )
     rests = frame.standstills or ()
     if rests:
