@@ -224,7 +224,7 @@ def solve_scene(
 
 def frame_text(frame: FrameFacts, report: SolveReport) -> str:
     """Format the standstills, and the source and the standard deviations of the frame."""
-    unit, per_m = ("mm", 1e3) if report.is_metric else ("1e-3", 1e3)
+    unit = "mm" if report.is_metric else "1e-3"
     figures = [
         (name, None if value is None else f"{factor * value:.2g} {suffix}")
         for name, value, factor, suffix in (
@@ -258,7 +258,7 @@ def frame_text(frame: FrameFacts, report: SolveReport) -> str:
                         *(
                             ("-",) * 3
                             if rest.position_m is None
-                            else (f"{per_m * value:.0f}" for value in rest.position_m)
+                            else (round(1e3 * value) for value in rest.position_m)
                         ),
                         rest.role or "-",
                     )
