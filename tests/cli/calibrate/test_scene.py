@@ -75,12 +75,7 @@ def test_a_floor_with_a_known_axis(
     assert result.exit_code == 0, result.stderr
     lines = [line.split() for line in result.stdout.splitlines() if "robot-1" in line]
     rests = [line for line in lines if line[1] == "robot-1"]
-    assert rests[0][4:] == ["0", "0", "25", "origin"] or rests[0][4:] == [
-        "-0",
-        "-0",
-        "25",
-        "origin",
-    ]
+    assert rests[0][4:] == ["0", "0", "25", "origin"]
     assert rests[1][-5:] == ["1000", "0", "25", "x", "axis"]
     assert rests[2][-1] == "floor"
     assert "frame: from floor" in result.stdout
@@ -94,14 +89,13 @@ def test_a_floor_with_a_known_axis(
     assert other[:2] == pytest.approx([first[1], 1 - first[0]], abs=0.02)
 
 
+@pytest.mark.slow
 def test_accelerometers_level_a_recording(locatk: Callable[..., Any], tmp_path: Path) -> None:
     """Stations send bytes; those of the reports come back from the session."""
     from locatk.core.lighthouse.receiver import DECK
 
     run = simulate(
-        SimulationOptions(
-            stations=2, planar=False, receiver=DECK, duration_s=15.0, report_hz=30, seed=3
-        )
+        SimulationOptions(planar=False, receiver=DECK, duration_s=15.0, report_hz=30, seed=3)
     )
     reports = []
     for station in run.true_scene.stations:
