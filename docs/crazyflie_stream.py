@@ -91,8 +91,8 @@ LOG_CLOCK_TICKS = 1 << 24
 """Number of ticks after which the clock of the log wraps: 4.7 hours."""
 
 HINT = (
-    "Hint: switch the Crazyflie on, check its address and its distance, and end other programs "
-    "that use the radio (cfclient)"
+    "Hint: plug in the Crazyradio, switch the Crazyflie on, check its address and its distance, "
+    "and end other programs that use the radio (cfclient)"
 )
 
 HELLO, TEXT, IMU, POSE, LIGHTHOUSE_DECK = 1, 2, 8, 9, 10

@@ -10,6 +10,8 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -416,3 +418,135 @@ def test_errors_are_one_line(
     assert len(errors) == 1, messages
     assert errors[0].startswith(said)
     assert "Hint: " in messages
+
+
+# ---- with cflib itself
+
+
+class UdpCrazyflie(threading.Thread):
+    """Crazyflie behind ``udp://``, as far as cflib talks to it: CRTP of protocol version 10.
+
+    Sources: documentation of the Crazy RealTime Protocol, https://www.bitcraze.io/documentation/
+    repository/crazyflie-firmware/master/functional-areas/crtp/.
+    """
+
+    PARAMETERS = ("deck.bcLighthouse4", "lighthouse.enLhRawStream")
+    VARIABLES = tuple(
+        [f"{group}.{axis}" for group in ("acc", "gyro", "stateEstimate") for axis in "xyz"]
+        + [f"stateEstimate.{angle}" for angle in ("roll", "pitch", "yaw")]
+    )
+
+    def __init__(self, flight: Flight) -> None:
+        super().__init__(daemon=True)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self.uri = f"udp://127.0.0.1:{self._socket.getsockname()[1]}"
+        self._client: Any = None
+        self._flight = flight
+        self.values = dict.fromkeys(self.PARAMETERS, 0) | {"deck.bcLighthouse4": 1}
+        self.blocks: dict[int, list[str]] = {}
+        self.started: set[int] = set()
+        self.asked: list[str] = []
+
+    def run(self) -> None:
+        while True:
+            packet, self._client = self._socket.recvfrom(64)
+            self.answer(packet[0] >> 4, packet[0] & 3, packet[1:])
+
+    def send(self, port: int, channel: int, data: bytes) -> None:
+        self._socket.sendto(bytes([port << 4 | channel]) + data, self._client)
+
+    def answer(self, port: int, channel: int, data: bytes) -> None:
+        if (port, channel) == (15, 1):
+            self.send(port, channel, b"Bitcraze Crazyflie\0")
+        elif (port, channel) == (15, 0):  # ping
+            self.send(port, channel, data)
+        elif (port, channel) == (13, 1):  # version of the protocol
+            self.send(port, channel, data[:1] + b"\x0a")
+        elif (port, channel) == (4, 0):  # no memories
+            self.send(port, channel, data[:1] + b"\0")
+        elif channel == 0 and port in (2, 5):
+            self.describe(port, data)
+        elif port == 5:
+            self.configure(data)
+        elif port == 2:
+            name = self.PARAMETERS[int.from_bytes(data[:2], "little")]
+            if channel == 2:
+                self.values[name] = data[2]
+                self.asked.append(f"{name}={data[2]}")
+                if data[2]:
+                    threading.Thread(target=self.play, daemon=True).start()
+                self.send(port, channel, data)
+            else:
+                self.send(port, channel, data[:2] + bytes([0, self.values[name]]))
+
+    def describe(self, port: int, data: bytes) -> None:
+        """Answer to questions about the table of contents."""
+        names = self.PARAMETERS if port == 2 else self.VARIABLES
+        if data[0] == 3:
+            self.send(port, 0, data[:1] + struct.pack("<HI", len(names), 0x1000 * port))
+        else:
+            text = names[int.from_bytes(data[1:3], "little")].replace(".", "\0") + "\0"
+            kind = b"\x08" if port == 2 else b"\x07"  # uint8_t, float
+            self.send(port, 0, data[:3] + kind + text.encode())
+
+    def configure(self, data: bytes) -> None:
+        """Answer to commands about blocks of the log."""
+        command, block = data[0], data[1] if len(data) > 1 else 0
+        if command in (6, 7):
+            entries = struct.iter_unpack("<BH", data[2:])
+            self.blocks.setdefault(block, []).extend(self.VARIABLES[k] for _, k in entries)
+        elif command == 3:
+            self.started.add(block)
+            self.asked.append(f"start {self.blocks[block][0]} {10 * data[2]} ms")
+        elif command == 4:
+            self.started.discard(block)
+            self.asked.append(f"stop {self.blocks[block][0]}")
+        self.send(5, 1, bytes([command, block, 0]))
+
+    def play(self) -> None:
+        start = time.monotonic()
+        for time_s, kind, *rest in sorted(self._flight.lines, key=lambda line: line[0]):
+            time.sleep(max(0.0, start + time_s - time.monotonic()))
+            if not self.values["lighthouse.enLhRawStream"]:
+                return
+            if kind == "raw":
+                self.send(6, 3, bytes.fromhex(rest[0]))
+                continue
+            first, stamp, values = rest
+            for block in list(self.started):
+                if self.blocks[block][0] == first:
+                    assert len(values) == len(self.blocks[block])
+                    head = bytes([block]) + stamp.to_bytes(3, "little")
+                    self.send(5, 2, head + struct.pack(f"<{len(values)}f", *values))
+
+
+def python_with_cflib() -> str:
+    """Python of an environment with cflib, which is not one of locatk's packages."""
+    python = os.environ.get("LOCATK_CFLIB_PYTHON")
+    if python is None:
+        pytest.skip("no environment with cflib (see LOCATK_CFLIB_PYTHON)")
+    return python
+
+
+@pytest.mark.slow
+def test_cflib_understands_what_the_script_asks(
+    script: Path, tmp_path: Path, locatk: Callable[..., Result]
+) -> None:
+    python = python_with_cflib()
+    flight, port = simulated_flight(5.0), free_port()
+    crazyflie = UdpCrazyflie(flight)
+    crazyflie.start()
+    recording = tmp_path / "run.mcap"
+    words = (f"socket://127.0.0.1:{port}", "--wait", "20s", "--duration", "6s", "-o", recording)
+    with running(python, script, crazyflie.uri, "--port", port) as process:
+        result = locatk("capture", *words)
+        process.send_signal(signal.SIGINT)
+        _, messages = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, result.exit_code) == (0, 3), messages + result.output
+    assert "Traceback" not in messages
+    check_recording(recording, flight)
+    start, stop = ["start acc.x 10 ms", "start stateEstimate.x 20 ms"], ["stop acc.x"]
+    assert crazyflie.asked[0] == start[0]
+    assert set(crazyflie.asked[:3]) == {*start, "lighthouse.enLhRawStream=1"}
+    assert {*stop, "stop stateEstimate.x", "lighthouse.enLhRawStream=0"} == set(crazyflie.asked[3:])
