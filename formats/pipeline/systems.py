@@ -16,6 +16,7 @@ from typing import Any
 
 from locatk.core import dots, landmarks, lighthouse, polaris
 from locatk.core.errors import FormatError, InputError, LocatkError
+from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -140,6 +141,9 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     given = None if request.artifact is None else scene.read_scene(request.artifact)
     # Factory calibrations and ids that the stations sent replace those of the scene.
     reports = observations.read_station_reports(session)
+    warnings: tuple[SolverWarning, ...] = ()
+    if not reports:
+        reports, warnings = report_stations(sweeps)
     known = given or observations.read_scene(session)
     initial = station_reports.add_station_data(known, reports) or Scene()
     odometry = observations.read_odometry(session)
@@ -153,7 +157,7 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
 
     def solve() -> Solution:
         solution = lighthouse.solve(sweeps, initial, options, odometry=odometry, **more)
-        return replace(solution, warnings=(*conflicts, *solution.warnings))
+        return replace(solution, warnings=(*conflicts, *warnings, *solution.warnings))
 
     return solve
 
