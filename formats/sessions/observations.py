@@ -41,8 +41,10 @@ from locatk.formats.sessions.station_reports import (
     station_records,
 )
 from locatk.formats.sessions.trajectories import (
+    onboard_messages,
     read_batches,
     read_odometry,
+    read_onboard,
     read_truth,
     reference_streams,
     write_streams,
@@ -58,6 +60,7 @@ __all__ = [
     "read_manifest",
     "read_map",
     "read_odometry",
+    "read_onboard",
     "read_receivers",
     "read_scene",
     "read_solution",
@@ -197,6 +200,7 @@ def write_session(
     truth: Sequence[Trajectory] = (),
     odometry: Sequence[Trajectory] = (),
     imu: Sequence[InertialSamples] = (),
+    onboard: Sequence[Trajectory] = (),
     scene: Scene | None = None,
     facts: Mapping[str, object] | None = None,
     stations: Sequence[StationReport] = (),
@@ -220,6 +224,9 @@ def write_session(
         The planar part (x, y, heading) is written on ``/odometry/<device>``.
     imu : sequence of InertialSamples
         Accelerometer and gyroscope, on ``/imu/<device>``.
+    onboard : sequence of Trajectory
+        Poses that the devices estimated themselves, on ``/onboard_track/<device>`` and for viewers
+        on ``/onboard/<device>``. They are for comparison: solvers do not use them.
     scene : Scene, optional
         Attached as ``scene.toml``.
     facts : mapping, optional
@@ -246,7 +253,12 @@ def write_session(
     scene = add_station_data(scene, stations)
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
     receiver_texts = receiver_attachments(receivers or {}, devices)
-    streams = [sweep_messages(sweeps), *reference_streams(truth, odometry), *imu_streams(imu)]
+    streams = [
+        sweep_messages(sweeps),
+        *reference_streams(truth, odometry),
+        *imu_streams(imu),
+        *onboard_messages(onboard),
+    ]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if scene is not None:
