@@ -382,6 +382,7 @@ def _report_station(
         calibration=None if data is None else data.calibration,
         frames=len(valid_frames),
         damaged=len(frames) - len(valid_frames),
+        acceleration=None if data is None else data.acceleration,
     )
     return report, warnings + data_warnings
 

@@ -56,6 +56,7 @@ def report_stations(sweeps: Sweeps) -> tuple[tuple[StationReport, ...], tuple[So
                     calibration=data.calibration,
                     frames=len(valid_frames),
                     damaged=len(frames) - len(valid_frames),
+                    acceleration=data.acceleration,
                 )
             )
             break

@@ -186,6 +186,7 @@ def _station_reports(
                 None if data is None else data.calibration,
                 sum(frame.is_valid for frame in frames),
                 sum(not frame.is_valid for frame in frames),
+                None if data is None else data.acceleration,
             )
         )
     return tuple(reports)

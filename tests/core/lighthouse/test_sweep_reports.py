@@ -72,6 +72,7 @@ def test_stations_send_their_factory_data() -> None:
         assert each.calibration.source == "factory"
         np.testing.assert_allclose(each.calibration.sweeps[:, 1], [-0.05, 0.046], atol=1e-4)
         assert (each.sweeps, each.frames, each.damaged) == (4000, 1, 0)
+        assert each.acceleration == (2, 127, 3)
     assert warnings == ()
 
 
