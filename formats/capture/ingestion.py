@@ -26,7 +26,6 @@ from locatk.formats.sessions import frames, messages
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.inertial import IMU_TOPIC_PREFIX
 from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, Layout
-from locatk.formats.sessions.trajectories import ONBOARD_TOPIC_PREFIX
 
 PAUSE_NS = 3_000_000
 """Silence of the line that separates two frames: within a frame, bytes follow each other, or wait
@@ -564,7 +563,7 @@ def _stream_layout(stream: Stream, device: str) -> tuple[str, Layout, dict[str, 
         return IMU_TOPIC_PREFIX + device, messages.IMU, {"device": device}
     if stream.kind == "poses":
         once = {"device": device, "frame_id": "onboard"}
-        return ONBOARD_TOPIC_PREFIX + device, messages.POSES, once
+        return f"/onboard_track/{device}", messages.POSES, once
     if stream.kind == "readings":
         once = {"device": device, "names": stream.names}
         return f"/readings/{device}", messages.readings(len(stream.names)), once

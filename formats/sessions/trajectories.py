@@ -28,9 +28,6 @@ from locatk.formats.sessions.messages import (
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
-ONBOARD_TOPIC_PREFIX = "/onboard_track/"
-"""Topic of the poses that a device has estimated itself, without its name."""
-
 # ---- writing
 
 

@@ -333,7 +333,7 @@ def test_recorded_streams_equal_written_ones(tmp_path: Path) -> None:
     assert imu.device == "red"
     np.testing.assert_array_equal(imu.acceleration, columns["imu"]["acceleration_m_s2"])
     np.testing.assert_array_equal(imu.angular_rate, columns["imu"]["angular_rate_rad_s"])
-    (track,) = tracks.read_tracks(session, tracks.ONBOARD_TOPIC_PREFIX)
+    (track,) = tracks.read_onboard(session)
     assert track.device == "red"
     np.testing.assert_array_equal(track.quaternion, columns["poses"]["quaternion_xyzw"])
     (odometry,) = tracks.read_odometry(session)

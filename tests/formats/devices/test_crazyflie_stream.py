@@ -32,9 +32,8 @@ from locatk.formats.devices.interface import Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames.decoder import FrameDecoder
 from locatk.formats.devices.locatk_frames.framing import encode_frame
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
-from locatk.formats.sessions.observations import read_imu, read_sweeps
+from locatk.formats.sessions.observations import read_imu, read_onboard, read_sweeps
 from locatk.formats.sessions.reader import Session
-from locatk.formats.sessions.trajectories import ONBOARD_TOPIC_PREFIX, read_tracks
 
 LIMIT_S = 30.0
 
@@ -327,7 +326,7 @@ def check_recording(path: Path, flight: Flight) -> None:
     assert np.ptp(delay_s[index > 100 * SYNCHRONIZATION_S]) < MAX_CLOCK_ERROR_S
     assert np.abs(np.degrees(imu.angular_rate[:, 2]) - 0.01 * index).max() < 1e-4
 
-    (track,) = read_tracks(session, ONBOARD_TOPIC_PREFIX)
+    (track,) = read_onboard(session)
     assert track.device == imu.device == "robot"
     index = np.rint(track.position[:, 0] * 100)
     delay_s = (track.time_ns - imu.time_ns[0]) * 1e-9 - index / 100
