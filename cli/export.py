@@ -57,6 +57,11 @@ STDOUT = Path("-")
         metavar="NAME",
         help="Device to export. Repeatable.  [default: all]",
     ),
+    click.option(
+        "--onboard",
+        is_flag=True,
+        help="Export the poses that the devices estimated themselves; SOLUTION is a session.",
+    ),
     click.option("--covariance", is_flag=True, help="ros2: also write poses with covariance."),
 )
 @options.as_json
@@ -66,6 +71,7 @@ def command(
     format_name: str,
     output: Path,
     devices: tuple[str, ...],
+    onboard: bool,
     covariance: bool,
     overwrite: bool,
     as_json: bool,
@@ -111,11 +117,14 @@ def command(
         raise click.UsageError(f"{option} cannot be combined with -o -, which is for csv and tum.")
     if format_name == CONFIG:
         options.check_ending(output, ENDINGS[CONFIG])
-        if devices:
-            raise click.UsageError(f"--device is for poses; {CONFIG} contains stations.")
+        if devices or onboard:
+            option = "--device" if devices else "--onboard"
+            raise click.UsageError(f"{option} is for poses; {CONFIG} contains stations.")
         export_stations(solution, output, overwrite=overwrite, as_json=as_json)
         return
-    tracks = select_devices(read_trajectories(solution), devices, solution)
+    tracks = select_devices(
+        read_trajectories(solution, "onboard" if onboard else "auto"), devices, solution
+    )
     poses = sum(map(len, tracks))
     if format_name != "parquet":  # Parquet has null for values that are not numbers.
         tracks = [exports.with_finite_poses(track) for track in tracks]
