@@ -30,12 +30,10 @@ COMPRESSED_QUATERNION = ("stateestimatez.quat",)
 """Names of variables, in lower case."""
 
 USED_VARIABLES = frozenset(
-    name
-    for names in (
-        ACCELERATION, ANGULAR_RATE, POSITION, QUATERNION, EULER_ANGLES, COMPRESSED_POSITION,
-        COMPRESSED_QUATERNION,
+    (
+        *ACCELERATION, *ANGULAR_RATE, *POSITION, *QUATERNION, *EULER_ANGLES, *COMPRESSED_POSITION,
+        *COMPRESSED_QUATERNION,
     )
-    for name in names
 )  # fmt: skip
 
 MAX_JOIN_GAP_NS = 200_000_000
@@ -61,13 +59,20 @@ class LogBlock:
     def ascending(
         cls, time_ns: NDArray[np.int64], columns: dict[str, Array]
     ) -> tuple[LogBlock, int]:
-        """Return a block of samples in order of time, and the number of repeated times.
+        """Return a block of samples in order of time, and the number of samples left out.
 
-        Of samples with the same time, the first is kept.
+        Values of one time may be in several samples; of several values, the first is kept.
         """
-        unique, first = np.unique(time_ns, return_index=True)
-        ordered = {name: np.asarray(values, float)[first] for name, values in columns.items()}
-        return cls(unique, ordered), len(time_ns) - len(unique)
+        unique, row = np.unique(time_ns, return_inverse=True)
+        merged = {}
+        repeated = 0
+        for name, values in columns.items():
+            has_value = np.flatnonzero(~np.isnan(values))
+            rows, first = np.unique(row[has_value], return_index=True)
+            merged[name] = np.full(len(unique), np.nan)
+            merged[name][rows] = values[has_value[first]]
+            repeated = max(repeated, len(has_value) - len(rows))
+        return cls(unique, merged), repeated
 
 
 def read_imu(blocks: Sequence[LogBlock], device: str) -> InertialSamples | None:
