@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,7 +19,9 @@ FORMATS = ("tum", "kitti", "csv", "parquet", "ros2")
 """Formats of poses."""
 
 CONFIG = "crazyflie-config"
-"""Format of Lighthouse stations."""
+CALIBRATION = "dotbot-calibration"
+STATION_FORMATS = (CONFIG, CALIBRATION)
+"""Formats of Lighthouse stations."""
 
 ENDINGS = {
     "tum": (".tum", ".txt"),
@@ -28,10 +30,35 @@ ENDINGS = {
     "parquet": (".parquet", ".pq"),
     "ros2": (".mcap",),
     CONFIG: (".yaml", ".yml"),
+    CALIBRATION: (".out",),
 }
 """Endings of the names of each format."""
 
+MIN_AREA_MM, MAX_AREA_MM = 100, 100_000
+"""Shortest and longest side of a floor of DotBots; their coordinates end at 100 m."""
+
 STDOUT = Path("-")
+
+
+def _parse_area(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[float, ...] | None:
+    """Return the smallest x and y and the largest x and y of two corners."""
+    if value is None:
+        return None
+    try:
+        x, y, other_x, other_y = (float(number) for number in value.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            "expected four numbers, as in 0,-2000,3000,0", ctx, param
+        ) from None
+    area = (min(x, other_x), min(y, other_y), max(x, other_x), max(y, other_y))
+    sizes = (area[2] - area[0], area[3] - area[1])
+    if not all(MIN_AREA_MM <= size <= MAX_AREA_MM for size in sizes):
+        raise click.BadParameter(
+            f"the sides should be {MIN_AREA_MM} to {MAX_AREA_MM} mm long", ctx, param
+        )
+    return area
 
 
 @click.command(cls=Command, short_help="Write poses for other tools.")
@@ -39,7 +66,7 @@ STDOUT = Path("-")
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice((*FORMATS, CONFIG)),
+    type=click.Choice((*FORMATS, *STATION_FORMATS)),
     required=True,
     help="Format of the output.",
 )
@@ -57,7 +84,24 @@ STDOUT = Path("-")
         metavar="NAME",
         help="Device to export. Repeatable.  [default: all]",
     ),
+    click.option(
+        "--onboard",
+        is_flag=True,
+        help="Export the poses that the devices estimated themselves; SOLUTION is a session.",
+    ),
     click.option("--covariance", is_flag=True, help="ros2: also write poses with covariance."),
+    click.option(
+        "--frame",
+        type=click.Choice(("level", "as-is")),
+        help="crazyflie-config: `as-is` also writes a frame that is not level.  [default: level]",
+    ),
+    click.option(
+        "--area",
+        metavar="X,Y,X,Y",
+        callback=_parse_area,
+        help="dotbot-calibration: two opposite corners of the floor on which the robots drive, in "
+        "mm in the frame of the scene.  [default: around poses and markers]",
+    ),
 )
 @options.as_json
 @options.verbosity
@@ -66,14 +110,17 @@ def command(
     format_name: str,
     output: Path,
     devices: tuple[str, ...],
+    onboard: bool,
     covariance: bool,
+    frame: str | None,
+    area: tuple[float, ...] | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Write the poses of SOLUTION, or its Lighthouse stations, in a format of other tools.
 
     SOLUTION is a solution of `locatk solve`, or a session with truth, whose truth is then exported.
-    For crazyflie-config it may also be a scene (scene.toml).
+    For formats of stations it may also be a scene (scene.toml).
 
     \b
     tum      time and pose, one file per device, for evo and others; an
@@ -87,7 +134,11 @@ def command(
     ros2     PoseStamped and TFMessage in MCAP, for ros2 bag, RViz and evo
     crazyflie-config
              poses and calibrations of stations as YAML, which the client and
-             library of Bitcraze write into a Crazyflie
+             library of Bitcraze write into a Crazyflie; refused if the
+             frame is not level on the floor
+    dotbot-calibration
+             homographies from stations to the floor (calibration.out), with
+             which DotBots locate themselves
 
     \b
     Examples:
@@ -97,6 +148,7 @@ def command(
       locatk export solved.mcap --format csv -o -
       locatk export solved.mcap --format crazyflie-config -o lighthouse.yaml
       locatk export scene.toml --format crazyflie-config -o lighthouse.yaml
+      locatk export solved.mcap --format dotbot-calibration -o calibration.out
     """
     from locatk.core.errors import InputError
     from locatk.formats.exporters import export as exports
@@ -109,13 +161,27 @@ def command(
     if output == STDOUT and (as_json or format_name not in exports.TEXTS):
         option = "--json" if as_json else f"--format {format_name}"
         raise click.UsageError(f"{option} cannot be combined with -o -, which is for csv and tum.")
-    if format_name == CONFIG:
-        options.check_ending(output, ENDINGS[CONFIG])
-        if devices:
-            raise click.UsageError(f"--device is for poses; {CONFIG} contains stations.")
-        export_stations(solution, output, overwrite=overwrite, as_json=as_json)
+    for option, value, owner in (("frame", frame, CONFIG), ("area", area, CALIBRATION)):
+        if value is not None and format_name != owner:
+            raise click.UsageError(f"--{option} is for --format {owner}.")
+    if format_name in STATION_FORMATS:
+        options.check_ending(output, ENDINGS[format_name])
+        if devices or onboard:
+            option = "--device" if devices else "--onboard"
+            raise click.UsageError(f"{option} is for poses; {format_name} contains stations.")
+        options.guard_output(output, overwrite=overwrite, inputs=[solution])
+        if format_name == CONFIG:
+            entry = export_config(solution, output, is_as_is=frame == "as-is", overwrite=overwrite)
+        else:
+            entry = export_calibration(solution, output, area, overwrite=overwrite)
+        if as_json:
+            console.emit_json(
+                {"version": 1, "input": solution, "format": format_name, "files": [entry]}
+            )
         return
-    tracks = select_devices(read_trajectories(solution), devices, solution)
+    tracks = select_devices(
+        read_trajectories(solution, "onboard" if onboard else "auto"), devices, solution
+    )
     poses = sum(map(len, tracks))
     if format_name != "parquet":  # Parquet has null for values that are not numbers.
         tracks = [exports.with_finite_poses(track) for track in tracks]
@@ -156,21 +222,74 @@ def command(
     check_loss(lost)
 
 
-def export_stations(source: Path, output: Path, *, overwrite: bool, as_json: bool) -> None:
-    """Write the stations of a scene, a session or a solution."""
+def export_config(source: Path, output: Path, *, is_as_is: bool, overwrite: bool) -> dict[str, Any]:
+    """Write the stations of a scene, a session or a solution; returns the file for ``--json``."""
     from locatk.core.errors import error_context
     from locatk.formats.exporters import crazyflie
 
-    options.guard_output(output, overwrite=overwrite, inputs=[source])
     scene = read_any_scene(source)
     with error_context(source):
-        crazyflie.write_config(output, scene, overwrite=overwrite)
+        crazyflie.write_config(output, scene, allow_tilted=is_as_is, overwrite=overwrite)
+    if fault := crazyflie.describe_frame_fault(scene):
+        console.warn(f"not for flight: {fault}")
     channels = [station.channel for station in scene.stations]
+    console.result(f"Wrote {output}: {list_stations(channels)}")
+    return {"path": output, "channels": channels}
+
+
+def export_calibration(
+    source: Path, output: Path, area: tuple[float, ...] | None, *, overwrite: bool
+) -> dict[str, Any]:
+    """Write the homographies of stations to the floor; returns the file for ``--json``."""
+    from locatk.core.errors import error_context
+    from locatk.formats.exporters import dotbot_calibration as dotbot
+    from locatk.formats.sessions.solutions import read_trajectories
+
+    scene = read_any_scene(source)
+    tracks = [] if source.suffix.lower() == ".toml" else read_trajectories(source)
+    with error_context(source):
+        calibration = dotbot.build_calibration(scene, tracks, area_mm=area)
+    dotbot.write_calibration(output, calibration, overwrite=overwrite)
+    channels = [station.channel for station in calibration.stations]
+    console.result(f"Wrote {output}: {list_stations(channels)}")
+    for station in calibration.stations:
+        console.result(
+            f"  channel {station.channel}: sees {station.visible_fraction:.0%} of the floor; "
+            f"DotBot error {station.rms_mm:.1f} mm rms, up to {station.max_mm:.1f} mm"
+        )
+    low_x, low_y, high_x, high_y = calibration.area_mm
+    origin_x, origin_y = calibration.origin_mm
+    console.result(f"Floor: x {low_x:.0f} to {high_x:.0f}, y {low_y:.0f} to {high_y:.0f} mm")
+    console.result(f"A DotBot at (x, y) reports (x {-origin_x:+.0f}, {origin_y:.0f} - y) mm")
+    for channel in calibration.hidden_channels:
+        console.warn(f"the station on channel {channel} sees too little of the floor: left out")
+    for channel in channels:
+        if channel in dotbot.UNCERTAIN_CHANNELS:
+            console.warn(
+                f"versions of the DotBot's firmware differ in the period of channel {channel}: "
+                "check a position, or use another channel"
+            )
+    return {
+        "path": output,
+        "channels": channels,
+        "area_mm": calibration.area_mm,
+        "origin_mm": calibration.origin_mm,
+        "stations": [
+            {
+                "channel": station.channel,
+                "visible_fraction": station.visible_fraction,
+                "rms_mm": station.rms_mm,
+                "max_mm": station.max_mm,
+            }
+            for station in calibration.stations
+        ],
+    }
+
+
+def list_stations(channels: list[int]) -> str:
+    """Return the number of stations and their channels."""
     count, s = ("1 station", "") if len(channels) == 1 else (f"{len(channels)} stations", "s")
-    console.result(f"Wrote {output}: {count}, channel{s} {', '.join(map(str, channels))}")
-    if as_json:
-        files = [{"path": output, "channels": channels}]
-        console.emit_json({"version": 1, "input": source, "format": CONFIG, "files": files})
+    return f"{count}, channel{s} {', '.join(map(str, channels))}"
 
 
 def read_any_scene(source: Path) -> Scene:

@@ -3,6 +3,9 @@
 The format is described in :mod:`locatk.formats.importers.crazyflie`. Only factory calibrations are
 written. A Crazyflie replaces others within half a minute by the calibration that it receives, and a
 reader could not distinguish an estimate from it.
+
+A Crazyflie takes z for up and z = 0 for the floor: it holds the height that it is commanded, and
+lands where z is 0. Frames that are not level are therefore refused (:func:`describe_frame_fault`).
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import PARAMETERS
 from locatk.core.lighthouse.scene import Scene
 from locatk.formats.importers.crazyflie import (
+    FRAME,
     MODEL_NOTE,
     OWN_SOLVER,
     SOLVER,
@@ -32,17 +36,49 @@ FORMER_MODEL_NOTE = (
 )
 """Wording of :data:`MODEL_NOTE` in scenes of earlier versions."""
 
+LEVEL_FRAME_HINT = (
+    "Fix the frame by points of the floor on which a device rested: locatk calibrate scene SESSION "
+    "--floor, or give three or more markers"
+)
 
-def dumps_config(scene: Scene) -> str:
+
+def describe_frame_fault(scene: Scene) -> str | None:
+    """Return why the frame of a scene with stations is not level on the floor, or None if it is.
+
+    Level are frames of markers, of points on the floor, of planar scenes with stations above their
+    floor, and of a Crazyflie's configuration. Other frames in space have the axes of a station, or
+    their origin in it.
+    """
+    if scene.planar:
+        if all(station.position[2] < scene.floor_z for station in scene.stations):
+            return f"z of the frame {scene.frame!r} points down: all stations are below the floor"
+        return None
+    if scene.frame_source in ("markers", "floor"):
+        return None
+    if scene.frame_source == "gravity":
+        return f"the origin of the frame {scene.frame!r} is not known to be on the floor"
+    if scene.scale == "markers" or scene.frame == FRAME:
+        return None
+    return f"the frame {scene.frame!r} is not level: nothing relates its axes to the floor"
+
+
+def dumps_config(scene: Scene, *, allow_tilted: bool = False) -> str:
     """Return the YAML text of a scene for cfclient, cflib and the Crazyflie.
 
     The same scene gives the same text. Comments state the frame and the calibrations that are
     omitted.
 
+    Parameters
+    ----------
+    scene : Scene
+    allow_tilted : bool
+        Also write frames that are not level, with a comment.
+
     Raises
     ------
     InputError
-        The scene has no stations, no scale, or numbers that are not finite.
+        The scene has no stations, no scale, or numbers that are not finite; or its frame is not
+        level.
     """
     if not scene.stations:
         raise InputError(
@@ -53,6 +89,9 @@ def dumps_config(scene: Scene) -> str:
             "the scene has no scale: a Crazyflie needs metres",
             hint="Give markers or a distance to locatk solve",
         )
+    fault = describe_frame_fault(scene)
+    if fault and not allow_tilted:
+        raise InputError(fault, hint=LEVEL_FRAME_HINT)
     geos, calibs, omitted = {}, {}, []
     calibrations = dict(scene.calibrations) | {s.channel: s.calibration for s in scene.stations}
     ids = dict(scene.ids) | {s.channel: s.id for s in scene.stations}
@@ -74,6 +113,8 @@ def dumps_config(scene: Scene) -> str:
             "uid": int(ids.get(channel) or 0),
         }
     head = [f"# Positions in the frame {scene.frame!r}; ids are channels less one."]
+    if fault:
+        head.append(f"# NOT FOR FLIGHT: {fault}.")
     if omitted:
         head.append(
             f"# No factory calibration of {list_channels(omitted)}: "
@@ -91,7 +132,13 @@ def dumps_config(scene: Scene) -> str:
     return "\n".join(head) + "\n" + yaml.safe_dump(content, sort_keys=False, width=100)
 
 
-def write_config(path: str | os.PathLike[str], scene: Scene, *, overwrite: bool = False) -> None:
+def write_config(
+    path: str | os.PathLike[str],
+    scene: Scene,
+    *,
+    allow_tilted: bool = False,
+    overwrite: bool = False,
+) -> None:
     """Write a scene as a system configuration.
 
     Raises
@@ -101,6 +148,6 @@ def write_config(path: str | os.PathLike[str], scene: Scene, *, overwrite: bool 
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.atomic_write`.
     """
-    text = dumps_config(scene)
+    text = dumps_config(scene, allow_tilted=allow_tilted)
     with atomic_write(path, overwrite=overwrite) as stream:
         stream.write(text.encode())

@@ -16,6 +16,7 @@ from typing import Any
 
 from locatk.core import dots, landmarks, lighthouse, polaris
 from locatk.core.errors import FormatError, InputError, LocatkError
+from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -155,6 +156,9 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     own = observations.read_scene(session)
     known, conflicts = (own, []) if given is None else merge_scenes(given, own)
     reports = observations.read_station_reports(session)
+    if not reports:
+        reports, warnings = report_stations(sweeps)
+        conflicts += warnings
     initial = station_reports.add_station_data(known, reports) or Scene()
     odometry = observations.read_odometry(session)
     receivers = _rigid_devices(sweeps, observations.read_receivers(session))

@@ -17,6 +17,7 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from numpy.typing import NDArray
 
+from locatk.formats.schemas.inertial_pb2 import Imu
 from locatk.formats.schemas.lighthouse_pb2 import LighthouseCapture, LighthouseSweep
 from locatk.formats.schemas.magnetics_pb2 import HallArray, MagnetometerArray
 from locatk.formats.schemas.poses_pb2 import Odometry, PoseTrack
@@ -262,6 +263,17 @@ ODOMETRY = Layout(
         Column("x_m", "<f8"),
         Column("y_m", "<f8"),
         Column("heading_rad", "<f8"),
+        TICKS,
+    ),
+)
+
+IMU = Layout(
+    Imu,
+    ("device",),
+    (
+        Column("time_ns", "<i8"),
+        Column("acceleration_m_s2", "<f8", 3, optional=True),
+        Column("angular_rate_rad_s", "<f8", 3, optional=True),
         TICKS,
     ),
 )

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from locatk.core.errors import FormatError
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.receiver import DECK, Receiver
 from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -30,6 +31,7 @@ from locatk.formats.artifacts.tags import attached_tags as read_tags
 from locatk.formats.sessions import capture_record
 from locatk.formats.sessions.field_samples import read_halls, read_magnetometers
 from locatk.formats.sessions.frames import read_frames
+from locatk.formats.sessions.inertial import imu_streams, read_imu
 from locatk.formats.sessions.messages import MAX_BATCH_NS, SWEEPS, TimedMessage, batch_edges
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution, read_trajectories, write_solution
@@ -39,8 +41,10 @@ from locatk.formats.sessions.station_reports import (
     station_records,
 )
 from locatk.formats.sessions.trajectories import (
+    onboard_messages,
     read_batches,
     read_odometry,
+    read_onboard,
     read_truth,
     reference_streams,
     write_streams,
@@ -51,10 +55,12 @@ __all__ = [
     "read_camera",
     "read_frames",
     "read_halls",
+    "read_imu",
     "read_magnetometers",
     "read_manifest",
     "read_map",
     "read_odometry",
+    "read_onboard",
     "read_receivers",
     "read_scene",
     "read_solution",
@@ -193,6 +199,8 @@ def write_session(
     sweeps: Sweeps,
     truth: Sequence[Trajectory] = (),
     odometry: Sequence[Trajectory] = (),
+    imu: Sequence[InertialSamples] = (),
+    onboard: Sequence[Trajectory] = (),
     scene: Scene | None = None,
     facts: Mapping[str, object] | None = None,
     stations: Sequence[StationReport] = (),
@@ -214,6 +222,11 @@ def write_session(
         viewers on ``/truth/<device>``.
     odometry : sequence of Trajectory
         The planar part (x, y, heading) is written on ``/odometry/<device>``.
+    imu : sequence of InertialSamples
+        Accelerometer and gyroscope, on ``/imu/<device>``.
+    onboard : sequence of Trajectory
+        Poses that the devices estimated themselves, on ``/onboard_track/<device>`` and for viewers
+        on ``/onboard/<device>``. They are for comparison: solvers do not use them.
     scene : Scene, optional
         Attached as ``scene.toml``.
     facts : mapping, optional
@@ -233,14 +246,19 @@ def write_session(
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.atomic_write`.
     InputError
-        A time is before 1970, two trajectories have the same device or two stations the same
-        channel, or a receiver is impossible.
+        A time is before 1970, two trajectories or two IMUs have the same device or two stations
+        the same channel, or a receiver or a sample of an IMU is impossible.
     """
     records = station_records(stations)
     scene = add_station_data(scene, stations)
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
     receiver_texts = receiver_attachments(receivers or {}, devices)
-    streams = [sweep_messages(sweeps), *reference_streams(truth, odometry)]
+    streams = [
+        sweep_messages(sweeps),
+        *reference_streams(truth, odometry),
+        *imu_streams(imu),
+        *onboard_messages(onboard),
+    ]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if scene is not None:

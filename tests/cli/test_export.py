@@ -276,6 +276,60 @@ def test_stations_for_a_crazyflie(
     assert (station.channel, station.position.tolist()) == (3, [0, 1, 2])
 
 
+def test_a_tilted_frame_is_not_for_flight(locatk, scene: Scene, tmp_path: Path) -> None:
+    file, out = tmp_path / "scene.toml", tmp_path / "a.yaml"
+    tilted = replace(scene, scale="distance", planar=False, frame="station-3")
+    artifacts.write_scene(file, tilted)
+    export = ("export", file, "--format", "crazyflie-config", "-o", out)
+    refused = locatk(*export)
+    assert refused.exit_code == 1
+    assert refused.stderr.count("\n") == 1
+    assert f"{file}: the frame 'station-3' is not level" in refused.stderr
+    assert "calibrate scene SESSION --floor" in refused.stderr
+    assert not out.exists()
+    assert locatk(*export, "--frame", "as-is").stderr.startswith("Warning: not for flight: the fra")
+    assert "# NOT FOR FLIGHT: the frame 'station-3' is not level" in out.read_text()
+    # Poses of a Crazyflie's own configuration are in its room, also after a round trip.
+    back, again = tmp_path / "back.toml", tmp_path / "again.yaml"
+    assert locatk("import", "crazyflie-config", out, "-o", back).exit_code == 0
+    level = locatk("export", back, "--format", "crazyflie-config", "-o", again)
+    assert (level.exit_code, level.stderr) == (0, "")
+    # A planar scene is level, unless its z points down.
+    artifacts.write_scene(file, replace(tilted, planar=True, frame="floor"), overwrite=True)
+    assert locatk(*export, "--overwrite").exit_code == 0
+    artifacts.write_scene(file, replace(tilted, planar=True, floor_z=9.0), overwrite=True)
+    assert "points down" in locatk(*export, "--overwrite").stderr
+    artifacts.write_scene(file, replace(tilted, scale="unit"), overwrite=True)
+    assert locatk(*export, "--frame", "as-is", "--overwrite").exit_code == 1
+
+
+def test_a_calibration_for_dotbots(locatk, tmp_path: Path) -> None:
+    run, solved, out = (tmp_path / name for name in ("run.mcap", "solved.mcap", "calibration.out"))
+    assert locatk("simulate", "lighthouse", "-o", run, "--duration", 5).exit_code == 0
+    assert locatk("solve", run, "-o", solved, "--save-scene", tmp_path / "s.toml").exit_code == 0
+    result = locatk("export", solved, "--format", "dotbot-calibration", "-o", out)
+    assert result.exit_code == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert lines[0] == f"Wrote {out}: 2 stations, channels 1, 2"
+    assert "mm rms, up to" in lines[1]
+    assert len(lines) == 5
+    assert out.read_bytes()[0] == 2
+    assert len(out.read_bytes()) == 1 + 2 * 36
+    scene = ("export", tmp_path / "s.toml", "--format", "dotbot-calibration", "-o", out)
+    result = locatk(*scene, "--area", "500,600,-400,-500", "--overwrite", "--json")
+    [file] = json.loads(result.stdout)["files"]
+    assert file["area_mm"] == [-400, -500, 500, 600]
+    assert file["origin_mm"] == [-400, 600]
+    assert [sorted(each) for each in file["stations"]] == [
+        ["channel", "max_mm", "rms_mm", "visible_fraction"]
+    ] * 2
+    for wrong in ("1,2,3", "0,0,50,50", "a,b,c,d", "nan,0,1000,1000"):
+        assert locatk(*scene, "--area", wrong, "--overwrite").exit_code == 2
+    assert locatk(*scene, "--frame", "as-is", "--overwrite").exit_code == 2
+    assert "--overwrite" in locatk(*scene).stderr
+    assert locatk(*scene[:-1], tmp_path / "calibration.bin").exit_code == 2
+
+
 def test_contents_that_a_crazyflie_cannot_hold(
     locatk, solved: Path, session: Path, scene: Scene, tmp_path: Path
 ) -> None:

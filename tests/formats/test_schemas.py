@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from locatk.formats.schemas import lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2
+from locatk.formats.schemas import (
+    inertial_pb2,
+    lighthouse_pb2,
+    magnetics_pb2,
+    poses_pb2,
+    serial_pb2,
+)
+
+MODULES = (inertial_pb2, lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -18,14 +26,14 @@ def test_generated_code_is_up_to_date(root: Path) -> None:
 
 
 def test_names_of_the_messages() -> None:
-    modules = (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2)
     names = {
         message.full_name
-        for module in modules
+        for module in MODULES
         for message in module.DESCRIPTOR.message_types_by_name.values()
     }
     assert names == {
         "locatk.HallArray",
+        "locatk.Imu",
         "locatk.LighthouseCapture",
         "locatk.LighthouseSweep",
         "locatk.MagnetometerArray",
@@ -38,7 +46,7 @@ def test_names_of_the_messages() -> None:
 
 def test_messages_are_documented(root: Path) -> None:
     text = (root / "docs" / "formats.md").read_text("utf-8")
-    for module in (lighthouse_pb2, magnetics_pb2, poses_pb2, serial_pb2):
+    for module in MODULES:
         for message in module.DESCRIPTOR.message_types_by_name.values():
             assert f"`{message.full_name}`" in text
             for field in message.fields:

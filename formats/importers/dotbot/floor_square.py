@@ -5,6 +5,11 @@
 PyDotBot's plane, columns x and y of a one-station recording) or ``timestamps_lh2`` (the times
 at which a robot rested on each corner).
 
+The file of alvarado24automatic has one entry a scene, ``scene_1`` and ``scene_2``, with
+``corners_mm`` (in space, by motion capture) and ``timestamps_lh2``; recordings are in folders with
+the names of the scenes. Its axes are tilted by a degree to the floor: the authors level them, here
+heights are averaged. ``circles`` (times at which a robot drove circles) are not used.
+
 Axes. The corners ``tl, tr, br, bl`` are clockwise from above, according to the images of
 three published stations and the camera. If ``corners_cm`` makes them counter-clockwise (y to the
 front, as in a picture), z of its frame would point into the floor. Then y is negated, for
@@ -42,6 +47,7 @@ from locatk.formats.tables.timestamps import parse_iso_time
 
 Array = NDArray[np.float64]
 
+FILE_NAME = "calibration.json"
 FRAME = "floor"
 CLOCKWISE = ("tl", "tr", "br", "bl")
 """Names of the square's corners, clockwise from above."""
@@ -52,7 +58,12 @@ MAX_HOMOGRAPHY_RESIDUAL = 1e-6
 MIN_CORNERS = 4
 """Corners in pixels that determine the homography to the floor."""
 
-CENTIMETRES_PER_METRE = 100
+METRES = {"corners_cm": 1e-2, "corners_mm": 1e-3}
+"""Keys of the corners, and their units in metres."""
+
+MAX_FLOOR_SLOPE = 0.05
+"""Largest difference of the heights of corners on one floor, relative to their distance. Averaging
+the heights changes lengths by half of its square, 0.1 %."""
 
 MAX_PIXELS = 1e5
 """Largest coordinate in a video: no frame is that wide."""
@@ -65,14 +76,16 @@ class FloorSquare:
     Attributes
     ----------
     file : Path
-    floor_m : dict of str to (2,) ndarray
-        In axes with z up.
+    floor_m : dict of str to (3,) ndarray
+        In axes with z up; z is zero if it is not given.
     pixels, plane : dict of str to (2,) ndarray
         The same points in the video and in PyDotBot's plane; empty if not given.
     stays : dict of str to (int, int)
         Start and end of the stay of a robot on each point, in nanoseconds since the epoch.
     axes : str
         Description of the axes, for the facts of the session.
+    unused : str
+        Description of the parts that are not used, empty if there are none.
     """
 
     file: Path
@@ -81,6 +94,7 @@ class FloorSquare:
     plane: dict[str, Array]
     stays: dict[str, tuple[int, int]]
     axes: str
+    unused: str
 
 
 def find_calibration(
@@ -89,7 +103,8 @@ def find_calibration(
     """Return the path of ``calibration.json``; None if there is none.
 
     It is the given file, or one in the folder of the truth, of the recordings, or in their sister
-    folder ``ground_truth`` as in the published data sets.
+    folder ``ground_truth`` as in the published data sets; or one in the folder above that has an
+    entry with the name of the recordings' folder.
 
     Raises
     ------
@@ -103,17 +118,80 @@ def find_calibration(
     folders = [Path(t).parent for t in truth]
     for recording in recordings:
         folders += [Path(recording).parent, Path(recording).parent.parent / "ground_truth"]
-    candidates = (folder / "calibration.json" for folder in folders)
+    candidates = [folder / FILE_NAME for folder in folders]
+    candidates += [
+        above
+        for path in recordings
+        if (above := Path(path).parent.parent / FILE_NAME).is_file()
+        and Path(path).resolve().parent.name in _read_entries(above)
+    ]
     return next((file for file in candidates if file.is_file()), None)
 
 
-def read_calibration(path: Path) -> FloorSquare:
+def read_calibration(
+    path: Path, recordings: Sequence[Path] = (), span_ns: tuple[int, int] | None = None
+) -> FloorSquare:
     """Read ``calibration.json``.
+
+    Parameters
+    ----------
+    path : path
+    recordings : sequence of path
+        Of several entries, the one whose name is a part of their paths is read.
+    span_ns : (int, int), optional
+        First and last time of the recordings. Without such a name, the only entry with stays in
+        that time is read.
 
     Raises
     ------
     FormatError
-        The file is not JSON, has no or several videos, or a key is missing or wrong.
+        The file is not JSON, has no entry of the recording or several, or a key is missing or
+        wrong.
+    """
+    entries = _read_entries(path)
+    if len(entries) == 1:
+        name = next(iter(entries))
+    else:
+        name = _choose_entry(path, entries, recordings, span_ns)
+    return _parse_square(path, name, entries[name])
+
+
+def _choose_entry(
+    path: Path,
+    entries: dict[str, Any],
+    recordings: Sequence[Path],
+    span_ns: tuple[int, int] | None,
+) -> str:
+    """Return the name of the entry of a recording."""
+    parts = [{*Path(file).resolve().parts, Path(file).stem} for file in recordings]
+    named = [name for name in entries if parts and all(name in each for each in parts)]
+    if not named and span_ns is not None:
+        squares = {name: _parse_square(path, name, entry) for name, entry in entries.items()}
+        named = [
+            name
+            for name, square in squares.items()
+            if square.stays
+            and min(start for start, _ in square.stays.values()) <= span_ns[1]
+            and max(end for _, end in square.stays.values()) >= span_ns[0]
+        ]
+    if len(named) != 1:
+        raise FormatError(
+            f"{len(entries)} entries ({', '.join(entries)}), of which "
+            f"{len(named) or 'none'} belong to the recording",
+            file=path,
+            hint="Import each scene into a session of its own, from a folder with its name, or "
+            "keep the entry of this recording only",
+        )
+    return named[0]
+
+
+def _read_entries(path: Path) -> dict[str, Any]:
+    """Return the entries of ``calibration.json`` by video or scene; one without name is "".
+
+    Raises
+    ------
+    FormatError
+        The file is not a JSON object, or empty.
     """
     try:
         content = json.loads(read_text(path))
@@ -125,50 +203,65 @@ def read_calibration(path: Path) -> FloorSquare:
         raise FormatError("not a calibration: nested too deeply", file=path) from None
     if not isinstance(content, dict):
         raise FormatError("not a calibration: should be an object", file=path)
-    videos = {"": content} if "corners_cm" in content else content
-    if len(videos) != 1:
-        raise FormatError(
-            f"{len(videos)} videos instead of one",
-            file=path,
-            hint="Keep the entry of this recording only",
-        )
-    name, video = next(iter(videos.items()))
-    if not isinstance(video, dict) or "corners_cm" not in video:
+    entries = {"": content} if any(key in content for key in METRES) else content
+    if not entries:
+        raise FormatError("not a calibration: no entries", file=path)
+    return entries
+
+
+def _parse_square(path: Path, name: str, video: Any) -> FloorSquare:
+    """Return the square of one entry."""
+    unit = next((key for key in METRES if isinstance(video, dict) and key in video), None)
+    if unit is None:
         raise FormatError(
             "key 'corners_cm' is missing",
             file=path,
             where=name,
-            hint="Map the name of each corner to [x, y] in cm",
+            hint="Map the name of each corner to [x, y] in cm, or as 'corners_mm' in mm",
         )
 
     def points(key: str) -> dict[str, Array]:
         return {
-            corner: _pair(value, path, f"{key}.{corner}")
+            corner: _point(value, path, f"{key}.{corner}")
             for corner, value in _object(video.get(key, {}), path, key).items()
         }
 
-    floor_m = {
-        corner: value / CENTIMETRES_PER_METRE for corner, value in points("corners_cm").items()
-    }
+    def planar_points(key: str) -> dict[str, Array]:
+        return {corner: point[:2] for corner, point in points(key).items()}
+
+    floor_m = {corner: METRES[unit] * point for corner, point in points(unit).items()}
     axes = "axes as given"
+    corners_m = np.array(list(floor_m.values()))
+    relief_m = np.ptp(corners_m[:, 2]) if len(corners_m) else 0.0
+    if 0 < relief_m <= MAX_FLOOR_SLOPE * np.ptp(corners_m[:, :2], axis=0).max():
+        axes = f"heights averaged over {1e3 * relief_m:.0f} mm"
+        floor_m = {c: np.append(p[:2], corners_m[:, 2].mean()) for c, p in floor_m.items()}
     if all(corner in floor_m for corner in CLOCKWISE):
-        x, y = np.array([floor_m[corner] for corner in CLOCKWISE]).T
+        x, y, _ = np.array([floor_m[corner] for corner in CLOCKWISE]).T
         if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0:
-            floor_m = {corner: value * [1.0, -1.0] for corner, value in floor_m.items()}
-            axes = "y negated, so that z is up"
+            floor_m = {corner: value * [1.0, -1.0, 1.0] for corner, value in floor_m.items()}
+            axes += ", y negated, so that z is up"
     stays = {
         corner: _stay(value, path, f"timestamps_lh2.{corner}")
         for corner, value in _object(
             video.get("timestamps_lh2", {}), path, "timestamps_lh2"
         ).items()
     }
-    square = FloorSquare(path, floor_m, points("corners_px"), points("corners_lh2"), stays, axes)
+    circles = video.get("circles", {})
+    number = sum(key != "quantity" for key in circles) if isinstance(circles, dict) else 0
+    square = FloorSquare(
+        path,
+        floor_m,
+        planar_points("corners_px"),
+        planar_points("corners_lh2"),
+        stays,
+        axes,
+        f"{number} circles" if number else "",
+    )
     for part in (square.pixels, square.plane, square.stays):
         unknown = sorted(set(part) - set(floor_m))
         if unknown:
-            raise FormatError(
-                f"corner {unknown[0]!r} is not in 'corners_cm'", file=path, where=name
-            )
+            raise FormatError(f"corner {unknown[0]!r} is not in {unit!r}", file=path, where=name)
     return square
 
 
@@ -178,14 +271,14 @@ def _object(value: Any, path: Path, where: str) -> dict[str, Any]:
     return value
 
 
-def _pair(value: Any, path: Path, where: str) -> Array:
-    """Return the first two numbers of a list; a third is allowed (the published lists have 0)."""
+def _point(value: Any, path: Path, where: str) -> Array:
+    """Return the two or three numbers of a list as a point (3,); z is zero if it is missing."""
     is_valid = isinstance(value, list) and len(value) in (2, 3)
     if is_valid:
         is_valid = all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
     if not is_valid or not np.all(np.isfinite(np.array(value, float))):
         raise FormatError(f"{str(value)[:40]} should be two finite numbers", file=path, where=where)
-    return np.array(value[:2], float)
+    return np.array([*value, 0.0][:3], float)
 
 
 def _stay(value: Any, path: Path, where: str) -> tuple[int, int]:
@@ -213,7 +306,7 @@ def estimate_markers(
         return None
     return Scene(
         markers=tuple(
-            Marker(name, np.append(position, 0.0), (visits[name],) if name in visits else ())
+            Marker(name, position, (visits[name],) if name in visits else ())
             for name, position in square.floor_m.items()
         ),
         frame=FRAME,
@@ -316,7 +409,7 @@ def read_tracks(
     try:
         to_floor = fit_homography(
             np.array([square.pixels[name] for name in names]),
-            np.array([square.floor_m[name] for name in names]),
+            np.array([square.floor_m[name][:2] for name in names]),
         )
     except DegenerateError as error:
         raise FormatError(

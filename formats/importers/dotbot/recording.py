@@ -9,9 +9,11 @@ reads the files that define the frame of the floor.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from locatk.core.errors import InputError, MissingDataError
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
@@ -19,8 +21,12 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot.count_rows import (
     CountRows,
     detect_layout,
+    find_new_counts,
+    find_planes,
     merge_rows,
     read_rows,
+    rename_columns,
+    set_robot_times,
     sort_and_deduplicate,
 )
 from locatk.formats.importers.dotbot.floor_square import (
@@ -64,7 +70,7 @@ def read_dotbot(
     if not paths:
         raise MissingDataError("no recording to import")
     warnings: list[str] = []
-    tables = [read_table(Path(path)) for path in paths]
+    tables = [rename_columns(read_table(Path(path))) for path in paths]
     layouts = [detect_layout(table) for table in tables]
     for table, layout in zip(tables, layouts, strict=True):
         if layout != layouts[0]:
@@ -76,7 +82,9 @@ def read_dotbot(
             )
     parts = [read_rows(table, layouts[0]) for table in tables]
     rows = sort_and_deduplicate(merge_rows(parts), warnings)
-    sweeps = _sweeps(rows)
+    is_new, offset_us = find_new_counts(rows)
+    rows = set_robot_times(rows, warnings)
+    sweeps = _sweeps(rows, is_new, offset_us)
     rows_per_device = np.bincount(rows.device, minlength=len(rows.devices)).tolist()
     is_assumed = bool(np.all(rows.polynomial == UNKNOWN))
     facts = {
@@ -90,8 +98,15 @@ def read_dotbot(
         ),
         "channels": ", ".join(str(channel) for channel in np.unique(rows.channel))
         + (" (assumed)" if is_assumed else " (from polynomials)"),
-        "clock": "time stamps are in UTC; all counts of a row share one",
+        "clock": "time stamps are in UTC; all counts of a row share one"
+        if rows.tick is None
+        else "clocks of the robots (db_time), fitted to the time stamps (UTC)",
     }
+    if not np.all(is_new):
+        facts["repeated"] = (
+            f"{np.count_nonzero(~is_new)} counts are repeated from earlier rows and left out: "
+            "db_time is the time of one sweep"
+        )
     trajectories = _truth_columns(rows)
     if trajectories:
         facts["truth"] = f"{sum(map(len, trajectories))} poses from the columns real_*_mm"
@@ -110,8 +125,10 @@ def read_dotbot(
             hint=f"Give --calibration, or put it into {Path(truth[0]).parent}",
         )
     if calibration_file is not None:
-        square = read_calibration(calibration_file)
-        facts["calibration"] = f"{calibration_file} ({square.axes})"
+        span_ns = (int(rows.time_ns.min()), int(rows.time_ns.max()))
+        square = read_calibration(calibration_file, [Path(path) for path in paths], span_ns)
+        unused = f"; not used: {square.unused}" if square.unused else ""
+        facts["calibration"] = f"{calibration_file} ({square.axes}{unused})"
         scene = estimate_markers(square, rows, facts, warnings)
         if truth:
             files = [Path(path) for path in truth]
@@ -119,12 +136,12 @@ def read_dotbot(
     return ImportedSession(sweeps, scene, trajectories, facts, warnings)
 
 
-def _sweeps(rows: CountRows) -> Sweeps:
-    """Return each count of each row as a sweep."""
+def _sweeps(rows: CountRows, is_new: NDArray[np.bool_], offset_us: NDArray[np.float64]) -> Sweeps:
+    """Return each new count of each row as a sweep."""
     n, k = rows.count.shape
-    return Sweeps(
+    sweeps = Sweeps(
         devices=rows.devices,
-        time_ns=np.repeat(rows.time_ns, k),
+        time_ns=(rows.time_ns[:, None] + np.rint(1e3 * offset_us).astype(np.int64)).ravel(),
         device=np.repeat(rows.device, k),
         sensor=np.zeros(n * k, np.int32),
         channel=rows.channel.ravel(),
@@ -132,6 +149,12 @@ def _sweeps(rows: CountRows) -> Sweeps:
         sweep=np.full(n * k, UNKNOWN, np.int32),
         count=rows.count.ravel(),
     )
+    # Columns that repeat sweeps are the slots of the robot; those of complete reports are not.
+    slot = rows.slot if k == 1 else None if np.all(is_new) else np.tile(np.arange(k), n)
+    order = np.flatnonzero(is_new.ravel())
+    order = order[np.argsort(sweeps.time_ns[order], kind="stable")]
+    sweeps = sweeps.take(order)
+    return sweeps if slot is None else replace(sweeps, sweep=find_planes(sweeps, slot[order]))
 
 
 def _truth_columns(rows: CountRows) -> list[Trajectory]:

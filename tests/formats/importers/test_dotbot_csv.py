@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from locatk.core.geometry import apply_homography, fit_homography
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, predict_angles
 from locatk.core.lighthouse.light_planes import angles_to_counts
 from locatk.core.lighthouse.published.scene import paper_image_points
+from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.dotbot.recording import read_dotbot
 from locatk.formats.importers.imported_session import ImportedSession
@@ -287,7 +289,7 @@ def test_swapped_and_repeated_stamps_are_mended_and_told(write: Write) -> None:
         (TWO, 1, "no rows"),
         ("time,value\n1,2\n", 1, "known DotBot layout"),
         (TWO.replace(",LHB_count_2", "") + "0,2023-07-27T15:34:22Z,R,1,2,3\n", 1, "'lhb_count_2'"),
-        (TWO.replace("timestamp", "time") + ROW, 1, "'timestamp'"),
+        (TWO.replace("timestamp", "when") + ROW, 1, "'timestamp'"),
         ("timestamp,c0\n2023-07-27T15:34:22Z,1\n", 1, "'c1'"),
         (TWO.replace("LHB_count_2", "LHB_count_1") + ROW, 1, "twice"),
         (TWO + ROW + NEXT.replace("84421", "many"), 3, "'many'"),
@@ -456,8 +458,8 @@ def test_markers_name_the_device_that_stood_there(write: Write) -> None:
     [
         ("{", "JSON"),
         ("[]", "object"),
-        ("{}", "0 videos"),
-        (json.dumps({"a": SQUARE, "b": SQUARE}), "2 videos"),
+        ("{}", "no entries"),
+        (json.dumps({"a": SQUARE, "b": SQUARE}), "2 entries (a, b), of which none"),
         (json.dumps({"a": {}}), "corners_cm"),
         (json.dumps({"a": {"corners_cm": {"tl": [1, "x"]}}}), "finite"),
         (json.dumps({"a": {"corners_cm": {"tl": [1, float("nan")]}}}), "finite"),
@@ -476,6 +478,69 @@ def test_bad_calibration_is_named(write: Write, content: str, what: str) -> None
         read_dotbot([recording])
     assert caught.value.file == str(file)
     assert what in str(caught.value)
+
+
+def scenes() -> dict:
+    """Both scenes of alvarado24automatic: corners in space, stays, circles."""
+
+    def scene(day: int, shift: float) -> dict:
+        corners = {
+            "tl": [935, 452, 37],
+            "tr": [957, 54, 34],
+            "br": [557, 31, 31],
+            "bl": [539, 431, 34],
+        }
+        times = {
+            c: [f"2024-12-{day}T15:27:{k}0Z", f"2024-12-{day}T15:27:{k}9Z"]
+            for k, c in enumerate(corners, 1)
+        }
+        return {
+            "corners_mm": {c: [x + shift, y, z] for c, (x, y, z) in corners.items()},
+            "timestamps_lh2": times,
+            "circles": {"quantity": 2, "1": times["tl"], "2": times["tr"]},
+        }
+
+    return {"scene_1": scene(10, 0), "scene_2": scene(11, 40)}
+
+
+LABELLED = ",timestamp,db_time,lha_poly_0,lha_count_0,lha_poly_1,lha_count_1,"
+LABELLED += "lhb_poly_0,lhb_count_0,lhb_poly_1,lhb_count_1\n"
+LABELLED += "0,2024-12-11T15:27:15Z,5000000,1,36669,0,75076,3,37516,2,78457\n"
+LABELLED += "1,2024-12-11T15:27:45Z,35000000,1,36669,0,75076,3,37516,2,78457\n"
+
+
+def test_scenes_of_one_calibration(write: Write, tmp_path: Path) -> None:
+    """The folder of the recording names its scene, otherwise its times do."""
+    write(json.dumps(scenes()), "calibration.json")
+    (tmp_path / "scene_2").mkdir()
+    session = read_dotbot([write(LABELLED, "scene_2/lh_data.csv")])
+    assert session.scene is not None
+    markers = {marker.name: marker for marker in session.scene.markers}
+    # In the millimetres of the motion capture, z up, on a level floor.
+    np.testing.assert_allclose(markers["tl"].position, [0.975, 0.452, 0.034], atol=1e-12)
+    np.testing.assert_allclose(markers["br"].position, [0.597, 0.031, 0.034], atol=1e-12)
+    [visit] = markers["tl"].visits
+    assert (visit.device, visit.start_ns) == ("robot", 1733930830000000000)
+    assert [len(markers[name].visits) for name in CORNERS] == [1, 0, 0, 1]
+    assert "heights averaged over 6 mm; not used: 2 circles" in session.facts["calibration"]
+    by_time = read_dotbot([write(LABELLED, "run.csv")])
+    np.testing.assert_array_equal(
+        [m.position for m in by_time.scene.markers], [m.position for m in session.scene.markers]
+    )
+    other_day = LABELLED.replace("2024-12-11", "2024-12-20")
+    with pytest.raises(FormatError, match="of which none belong to the recording"):
+        read_dotbot([write(other_day, "run.csv")])
+    # A file of the folder above that does not name the folder is of something else.
+    (tmp_path / "scene_3").mkdir()
+    assert read_dotbot([write(LABELLED, "scene_3/lh_data.csv")]).scene is None
+
+
+def test_corners_at_different_heights_stay(write: Write) -> None:
+    table = scenes()
+    table["scene_1"]["corners_mm"]["tl"][2] = 700
+    write(json.dumps({"scene_1": table["scene_1"]}), "calibration.json")
+    session = read_dotbot([write(LABELLED.replace("2024-12-11", "2024-12-10"))])
+    assert session.scene.markers[0].position[2] == pytest.approx(0.7)
 
 
 def test_corners_on_a_line_are_refused(write: Write) -> None:
@@ -535,3 +600,177 @@ def test_no_markers_from_a_plane_that_is_not_of_these_counts(write: Write) -> No
     session = read_dotbot([write(still)])
     assert session.scene is None
     assert "coincide" in session.warnings[0]
+
+
+# ---- single sweeps, and the clock of the robot
+
+
+class Event(NamedTuple):
+    """Sweep that a robot received."""
+
+    time_s: float
+    polynomial: int
+    count: int
+    slot: int
+    plane: int
+
+
+def received(
+    seconds: float, stations: int, *, rest: tuple[float, float] = (0, 0), seed: int = 1
+) -> list[Event]:
+    """Sweeps of rotors that run freely, over a robot that drives a circle and rests once."""
+    rng = np.random.default_rng(seed)
+    events = []
+    for station in range(stations):
+        period_s = [959000, 957000][station] / 48e6 * (1 + [-15e-6, 22e-6][station])
+        places, slot_of_plane = [(0.1, 2.0), (-1.5, 1.0)][station], [(1, 0), (0, 1)][station]
+        start_s = rng.uniform(0, period_s)
+        while start_s < seconds:
+            polynomial = 2 * station + int(rng.integers(2))
+            for plane, fraction in enumerate((1 / 3, 2 / 3)):
+                time_s = start_s + fraction * period_s
+                driven_s = time_s - np.clip(time_s - rest[0], 0, rest[1] - rest[0])
+                x, y = 0.5 * np.cos(driven_s), 0.5 * np.sin(driven_s)
+                angle = np.arctan2(y - places[0], x + places[1])
+                turn = fraction + (angle + (-1) ** plane * -0.3) / (2 * np.pi)
+                count = turn * period_s * 6e6 + rng.normal(0, 0.8)
+                if rng.uniform() > 0.1:
+                    event = (start_s + turn * period_s, polynomial, round(count))
+                    events.append(Event(*event, slot_of_plane[plane], plane))
+            start_s += period_s
+    return sorted(events)
+
+
+def held_table(events: list[Event], stations: int, *, max_age_us: int, boot_us: int = 7) -> str:
+    """Table as `parse_logfile.py` writes it: the last sweep of each slot, at the newest's time."""
+    names = ["poly_0,lfsr_index_0,poly_1,lfsr_index_1"]
+    if stations == 2:
+        names = [f"lh{k}_poly_0,lh{k}_count_0,lh{k}_poly_1,lh{k}_count_1" for k in "ab"]
+    lines = [",timestamp,db_time," + ",".join(names)]
+    cells: dict[tuple[int, int], tuple[int, int, int]] = {}
+    for event in events:
+        tick = boot_us + round(event.time_s * 1e6 * (1 + 30e-6))
+        cells[event.polynomial // 2, event.slot] = (event.polynomial, event.count, tick)
+        cells = {key: cell for key, cell in cells.items() if tick - cell[2] <= max_age_us}
+        if len(cells) == 2 * stations:
+            row = [f"{cell[0]},{cell[1]}" for _, cell in sorted(cells.items())]
+            stamp = np.datetime64(T0 + tick * 1000, "ns")
+            lines.append(f"{len(lines) - 1},{stamp}Z,{tick}," + ",".join(row))
+    return "\n".join(lines) + "\n"
+
+
+def time_errors_us(sweeps: Sweeps, events: list[Event]) -> np.ndarray:
+    """Differences of the times of sweeps from those of their events."""
+    times: dict[tuple[int, float], list[float]] = {}
+    for event in events:
+        times.setdefault((event.polynomial, event.count), []).append(event.time_s)
+    found_s = (sweeps.time_ns - T0 - 7000) / 1e9 / (1 + 30e-6)
+    columns = (sweeps.polynomial.tolist(), sweeps.count.tolist(), found_s.tolist())
+    return 1e6 * np.array(
+        [min((at - t for t in times[p, c]), key=abs) for p, c, at in zip(*columns, strict=True)]
+    )
+
+
+@pytest.mark.parametrize(("stations", "max_age_us"), [(1, 10**9), (2, 25_000)])
+def test_held_counts_are_left_out(write: Write, stations: int, max_age_us: int) -> None:
+    """A sweep of each row is new if nothing is missing; the others are copies of earlier ones."""
+    events = received(8, stations, rest=(2, 5))
+    session = read_dotbot([write(held_table(events, stations, max_age_us=max_age_us))])
+    error_us = time_errors_us(session.sweeps, events)
+    # One in a hundred is dated one rotation too late, because two in succession were lost.
+    assert np.mean(np.abs(error_us) < 15) > 0.99
+    assert np.abs(error_us).max() < 25_000
+    rows, sweeps = int(session.facts["rows"]), len(session.sweeps)
+    assert 0.9 * len(events) < sweeps <= len(events)
+    plane = {(e.polynomial, e.count): e.plane for e in events}
+    keys = zip(session.sweeps.polynomial.tolist(), session.sweeps.count.tolist(), strict=True)
+    assert [plane[key] for key in keys] == session.sweeps.sweep.tolist()
+    assert "clocks of the robots" in session.facts["clock"]
+    assert f"{rows * 2 * stations - sweeps} counts are repeated" in session.facts["repeated"]
+
+
+def test_rows_are_in_the_order_of_their_numbers(write: Write) -> None:
+    """The published tables are sorted by time after they were filled in the order of the log."""
+    events = received(8, 2)
+    rng = np.random.default_rng(6)
+    late_s = [0.012 * (rng.uniform() < 0.1) for _ in events]
+    late = [events[k] for k in np.argsort([e.time_s for e in events] + np.array(late_s))]
+    header, *rows = held_table(late, 2, max_age_us=25_000).splitlines()
+    rows.sort(key=lambda row: row.split(",")[1])
+    # If several sweeps are new, one may be later than the sweep that was logged last.
+    sweeps = read_dotbot([write("\n".join([header, *rows]) + "\n")]).sweeps
+    numbered = np.mean(np.abs(time_errors_us(sweeps, events)) < 15)
+    assert numbered > 0.87
+    unnumbered = [row.split(",", 1)[1] for row in (header, *rows)]
+    sweeps = read_dotbot([write("\n".join(unnumbered) + "\n")]).sweeps
+    assert np.mean(np.abs(time_errors_us(sweeps, events)) < 15) < numbered - 0.03
+
+
+def test_complete_reports_with_a_clock_are_kept(write: Write) -> None:
+    """Pairs of one rotation at a time of the robot's clock, also at rest."""
+    rng = np.random.default_rng(3)
+    lines = ["timestamp,source,poly_0,lfsr_index_0,poly_1,lfsr_index_1,db_time"]
+    for k in range(200):
+        first = 40000 + (k > 100) * 30 * k + int(rng.normal(0, 2))
+        stamp = np.datetime64(T0 + k * 100_000_000, "ns")
+        lines.append(f"{stamp}Z,a,0,{first},1,{first + 41000 + int(rng.normal(0, 2))},{k * 100000}")
+    session = read_dotbot([write("\n".join(lines) + "\n")])
+    assert len(session.sweeps) == 400
+    assert "repeated" not in session.facts
+
+
+def test_a_clock_corrects_the_times_of_a_log(write: Write) -> None:
+    """Log lines are late by up to 40 ms, the clock wraps, and the robot restarts."""
+    rng = np.random.default_rng(4)
+    lines, true_ns = ["db_time,SWEEP,lfsr_index,Timestamp,poly,source"], []
+    for k in range(1500):
+        at_us = 20_000 * k
+        tick = (2**32 - 5_000_000 + at_us) % 2**32 if k < 900 else at_us - 18_000_000
+        late_ns = round(rng.exponential(8e6)) if k % 7 else 0
+        true_ns.append(T0 + 1000 * at_us)
+        lines.append(f"{tick},0,{30000 + k},{np.datetime64(true_ns[-1] + late_ns, 'ns')}Z,4,a")
+    session = read_dotbot([write("\n".join(lines) + "\n")])
+    assert session.facts["layout"] == "sweep-per-row"
+    assert session.warnings[-1:] == ["the clock of a restarted 1 times"]
+    error_ns = session.sweeps.time_ns - np.array(true_ns)[session.sweeps.count.astype(int) - 30000]
+    assert np.quantile(np.abs(error_ns), 0.98) < 3e6
+
+
+def test_planes_of_single_sweeps(write: Write) -> None:
+    """The slot of station 1 is the other plane, that of station 2 the plane."""
+    events = received(6, 2)
+    gap = [e for e in events if not (3 < e.time_s < 4.5 and (e.slot == 0 or e.polynomial > 1))]
+    lines = ["sweep,source,lfsr_index,timestamp,poly"]
+    for e in gap:
+        stamp = np.datetime64(T0 + round(e.time_s * 1e9), "ns")
+        lines.append(f"{e.slot},a,{e.count},{stamp}Z,{e.polynomial}")
+    sweeps = read_dotbot([write("\n".join(lines) + "\n")]).sweeps
+    assert sweeps.sweep.tolist() == [e.plane for e in gap]
+    assert sweeps.count.tolist() == [e.count for e in gap]
+    assert sweeps.channel.tolist() == [e.polynomial // 2 + 1 for e in gap]
+    # Without slots, and with slots that change their plane, planes are not guessed.
+    plain = [line.split(",", 1)[1] for line in lines]
+    assert set(read_dotbot([write("\n".join(plain) + "\n")]).sweeps.sweep) == {-1}
+    few = lines[:1] + [line for line in lines[1:] if line.startswith("0")]
+    assert set(read_dotbot([write("\n".join(few) + "\n")]).sweeps.sweep) == {-1}
+
+
+def test_slots_that_a_restart_exchanged(write: Write) -> None:
+    lines, planes = ["timestamp,source,poly,lfsr_index,sweep"], []
+    for e in received(6, 1):
+        slot = e.slot if e.time_s < 3 else 1 - e.slot
+        lines.append(f"{np.datetime64(T0 + round(e.time_s * 1e9), 'ns')}Z,a,0,{e.count},{slot}")
+        planes.append(e.plane)
+    found = read_dotbot([write("\n".join(lines) + "\n")]).sweeps.sweep
+    assert np.mean(found == planes) > 0.99
+    assert set(found[found != planes]) <= {-1}
+
+
+def test_headers_in_other_spellings(write: Write) -> None:
+    columns = "Time [s],Device,Polynomial 0,LFSR-Index 0,polynomial.1,lfsr_counts_1,DB Time [us]"
+    session = read_dotbot([write(columns + "\n1690472062.700963,a,8,40000,9,80000,1\n")])
+    assert session.sweeps.time_ns.tolist() == [T0] * 2
+    assert session.sweeps.devices == ("a",)
+    assert session.sweeps.channel.tolist() == [5, 5]
+    with pytest.raises(FormatError, match="'poly' occurs twice"):
+        read_dotbot([write("timestamp,poly,polynomial,lfsr_index\n1,2,3,4\n")])
