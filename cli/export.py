@@ -84,6 +84,11 @@ def _parse_area(
         metavar="NAME",
         help="Device to export. Repeatable.  [default: all]",
     ),
+    click.option(
+        "--onboard",
+        is_flag=True,
+        help="Export the poses that the devices estimated themselves; SOLUTION is a session.",
+    ),
     click.option("--covariance", is_flag=True, help="ros2: also write poses with covariance."),
     click.option(
         "--frame",
@@ -105,6 +110,7 @@ def command(
     format_name: str,
     output: Path,
     devices: tuple[str, ...],
+    onboard: bool,
     covariance: bool,
     frame: str | None,
     area: tuple[float, ...] | None,
@@ -160,8 +166,9 @@ def command(
             raise click.UsageError(f"--{option} is for --format {owner}.")
     if format_name in STATION_FORMATS:
         options.check_ending(output, ENDINGS[format_name])
-        if devices:
-            raise click.UsageError(f"--device is for poses; {format_name} contains stations.")
+        if devices or onboard:
+            option = "--device" if devices else "--onboard"
+            raise click.UsageError(f"{option} is for poses; {format_name} contains stations.")
         options.guard_output(output, overwrite=overwrite, inputs=[solution])
         if format_name == CONFIG:
             entry = export_config(solution, output, is_as_is=frame == "as-is", overwrite=overwrite)
@@ -172,7 +179,9 @@ def command(
                 {"version": 1, "input": solution, "format": format_name, "files": [entry]}
             )
         return
-    tracks = select_devices(read_trajectories(solution), devices, solution)
+    tracks = select_devices(
+        read_trajectories(solution, "onboard" if onboard else "auto"), devices, solution
+    )
     poses = sum(map(len, tracks))
     if format_name != "parquet":  # Parquet has null for values that are not numbers.
         tracks = [exports.with_finite_poses(track) for track in tracks]

@@ -369,14 +369,14 @@ class TickClock:
         if span * self._nominal >= MIN_FIT_S * 1e9:
             # The edge over the middle minimizes the sum of delays; an edge later in the window
             # better represents the current rate of the clock.
-            slope = _hull_slope(x - x[0], y - y[0] - self._nominal * (x - x[0]), span * 2 / 3)
+            slope = lower_hull_slope(x - x[0], y - y[0] - self._nominal * (x - x[0]), span * 2 / 3)
             if abs(slope) <= RATE_LIMIT * self._nominal:
                 era.rate, era.learned = self._nominal + slope, True
         last = era.earliest[keys[-1]]
         era.origin = min(float((y - era.rate * x).min()), last[1] - era.rate * last[0])
 
 
-def _hull_slope(x: Array, y: Array, abscissa: float) -> float:
+def lower_hull_slope(x: Array, y: Array, abscissa: float) -> float:
     """Slope of the lower convex hull of points with ascending ``x`` at an abscissa."""
     hull: list[tuple[float, float]] = []
     for point in zip(x.tolist(), y.tolist(), strict=True):

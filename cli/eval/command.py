@@ -76,6 +76,12 @@ offset_option = click.option(
     metavar="NAME=NAME",
     help="Name of a device in the estimate, and its name in the truth. Repeatable.",
 )
+@click.option(
+    "--onboard",
+    is_flag=True,
+    help="Compare the poses that the device estimated itself, such as a Crazyflie; ESTIMATE is a "
+    "session.",
+)
 @section("Alignment", align_option, offset_option)
 @section(
     "Association",
@@ -139,6 +145,7 @@ def command(
     names: tuple[str, ...],
     all_pairs: bool,
     full: bool,
+    onboard: bool,
     as_json: bool,
 ) -> None:
     """Compare the poses of ESTIMATE with a reference, for each device.
@@ -156,6 +163,7 @@ def command(
       locatk eval solved.mcap --truth run.mcap --full
       locatk eval solved.mcap --truth grid.mcap --align sim3 --json
       locatk eval solved.mcap --truth camera.tum --offset auto
+      locatk eval flight.mcap --onboard --truth solved.mcap --align se3
       locatk eval slam.tum --truth mocap.tum --align se3 --delta 1m
       locatk eval solved.mcap --truth mocap.csv --pair 785b=red --pair dffa=blue
     """
@@ -164,7 +172,7 @@ def command(
     from locatk.formats.importers import trajectories as files
 
     rpe_delta = Delta.parse(delta)
-    estimated = files.open_file(estimate)
+    estimated = files.open_file(estimate, role="onboard" if onboard else "estimate")
     true = files.open_file(truth, role="truth")
     files.check_kinds(estimated, true)
     if not estimated.solved:

@@ -65,6 +65,17 @@ FORMATS = {
         lighthouse.import_scene,
         takes_one_path=True,
     ),
+    "crazyflie-usd": Format(
+        IMPORTERS + "crazyflie_usd.recording:read_crazyflie_usd",
+        lighthouse.import_sweeps,
+        lighthouse.CRAZYFLIE_USD,
+        takes_one_path=True,
+    ),
+    "crazyflie-csv": Format(
+        IMPORTERS + "crazyflie_csv:read_crazyflie_csv",
+        lighthouse.import_sweeps,
+        lighthouse.CRAZYFLIE,
+    ),
     "images": Format(IMPORTERS + "images:ImageFiles", dots.import_images, dots.IMAGES),
     "video": Format(IMPORTERS + "video:Video", dots.import_video, dots.VIDEO, takes_one_path=True),
     "polaris-csv": Format(
@@ -114,6 +125,11 @@ def command(
       crazyflie-config
                     stations of a Crazyflie (YAML): poses and calibrations; the
                     output is a scene (scene.toml) instead of a session
+      crazyflie-usd a Crazyflie's log from its micro SD card (log00): sweeps of the
+                    Lighthouse deck, IMU, and the Crazyflie's own estimate
+      crazyflie-csv log variables of a Crazyflie, of cfclient (one file a block) or
+                    of programs with cflib: IMU, the Crazyflie's own estimate, and
+                    sampled angles of stations, as far as they are logged
       images        camera frames of a dot sheet: files, folders or patterns, in
                     the order of the file names (frame2 before frame10)
       video         frames of one video file, with its times
@@ -139,6 +155,8 @@ def command(
       locatk import libsurvive run.rec.gz --stations -o run.mcap
       locatk import dotbot-log pydotbot.log -o drive.mcap
       locatk import crazyflie-config lighthouse.yaml -o scene.toml
+      locatk import crazyflie-usd log00 --config lighthouse.yaml -o flight.mcap
+      locatk import crazyflie-csv Log_IMU.csv Log_state.csv -o flight.mcap
       locatk import images frames/ --sheet sheet.toml --rate 46.6 -o run.mcap
       locatk import images '*.png' --sheet a4.toml --camera cam.toml -o run.mcap
       locatk import video run.mp4 --sheet sheet.toml -o run.mcap

@@ -15,6 +15,8 @@ from locatk.cli.info import lighthouse as info_lighthouse
 DOTBOT = ("truth", "calibration")
 SALEAE = ("channel", "method", "device")
 LIBSURVIVE = ("stations",)
+CRAZYFLIE = ("config", "stations", "receiver", "mounting", "device")
+CRAZYFLIE_USD = (*CRAZYFLIE, "sweeps")
 """Options of the formats, by the names of their arguments."""
 
 READER_ARGUMENTS = {"channel": "channels"}
@@ -26,6 +28,9 @@ MAX_NAME_CHARACTERS = 64
 
 MAX_LISTED_DEVICES = 8
 
+MAX_MOUNTING = 10_000.0
+"""Largest number of --mounting: 10 m, which only mistakes exceed."""
+
 
 def _check_device_name(ctx: click.Context, option: click.Parameter, name: str | None) -> str | None:
     """Refuse a name that is not suitable for a topic and a terminal; a click callback."""
@@ -36,6 +41,24 @@ def _check_device_name(ctx: click.Context, option: click.Parameter, name: str | 
             f"expected a name of 1 to {MAX_NAME_CHARACTERS} printable characters"
         )
     return name
+
+
+class Mounting(click.ParamType):
+    """Position [mm] and rotation about z [deg] of a receiver on a device, as text."""
+
+    name = "mounting"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """Return x, y, z and yaw."""
+        try:
+            numbers = [float(word) for word in value.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (3, 4) or not all(abs(number) <= MAX_MOUNTING for number in numbers):
+            self.fail(f"{value!r} is not three numbers x,y,z [mm], or four with yaw [deg].")
+        return tuple([*numbers, 0.0][:4])
 
 
 lighthouse_options = combine(
@@ -53,6 +76,32 @@ lighthouse_options = combine(
             metavar="PATH",
             help="Camera or marker calibration (calibration.json).  [default: the one in the "
             "folder of the truth or of the data]",
+        ),
+    ),
+    section(
+        "For crazyflie-usd and crazyflie-csv",
+        options.input_option(
+            "--config",
+            metavar="FILE",
+            help="Configuration of the Crazyflie (YAML) with the calibrations of the stations.",
+        ),
+        click.option(
+            "--receiver",
+            metavar="NAME|FILE",
+            help="Layout of the photodiodes: deck, bolt, or a receiver.toml.  [default: deck]",
+        ),
+        click.option(
+            "--mounting",
+            type=Mounting(),
+            metavar="X,Y,Z[,YAW]",
+            help="Position of the receiver in the axes of the device (x forward, y left, z up) "
+            "[mm], and its rotation about z [deg].  [default: 0,0,0,0]",
+        ),
+        click.option(
+            "--sweeps",
+            type=click.Choice(("uart", "lhangle", "estimator")),
+            help="crazyflie-usd: events with the sweeps, lhUartFrame, lhAngle or estSweepAngle.  "
+            "[default: the first of these in the log]",
         ),
     ),
     section(
@@ -75,7 +124,8 @@ lighthouse_options = combine(
             "--device",
             metavar="NAME",
             callback=_check_device_name,
-            help="Name of the device in the session.  [default: photodiode]",
+            help="Name of the device in the session, also of a Crazyflie.  [default: photodiode "
+            "or crazyflie]",
         ),
     ),
     section(
@@ -84,7 +134,8 @@ lighthouse_options = combine(
             "--stations",
             is_flag=True,
             default=None,
-            help="Import the poses of the stations, too. Otherwise `locatk solve` estimates them.",
+            help="Import the poses of the stations, too; for a Crazyflie those of --config. "
+            "Otherwise `locatk solve` estimates them.",
         ),
     ),
 )
@@ -108,19 +159,33 @@ def import_sweeps(
             facts=imported.facts,
             stations=imported.stations,
             receivers=imported.receivers,
+            imu=imported.imu,
+            onboard=imported.onboard,
             overwrite=overwrite,
         )
     sweeps = imported.sweeps
     stations = [describe_station(report, report.channel) for report in imported.stations]
     truth_poses = sum(map(len, imported.truth))
     truth = f", {truth_poses} truth poses" if truth_poses else ""
-    console.say(f"{len(sweeps)} sweeps of {_device_list(sweeps.devices)}{truth}")
+    counts = {
+        "imu_samples": sum(map(len, imported.imu)),
+        "onboard_poses": sum(map(len, imported.onboard)),
+    }
+    extras = "".join(
+        f", {count} {noun}"
+        for count, noun in zip(
+            counts.values(), ("samples of the IMU", "on-board poses"), strict=True
+        )
+        if count
+    )
+    console.say(f"{len(sweeps)} sweeps of {_device_list(sweeps.devices)}{truth}{extras}")
     if stations:
         console.say(console.table(*info_lighthouse.station_table(stations)))
     results = {
         "sweeps": len(sweeps),
         "devices": list(sweeps.devices),
         "truth_poses": truth_poses,
+        **counts,
         "stations": [{**each, "id": info_lighthouse.hexadecimal(each["id"])} for each in stations],
         "warnings": imported.warnings,
     }

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from locatk.core.geometry import matrix_from_quaternion, quaternion_from_heading
 
 Array = NDArray[np.float64]
 
@@ -32,6 +34,12 @@ class Receiver:
     def __len__(self) -> int:
         return len(self.position_m)
 
+    def mounted(self, position_m: ArrayLike, yaw_rad: float) -> Receiver:
+        """Return this receiver at a position (3,) on another device, turned about its z axis."""
+        rotation = matrix_from_quaternion(quaternion_from_heading(np.array([yaw_rad])))[0]
+        normal = None if self.normal is None else self.normal @ rotation.T
+        return replace(self, position_m=self.position_m @ rotation.T + position_m, normal=normal)
+
 
 DECK = Receiver(
     np.array(
@@ -42,3 +50,10 @@ DECK = Receiver(
 )
 """Bitcraze's Lighthouse deck: four photodiodes that face upwards (positions: crazyflie-firmware
 ``lighthouse_position_est.c``)."""
+
+BOLT = replace(DECK, name="crazyflie-bolt")
+"""A Lighthouse deck on a Crazyflie Bolt. The firmware has the same positions for it; the real ones
+depend on the frame (:meth:`Receiver.mounted`)."""
+
+RECEIVERS = {"deck": DECK, "bolt": BOLT}
+"""Receivers known by name."""

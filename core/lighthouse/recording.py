@@ -124,6 +124,9 @@ class StationReport:
         Number of frames of factory data with a valid checksum.
     damaged : int
         Number of frames with a wrong checksum. They are never used.
+    acceleration : tuple of 3 int, optional
+        Direction of its accelerometer as it transmits it (x right, y up, z back), from its
+        factory data.
     """
 
     channel: int
@@ -134,6 +137,7 @@ class StationReport:
     calibration: Calibration | None = None
     frames: int = 0
     damaged: int = 0
+    acceleration: tuple[int, int, int] | None = None
 
     @property
     def decode_rate(self) -> float | None:

@@ -132,6 +132,66 @@ class StationPairLink:
 
 
 @dataclass(frozen=True)
+class StandstillFacts:
+    """Time during which a device rested, and its position there.
+
+    Attributes
+    ----------
+    number : int
+        From 1, in the order of time.
+    device : str
+    start_ns, end_ns : int
+        Nanoseconds since the epoch.
+    role : str
+        ``"origin"``, ``"x axis"``, ``"floor"``, the name of a marker, or "" if it is not used.
+    position_m : tuple of 3 float, optional
+        Median position of the device in the frame of the solution; None without a pose.
+    """
+
+    number: int
+    device: str
+    start_ns: int
+    end_ns: int
+    role: str = ""
+    position_m: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class FrameFacts:
+    """Origin and uncertainty of the frame of a scene.
+
+    Attributes
+    ----------
+    source : str
+        As :attr:`~locatk.core.lighthouse.scene.model.Scene.frame_source`.
+    level_sigma_rad : float
+        Standard deviation of the inclination of the z axis, about each horizontal axis.
+    up_deviation_rad : float
+        Angle between the z axis and the direction against gravity that the accelerometers of the
+        stations report.
+    up_sigma_rad : float
+        Standard deviation of that direction, about each axis.
+    origin_sigma_m, heading_sigma_rad, scale_sigma : float
+        Standard deviations of the origin (along each axis), of the direction of the x axis, and of
+        the scale (relative), from the points on the floor or the markers.
+    misfit_m : float
+        Rms height of the points on the floor, if they are more than three.
+    standstills : tuple of StandstillFacts
+        In the order of time, if they were searched.
+    """
+
+    source: str
+    level_sigma_rad: float | None = None
+    up_deviation_rad: float | None = None
+    up_sigma_rad: float | None = None
+    origin_sigma_m: float | None = None
+    heading_sigma_rad: float | None = None
+    scale_sigma: float | None = None
+    misfit_m: float | None = None
+    standstills: tuple[StandstillFacts, ...] | None = None
+
+
+@dataclass(frozen=True)
 class LighthouseFacts:
     """Figures of a run of the Lighthouse solver; None if a figure does not apply.
 
@@ -147,7 +207,8 @@ class LighthouseFacts:
         Median residual of the homography between two stations, as a tangent.
     candidates : tuple of TwoViewCandidate
     candidate_decided_by : str
-        ``"markers"`` if these chose the arrangement; ``reading_decided_by`` in the JSON form.
+        ``"markers"`` or ``"gravity"`` if these chose the arrangement;
+        ``reading_decided_by`` in the JSON form.
     bundle_points, bundle_iterations : int
         Points and iterations of the final bundle adjustment.
     marker_misfit_m, marker_residual_rad : float
@@ -174,6 +235,8 @@ class LighthouseFacts:
         Epochs whose sweeps of two stations were exchanged and restored;
         ``moments_with_swapped_sweeps_restored`` in the JSON form.
     verification : SceneVerification
+    frame : FrameFacts
+        Origin and uncertainty of the frame.
     rigid : LighthouseFacts
         Figures of the rigid devices, if single photodiodes were solved as well.
     """
@@ -202,4 +265,5 @@ class LighthouseFacts:
     calibration_sigma_rad: float | None = None
     station_residual_rad: dict[str, float] | None = None
     verification: SceneVerification | None = None
+    frame: FrameFacts | None = None
     rigid: LighthouseFacts | None = None

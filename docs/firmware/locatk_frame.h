@@ -29,6 +29,9 @@
 #define LOCATK_ODOMETRY 5
 #define LOCATK_LIGHTHOUSE_CAPTURE 6
 #define LOCATK_LIGHTHOUSE_SWEEP 7
+#define LOCATK_IMU 8
+#define LOCATK_POSE 9
+#define LOCATK_LIGHTHOUSE_DECK 10
 
 /* Flags of a series. */
 #define LOCATK_COUNTS 1
@@ -49,7 +52,7 @@
 #define LOCATK_MEMORY(payload) ((payload) + 15 + ((payload) + 14) / 253)
 
 /* Sizes of payloads: text or HELLO by its characters, samples by their values (3 per magnetometer,
- * 1 per hall sensor, 3 per odometry pose), captures, sweeps. */
+ * 1 per hall sensor, 3 per odometry pose, 6 per IMU, 7 per pose), captures, sweeps. */
 #define LOCATK_TEXT_PAYLOAD(characters) ((characters) + 8)
 #define LOCATK_SERIES_PAYLOAD(samples, values) (12 + 4 * (samples) * ((values) + 1))
 #define LOCATK_CAPTURES_PAYLOAD(captures) (16 * (captures))
@@ -226,8 +229,8 @@ static inline size_t locatk_text(locatk_writer *w, uint32_t tick, uint8_t level,
     return locatk_end(w);
 }
 
-/* Start a frame of MAGNETOMETERS, HALLS or ODOMETRY (`sensors` is 1), with `step` ticks between
- * two samples. Then put: with LOCATK_COUNTS the scale (f32, microtesla per count); sample by
+/* Start a frame of MAGNETOMETERS or HALLS, or of ODOMETRY, IMU or POSE (`sensors` is 1), with `step`
+ * ticks between two samples. Then put: with LOCATK_COUNTS the scale (f32, microtesla per count); sample by
  * sample all values (f32, or i16 with LOCATK_COUNTS); with LOCATK_TEMPERATURE the temperature of
  * each sample (f32). */
 static inline void locatk_series(locatk_writer *w, uint8_t type, uint32_t tick, uint8_t sensors,

@@ -83,9 +83,10 @@ attached_receiver, receiver_file = RECEIVER.attached_for, RECEIVER.file_for
 def deck_artifacts(stream: Any) -> dict[str, str]:
     """Return the attachment of Bitcraze's Lighthouse deck, which is built in one way only.
 
-    ``locatk capture`` attaches it if no receiver is given.
+    ``locatk capture`` attaches it if no receiver is given. It is empty for other streams.
     """
-    return {RECEIVER_FILE: dumps_receiver(DECK)}
+    is_deck = stream.kind == "lighthouse" and stream.sensors == len(DECK)
+    return {RECEIVER_FILE: dumps_receiver(DECK)} if is_deck else {}
 
 
 def receiver_attachments(receivers: Mapping[str, Receiver], devices: set[str]) -> dict[str, str]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
+from locatk.core.lighthouse.scene.model import FRAME_SOURCES, JOINT_PARAMETERS
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     MAX_VARIANCE,
@@ -56,6 +57,12 @@ ANGLE_PARAMETERS = ("phase", "tilt", "gibphase", "ogeephase")
 
 ROTATION_TOLERANCE = 1e-6
 """Largest deviation of an element of ``R R^T`` from the identity."""
+
+MAX_COVARIANCE_ERROR = 1e-6
+"""Largest asymmetry and most negative eigenvalue of a matrix of correlations: beyond rounding."""
+
+FACTOR_DIGITS = 6
+"""Significant digits of the factor of the joint covariance: a millionth of each sigma."""
 
 CHANNEL = Integer(1, 16)
 
@@ -153,6 +160,115 @@ class Counts:
         return Inline({str(c): [float(count) for count in pair] for c, pair in value.items()})
 
 
+@dataclass(frozen=True)
+class UnitVector:
+    """Direction in three dimensions; of any length in the file."""
+
+    expected = "a direction of 3 numbers, not all 0"
+    plural = "directions of 3 numbers, not all 0"
+
+    def parse(self, value: Any, unit: Unit = NO_UNIT) -> NDArray[np.float64]:
+        vector = Array((3,)).parse(value)
+        length = float(np.linalg.norm(vector))
+        if not length > 0:
+            raise InvalidValueError(f"expected {self.expected}")
+        # A vector of length 1 is not changed, so that it is written again as it was read.
+        return vector if abs(length - 1.0) < 1e-12 else vector / length
+
+    def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> Any:
+        return np.asarray(value, float).tolist()
+
+
+@dataclass(frozen=True)
+class PoseCovariance:
+    """Covariance of a pose: finite, symmetric and without negative variances in any direction."""
+
+    expected = "a covariance of 6 rows of 6 numbers"
+    plural = "covariances of 6 rows of 6 numbers"
+
+    def parse(self, value: Any, unit: Unit = NO_UNIT) -> NDArray[np.float64]:
+        covariance = Array((6, 6), Number(max_magnitude=MAX_VARIANCE)).parse(value)
+        problem = covariance_problem(covariance)
+        if problem is not None:
+            raise InvalidValueError(
+                f"not a covariance: {problem}",
+                "",
+                "Leave the key out if the covariance is unknown",
+            )
+        return covariance
+
+    def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> Any:
+        return np.asarray(value, float).tolist()
+
+
+def covariance_problem(covariance: NDArray[np.float64]) -> str | None:
+    """Return the reason why a square matrix is not a covariance, or None if it is one."""
+    if not np.all(np.isfinite(covariance)):
+        return "a value is not finite"
+    variance = np.diagonal(covariance)
+    if np.any(variance < 0):
+        return "a variance is negative"
+    sigma = np.sqrt(variance)
+    inverse = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0)
+    correlation = covariance * inverse[:, None] * inverse
+    if np.any(covariance[sigma == 0]) or np.any(covariance[:, sigma == 0]):
+        return "a variance is 0 and its covariances are not"
+    if np.max(np.abs(correlation - correlation.T)) > MAX_COVARIANCE_ERROR:
+        return "it is not symmetric"
+    if np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0] < -MAX_COVARIANCE_ERROR:
+        return "it is not positive semi-definite"
+    return None
+
+
+@dataclass(frozen=True)
+class TriangularFactor:
+    """Rows of a lower triangular matrix L, of 1, 2, 3 ... numbers; its value is L L^T."""
+
+    expected = "a list of rows of 1, 2, 3 and so on numbers"
+    plural = "lists of rows of 1, 2, 3 and so on numbers"
+
+    def parse(self, value: Any, unit: Unit = NO_UNIT) -> NDArray[np.float64]:
+        if not (isinstance(value, list) and value):
+            raise InvalidValueError(f"expected {self.expected}")
+        factor: NDArray[np.float64] = np.zeros((len(value), len(value)))
+        for number, row in enumerate(value):
+            length = number + 1
+            factor[number, :length] = parse_key(f"[{number}]", Array((length,)), row)
+        covariance: NDArray[np.float64] = factor @ factor.transpose()
+        return covariance
+
+    def to_toml(self, value: Any, unit: Unit = NO_UNIT) -> Any:
+        factor = _triangular_factor(np.asarray(value, float))
+        digits = f".{FACTOR_DIGITS - 1}e"
+        return [
+            [float(format(number, digits)) for number in row[: k + 1]]
+            for k, row in enumerate(factor.tolist())
+        ]
+
+
+def _triangular_factor(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lower triangular L with L L^T = covariance, which may be semi-definite.
+
+    Raises
+    ------
+    ValueError
+        The matrix is not a covariance.
+    """
+    problem = covariance_problem(covariance)
+    if problem is not None:
+        raise ValueError(f"not a covariance: {problem}")
+    try:
+        return np.asarray(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        pass  # The gauge of a scene has no variance, so that a covariance may be singular.
+    sigma = np.sqrt(np.diagonal(covariance))
+    scale = np.where(sigma > 0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    upper = np.asarray(np.linalg.qr(root.T, mode="r"))
+    return np.asarray((upper * np.where(np.diagonal(upper) < 0, -1.0, 1.0)[:, None]).T)
+
+
 # ---- calibrations
 
 
@@ -217,14 +333,18 @@ CALIBRATION = Variant(
 )
 
 
+_UP = "direction against gravity in its axes (forward, left, up), from its accelerometer"
+
+
 def _known_station_table(values: Mapping[str, Any]) -> Table:
     """Return the table of a station that has yet to be solved."""
     keys: tuple[Key, ...] = (
         Key("channel", CHANNEL, "channel of a station that has yet to be solved, once each"),
         Key("id", SerialNumber(), "its serial number", None, "unknown"),
+        Key("up", UnitVector(), _UP, None, "unknown"),
     )
-    if "id" in values and set(values) <= {"channel", "id"}:
-        return Table(keys)  # only the serial number is known
+    if {"id", "up"} & set(values) and set(values) <= {"channel", "id", "up"}:
+        return Table(keys)  # its calibration is unknown
     keys += _calibration_keys(is_known=values.get("source") != "none")
     return Table(keys, lambda values: {**values, "calibration": _calibration_of(values)})
 
@@ -314,7 +434,7 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
             ),
             Key(
                 covariance,
-                Array((6, 6), Number(is_nan_allowed=True, max_magnitude=MAX_VARIANCE)),
+                PoseCovariance(),
                 "covariance of position (m) and rotation vector (rad) in the frame",
                 None,
                 "unknown",
@@ -329,6 +449,7 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
                 "none",
                 value_name="floor_map",
             ),
+            Key("up", UnitVector(), _UP, None, "unknown"),
             Key("calibration", CALIBRATION),
         ),
         _station_of,
@@ -358,6 +479,22 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
                 0.0,
                 value_name="floor_z",
             ),
+            Key(
+                "frame_source",
+                Text(FRAME_SOURCES),
+                "origin of the axes of the frame: `markers`, `floor` (z = 0 is the floor), "
+                "`gravity` (z is up, at an unknown height) or `station` (not level)",
+                None,
+                "unknown",
+            ),
+            Key(
+                "level_sigma_deg",
+                NOT_NEGATIVE,
+                "standard deviation of the inclination of the z axis against the vertical, or "
+                "against the floor if this is the source of the frame; about each axis",
+                None,
+                "unknown",
+            ),
             Key("notes", ListOf(Text()), "assumptions of the solution", ()),
             Key("stations", Tables(station), default=()),
             Key("markers", Tables(_MARKER), default=()),
@@ -367,9 +504,32 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
                 Tables(Variant(_known_station_table, _known_station_table({}))),
                 default=(),
             ),
+            Key(
+                "joint_covariance",
+                _JOINT_COVARIANCE,
+                default=None,
+                default_text="unknown",
+                value_name="covariance",
+            ),
         ),
         _scene_of,
     )
+
+
+_JOINT_COVARIANCE = Table(
+    (
+        Key(
+            "factor",
+            TriangularFactor(),
+            "rows of the lower triangular factor L of the joint covariance L L^T of all stations, "
+            f"in the order of `stations`, {JOINT_PARAMETERS} parameters each: position (m), "
+            "rotation vector in the frame (rad), and of the first and the second sweep phase, "
+            "tilt, curve, and magnitude times cosine and sine of the phase of gib and of ogee",
+        ),
+    ),
+    lambda values: values["factor"],
+    lambda covariance: {"factor": covariance},
+)
 
 
 _MARKER = Table(
@@ -399,13 +559,21 @@ def _scene_of(values: Values) -> Scene:
     refuse_repeated((marker.name for marker in markers), "markers", "name")
     calibrations = {e["channel"]: e["calibration"] for e in known if "calibration" in e}
     ids = {entry["channel"]: entry["id"] for entry in known if entry["id"] is not None}
-    return Scene(**{**values, "calibrations": calibrations, "ids": ids})
+    ups = {entry["channel"]: entry["up"] for entry in known if entry["up"] is not None}
+    covariance, rows = values["covariance"], JOINT_PARAMETERS * len(stations)
+    if covariance is not None and len(covariance) != rows:
+        raise InvalidValueError(
+            f"expected {rows} rows, {JOINT_PARAMETERS} for each of {len(stations)} stations, "
+            f"not {len(covariance)}",
+            "joint_covariance.factor",
+        )
+    return Scene(**{**values, "calibrations": calibrations, "ids": ids, "ups": ups})
 
 
 def _scene_values(scene: Scene) -> Values:
     known: list[Values] = []
-    for channel in sorted(scene.calibrations.keys() | scene.ids.keys()):
-        entry: Values = {"channel": channel}
+    for channel in sorted(scene.calibrations.keys() | scene.ids.keys() | scene.ups.keys()):
+        entry: Values = {"channel": channel, "up": scene.ups.get(channel)}
         if channel in scene.ids:
             entry["id"] = scene.ids[channel]
         if channel in scene.calibrations:

@@ -24,6 +24,7 @@ from locatk.formats.devices.interface import Batch, Counts, Decoder, Options, St
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import frames, messages
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
+from locatk.formats.sessions.inertial import IMU_TOPIC_PREFIX
 from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, Layout
 
 PAUSE_NS = 3_000_000
@@ -433,7 +434,7 @@ class MessageEncoder:
         self.remarks: list[str] = []
         self._first: dict[str, int] = {}
         self._last: dict[str, int] = {}
-        self._clock_by_device: dict[str, DeviceClock] = {}
+        self._clocks: dict[str, DeviceClock] = {}
         self.samples: Counter[str] = Counter()
 
     def device(self, stream: Stream) -> str:
@@ -450,14 +451,12 @@ class MessageEncoder:
         }
 
     def clocks(self) -> dict[str, TickClock]:
-        """Return the clock model of each device that sends plausible ticks."""
-        return {
-            name: clock.model for name, clock in self._clock_by_device.items() if clock.rate is None
-        }
+        """Return the clock models of plausible ticks, by device and name of its counter."""
+        return {name: clock.model for name, clock in self._clocks.items() if clock.rate is None}
 
     def restart(self) -> None:
         """Restart the clock models after a reconnect."""
-        for clock in self._clock_by_device.values():
+        for clock in self._clocks.values():
             clock.restart()
 
     def messages(
@@ -514,15 +513,15 @@ class MessageEncoder:
         ticks = batch.stream.ticks
         if batch.tick is None or ticks is None:
             return arrivals.wire_ns(batch.end)
-        device = self.device(batch.stream)
-        clock = self._clock_by_device.get(device)
+        name = "-".join(filter(None, (self.device(batch.stream), ticks.name)))
+        clock = self._clocks.get(name)
         if clock is None or clock.ticks != ticks:
-            clock = self._clock_by_device[device] = DeviceClock(ticks)
+            clock = self._clocks[name] = DeviceClock(ticks)
         believed = clock.rate is None
         times = clock.times(batch.stream.kind, batch.tick, arrivals.read_ns(batch.end))
         if believed and clock.rate is not None:
             self.remarks.append(
-                f"the clock of {device} runs {clock.rate:.2g} times as fast as stated: samples "
+                f"the clock of {name} runs {clock.rate:.2g} times as fast as stated: samples "
                 "have the times of their arrival"
             )
         return arrivals.wire_ns(batch.end) if times is None else times
@@ -560,6 +559,11 @@ def _stream_layout(stream: Stream, device: str) -> tuple[str, Layout, dict[str, 
     if stream.kind == "odometry":
         once: dict[str, Any] = {"device": device, "frame_id": "odometry"}
         return f"/odometry/{device}", messages.ODOMETRY, once
+    if stream.kind == "imu":
+        return IMU_TOPIC_PREFIX + device, messages.IMU, {"device": device}
+    if stream.kind == "poses":
+        once = {"device": device, "frame_id": "onboard"}
+        return f"/onboard_track/{device}", messages.POSES, once
     if stream.kind == "readings":
         once = {"device": device, "names": stream.names}
         return f"/readings/{device}", messages.readings(len(stream.names)), once

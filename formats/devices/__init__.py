@@ -84,6 +84,7 @@ DEVICES = {
             115_200,
             "locatk.formats.devices.locatk_frames.decoder:FrameDecoder",
             "locatk.formats.devices.locatk_frames.decoder:encode",
+            "locatk.formats.artifacts.receiver:deck_artifacts",
         ),
         Device(
             "polaris-array",

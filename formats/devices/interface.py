@@ -19,7 +19,17 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.polaris.array import Samples
 from locatk.core.trajectory import Trajectory
 
-KINDS = ("magnetometers", "halls", "lighthouse", "captures", "odometry", "readings", "log")
+KINDS = (
+    "magnetometers",
+    "halls",
+    "lighthouse",
+    "captures",
+    "odometry",
+    "imu",
+    "poses",
+    "readings",
+    "log",
+)
 """Kinds of records; :mod:`locatk.formats.capture.ingestion` converts each to messages."""
 
 
@@ -33,10 +43,13 @@ class Ticks:
         Nominal frequency.
     bits : int
         Width; the counter wraps after ``2**bits`` ticks.
+    name : str
+        Name of the counter, if a device has several; ``""`` for its main one.
     """
 
     hz: float
     bits: int = 64
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,7 +63,8 @@ class Stream:
     node : str
         Name of the device behind the port; ``""`` if there is only one.
     sensors : int
-        Number of sensors, of ``magnetometers`` and ``halls``.
+        Number of sensors, of ``magnetometers`` and ``halls``, and of ``lighthouse`` if the device
+        is a Lighthouse deck.
     names : tuple of str
         Names of the values, of ``readings``; names of the sensors, of ``halls``, if the device
         sends them.
@@ -91,6 +105,11 @@ class Batch:
             ``locatk.LighthouseCapture``.
         ``odometry``
             ``x_m``, ``y_m``, ``heading_rad``.
+        ``imu``
+            ``acceleration_m_s2``, ``angular_rate_rad_s`` (n, 3), as in
+            :class:`locatk.core.inertial.InertialSamples`; NaN if a sensor was not sampled.
+        ``poses``
+            ``position_m`` (n, 3), ``quaternion_xyzw`` (n, 4): poses that the device estimates.
         ``readings``
             ``value`` (n, len(names)) float64.
         ``log``

@@ -53,7 +53,7 @@ SENSOR_COUNT = 4
 TICKS_PER_COUNT = 4
 SYNC_FRAME = b"\xff" * FRAME_BYTES
 SYNC_INTERVAL_NS = 500_000_000
-STREAM = Stream("lighthouse", ticks=Ticks(24e6, 24))
+STREAM = Stream("lighthouse", sensors=SENSOR_COUNT, ticks=Ticks(24e6, 24))
 
 MAX_GAP_TICKS = 10_000
 """Between pulses of one passage (crazyflie-firmware ``pulse_processor_v2.c``)."""

@@ -37,21 +37,26 @@ FORMER_MODEL_NOTE = (
 """Wording of :data:`MODEL_NOTE` in scenes of earlier versions."""
 
 LEVEL_FRAME_HINT = (
-    "Fix the frame by points of the floor: locatk calibrate scene SESSION --origin NAME "
-    "--x-axis NAME --floor NAME, or give three or more markers"
+    "Fix the frame by points of the floor on which a device rested: locatk calibrate scene SESSION "
+    "--floor, or give three or more markers"
 )
 
 
 def describe_frame_fault(scene: Scene) -> str | None:
     """Return why the frame of a scene with stations is not level on the floor, or None if it is.
 
-    Level are frames of markers, of planar scenes with stations above their floor, and of a
-    Crazyflie's configuration. Other frames in space have the axes of a station.
+    Level are frames of markers, of points on the floor, of planar scenes with stations above their
+    floor, and of a Crazyflie's configuration. Other frames in space have the axes of a station, or
+    their origin in it.
     """
     if scene.planar:
         if all(station.position[2] < scene.floor_z for station in scene.stations):
             return f"z of the frame {scene.frame!r} points down: all stations are below the floor"
         return None
+    if scene.frame_source in ("markers", "floor"):
+        return None
+    if scene.frame_source == "gravity":
+        return f"the origin of the frame {scene.frame!r} is not known to be on the floor"
     if scene.scale == "markers" or scene.frame == FRAME:
         return None
     return f"the frame {scene.frame!r} is not level: nothing relates its axes to the floor"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import StationReport, Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -33,6 +34,9 @@ class ImportedSession:
         Layout of the photodiodes of each device.
     lost : str or None
         Summary of the losses in one line. If there are any, the exit status is 3.
+    imu : tuple of InertialSamples
+    onboard : tuple of Trajectory
+        Poses that the devices estimated themselves, for comparison.
     """
 
     sweeps: Sweeps
@@ -43,3 +47,5 @@ class ImportedSession:
     stations: tuple[StationReport, ...] = ()
     receivers: Mapping[str, Receiver] = field(default_factory=dict)
     lost: str | None = None
+    imu: tuple[InertialSamples, ...] = ()
+    onboard: tuple[Trajectory, ...] = ()

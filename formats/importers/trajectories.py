@@ -14,7 +14,7 @@ from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.importers.tum import TUM_COLUMNS, read_tum
 
 Kind = Literal["solution", "session", "tum", "kitti", "csv"]
-Role = Literal["estimate", "truth"]
+Role = Literal["estimate", "truth", "onboard"]
 
 EVO_KINDS = ("tum", "kitti")
 """Formats that evo reads too; poses of two such files are associated as in evo."""
@@ -66,7 +66,7 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
         or KITTI (twelve).
     role : str
         For a file with solved poses and truth: ``"estimate"`` reads the poses, ``"truth"`` the
-        truth.
+        truth. ``"onboard"`` reads the poses of a session that its devices estimated themselves.
 
     Raises
     ------
@@ -81,6 +81,12 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
     head = read_head(path, HEAD_BYTES)
     if head.startswith(MCAP_MAGIC):
         return _read_mcap(path, role)
+    if role == "onboard":
+        raise InputError(
+            "not a session: only sessions have on-board poses",
+            file=path,
+            hint="Give a session of `locatk import crazyflie-usd`, or omit --onboard",
+        )
     kind = _kind_of_text(path, head)
     if kind == "csv":
         return TrajectoryFile(path, kind, read_csv(path), True)
@@ -134,6 +140,8 @@ def _read_mcap(path: Path, role: Role) -> TrajectoryFile:
     has_poses = session.topics("/solution/", "locatk.PoseTrack") or session.topics(
         "/pose/", "foxglove.PoseInFrame"
     )
+    if role == "onboard":
+        return TrajectoryFile(path, kind, read_trajectories(path, "onboard"), True)
     solved = kind == "solution" or (role == "estimate" and bool(has_poses))
     trajectories = read_trajectories(path, "solution" if solved else "truth")
     return TrajectoryFile(path, kind, trajectories, solved)

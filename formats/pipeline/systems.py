@@ -16,15 +16,27 @@ from typing import Any
 
 from locatk.core import dots, landmarks, lighthouse, polaris
 from locatk.core.errors import FormatError, InputError, LocatkError
+from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.levelling import inertial_ups, level_solution
+from locatk.core.lighthouse.scene.setup import (
+    AssignedStandstill,
+    SceneSetup,
+    add_to_prior,
+    assign_standstills,
+    place_on_floor,
+    with_standstills,
+)
+from locatk.core.lighthouse.scene.standstills import find_standstills
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution, SolverWarning
 from locatk.formats.artifacts import maps, scene, sheets, tags
 from locatk.formats.artifacts.registry import ARTIFACTS
 from locatk.formats.artifacts.schema import read_format
+from locatk.formats.pipeline.scene_merging import merge_scenes
 from locatk.formats.sessions import observations, station_reports
 from locatk.formats.sessions.reader import Session
 
@@ -55,6 +67,8 @@ class SolveRequest:
         Landmarks: random walk of the heading by odometry [deg/sqrt(m)].
     odometry_lag : float, optional
         Landmarks: time by which odometry is later than the hall sensors [ms].
+    setup : SceneSetup, optional
+        Lighthouse: points at which a device rested, found by its standstills.
     """
 
     method: str | None = None
@@ -66,6 +80,7 @@ class SolveRequest:
     tag: tuple[Path, ...] | None = None
     odometry_noise: float | None = None
     odometry_lag: float | None = None
+    setup: SceneSetup | None = None
 
 
 @dataclass(frozen=True)
@@ -138,21 +153,38 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     """Read sweeps, scene, reports of the stations, receivers and odometry."""
     sweeps = observations.read_sweeps(session)
     given = None if request.artifact is None else scene.read_scene(request.artifact)
-    # Factory calibrations and ids that the stations sent replace those of the scene.
+    own = observations.read_scene(session)
+    known, conflicts = (own, []) if given is None else merge_scenes(given, own)
     reports = observations.read_station_reports(session)
-    known = given or observations.read_scene(session)
+    if not reports:
+        reports, warnings = report_stations(sweeps)
+        conflicts += warnings
     initial = station_reports.add_station_data(known, reports) or Scene()
     odometry = observations.read_odometry(session)
+    imus = observations.read_imu(session)
     receivers = _rigid_devices(sweeps, observations.read_receivers(session))
     more: dict[str, Any] = {"receivers": receivers} if receivers else {}
     options = _solver_options(lighthouse.SolveOptions, method=request.method, scene=request.scene)
-    conflicts = tuple(
+    conflicts += [
         SolverWarning("other_station_id", message)
         for message in station_reports.describe_unknown_stations(initial, reports)
-    )
+    ]
 
     def solve() -> Solution:
-        solution = lighthouse.solve(sweeps, initial, options, odometry=odometry, **more)
+        setup, prior = request.setup, initial
+        rests: tuple[AssignedStandstill, ...] = ()
+        standstills = find_standstills(sweeps) if setup is not None or imus else []
+        if setup is not None:
+            rests = assign_standstills(setup, standstills)
+            prior = add_to_prior(initial, setup, rests, is_rigid=bool(receivers))
+        solution = lighthouse.solve(sweeps, prior, options, odometry=odometry, **more)
+        if setup is not None and setup.has_floor:
+            ups = inertial_ups(imus, solution.trajectories, standstills)
+            solution = place_on_floor(solution, setup, rests, prior, ups)
+        ups = inertial_ups(imus, solution.trajectories, standstills)
+        solution = level_solution(solution, prior, ups)
+        if rests:
+            solution = with_standstills(solution, rests)
         return replace(solution, warnings=(*conflicts, *solution.warnings))
 
     return solve
@@ -254,7 +286,7 @@ SYSTEMS: dict[str, Solver] = {
         System(
             "lighthouse",
             ("bundle", "paper"),
-            ("scene",),
+            ("scene", "setup"),
             _prepare_lighthouse,
             estimates_scene=True,
         ),

@@ -32,7 +32,13 @@ from locatk.formats.sessions import capture_record
 from locatk.formats.sessions.field_samples import read_halls, read_magnetometers
 from locatk.formats.sessions.frames import read_frames
 from locatk.formats.sessions.inertial import imu_streams, read_imu
-from locatk.formats.sessions.messages import MAX_BATCH_NS, SWEEPS, TimedMessage, batch_edges
+from locatk.formats.sessions.messages import (
+    MAX_BATCH_NS,
+    SWEEPS,
+    Batches,
+    TimedMessage,
+    batch_edges,
+)
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution, read_trajectories, write_solution
 from locatk.formats.sessions.station_reports import (
@@ -41,8 +47,10 @@ from locatk.formats.sessions.station_reports import (
     station_records,
 )
 from locatk.formats.sessions.trajectories import (
+    onboard_messages,
     read_batches,
     read_odometry,
+    read_onboard,
     read_truth,
     reference_streams,
     write_streams,
@@ -58,6 +66,7 @@ __all__ = [
     "read_manifest",
     "read_map",
     "read_odometry",
+    "read_onboard",
     "read_receivers",
     "read_scene",
     "read_solution",
@@ -67,6 +76,7 @@ __all__ = [
     "read_trajectories",
     "read_truth",
     "sweep_messages",
+    "sweeps_of_batches",
     "write_session",
     "write_solution",
     "write_sweeps",
@@ -104,13 +114,19 @@ def read_sweeps(session: Session) -> Sweeps:
             file=session.path,
             hint=_describe_topics(session),
         )
-    batches = read_batches(session, topics, SWEEPS)
+    sweeps = sweeps_of_batches(read_batches(session, topics, SWEEPS))
+    _check_ranges(sweeps, session.path)
+    return sweeps
+
+
+def sweeps_of_batches(batches: Batches) -> Sweeps:
+    """Return the sweeps of unpacked messages, in their order."""
     names = batches.texts["device"]
     devices = tuple(dict.fromkeys(names))
     numbers = {name: number for number, name in enumerate(devices)}
     device = np.array([numbers[name] for name in names], np.int32).repeat(batches.counts)
     columns = batches.columns
-    sweeps = Sweeps(
+    return Sweeps(
         devices=devices,
         time_ns=columns["time_ns"],
         device=device,
@@ -120,8 +136,6 @@ def read_sweeps(session: Session) -> Sweeps:
         sweep=columns["sweep"],
         count=columns["count"],
     )
-    _check_ranges(sweeps, session.path)
-    return sweeps
 
 
 def _check_ranges(sweeps: Sweeps, path: str | None) -> None:
@@ -197,6 +211,7 @@ def write_session(
     truth: Sequence[Trajectory] = (),
     odometry: Sequence[Trajectory] = (),
     imu: Sequence[InertialSamples] = (),
+    onboard: Sequence[Trajectory] = (),
     scene: Scene | None = None,
     facts: Mapping[str, object] | None = None,
     stations: Sequence[StationReport] = (),
@@ -220,6 +235,9 @@ def write_session(
         The planar part (x, y, heading) is written on ``/odometry/<device>``.
     imu : sequence of InertialSamples
         Accelerometer and gyroscope, on ``/imu/<device>``.
+    onboard : sequence of Trajectory
+        Poses that the devices estimated themselves, on ``/onboard_track/<device>`` and for viewers
+        on ``/onboard/<device>``. They are for comparison: solvers do not use them.
     scene : Scene, optional
         Attached as ``scene.toml``.
     facts : mapping, optional
@@ -246,7 +264,12 @@ def write_session(
     scene = add_station_data(scene, stations)
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
     receiver_texts = receiver_attachments(receivers or {}, devices)
-    streams = [sweep_messages(sweeps), *reference_streams(truth, odometry), *imu_streams(imu)]
+    streams = [
+        sweep_messages(sweeps),
+        *reference_streams(truth, odometry),
+        *imu_streams(imu),
+        *onboard_messages(onboard),
+    ]
     with SessionWriter(path, system=system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if scene is not None:

@@ -32,6 +32,7 @@ from locatk.formats.sessions.messages import TimedMessage
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import (
     check_devices,
+    read_onboard,
     read_poses,
     read_tracks,
     read_truth,
@@ -249,30 +250,39 @@ def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[
     ----------
     path : path
         An MCAP file.
-    kind : {"auto", "solution", "truth"}
+    kind : {"auto", "solution", "truth", "onboard"}
         Solved poses (``/solution/``, else ``PoseInFrame`` on ``/pose/``), reference
-        poses (``/truth``), or the first of them that exists.
+        poses (``/truth``), or the first of them that exists; or the poses that the devices
+        estimated themselves (``/onboard_track/``).
 
     Raises
     ------
     FormatError
         There are none of this kind.
     """
-    if kind not in ("auto", "solution", "truth"):
+    if kind not in ("auto", "solution", "truth", "onboard"):
         raise ValueError(f"kind is {kind!r}")
     session = Session.open(path)
     found: list[Trajectory] = []
-    if kind != "truth":
+    if kind == "onboard":
+        found = read_onboard(session)
+    elif kind != "truth":
         found = read_tracks(session, "/solution/") or read_poses(session, "/pose/")
-    if not found and kind != "solution":
+    if not found and kind in ("auto", "truth"):
         found = read_truth(session)
     if not found:
         hints = {
             "auto": "Solve it first: `locatk solve`",
             "solution": "Solve it first: `locatk solve`",
             "truth": "Import it with its reference: `locatk import ... --truth`",
+            "onboard": "Log stateEstimate on the device, and import the log",
         }
-        what = {"auto": "poses", "solution": "solved poses", "truth": "reference poses"}[kind]
+        what = {
+            "auto": "poses",
+            "solution": "solved poses",
+            "truth": "reference poses",
+            "onboard": "on-board poses",
+        }[kind]
         raise FormatError(f"no {what}", file=path, hint=hints[kind])
     return sorted(found, key=lambda trajectory: trajectory.device)
 

@@ -15,6 +15,7 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.recording import StationReport
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.gravity import up_from_acceleration
 from locatk.formats.artifacts.scene import attached_scene
 from locatk.formats.sessions.reader import Session
 
@@ -32,6 +33,9 @@ def station_record(station: StationReport) -> dict[str, str]:
         "period_ticks": None if station.period_ticks is None else repr(float(station.period_ticks)),
         **{key: getattr(station, key) for key in _COUNTS},
         "calibration": None if station.calibration is None else station.calibration.source,
+        "acceleration": None
+        if station.acceleration is None
+        else " ".join(map(str, station.acceleration)),
     }
     return {key: str(value) for key, value in values.items() if value is not None}
 
@@ -58,20 +62,27 @@ def station_records(stations: Sequence[StationReport]) -> dict[str, dict[str, st
 
 
 def add_station_data(scene: Scene | None, stations: Sequence[StationReport]) -> Scene | None:
-    """Add the calibrations and serial numbers that stations transmitted to ``scene``.
+    """Add the calibrations, serial numbers and directions that stations sent to ``scene``.
 
     Those that the scene already has for a channel are kept. Returns ``scene`` itself if there is
     nothing to add.
     """
     calibrations = {each.channel: each.calibration for each in stations if each.calibration}
     ids = {each.channel: each.id for each in stations if each.id is not None}
-    if not calibrations and not ids:
+    ups = {
+        each.channel: up
+        for each in stations
+        if each.acceleration is not None
+        and (up := up_from_acceleration(each.acceleration)) is not None
+    }
+    if not calibrations and not ids and not ups:
         return scene
     scene = scene or Scene()
     return replace(
         scene,
         calibrations={**calibrations, **scene.calibrations},
         ids={**ids, **scene.ids},
+        ups={**ups, **scene.ups},
     )
 
 
@@ -141,6 +152,15 @@ def _parse_record(
             if not re.fullmatch("[0-9]{1,18}", text, re.ASCII):
                 raise ValueError(f"{key} {text[:20]!r} is no count")
             counts[key] = int(text)
+    acceleration = None
+    if "acceleration" in record:
+        # Signed bytes, which the station scales so that the largest is 127.
+        stated = record["acceleration"][:20]
+        match = re.fullmatch(r"(-?\d{1,3}) (-?\d{1,3}) (-?\d{1,3})", stated, re.ASCII)
+        values = [] if match is None else [int(text) for text in match.groups()]
+        if not values or max(map(abs, values)) > 128:
+            raise ValueError(f"acceleration {stated!r} is not three signed bytes")
+        acceleration = (values[0], values[1], values[2])
     return StationReport(
         channel=int(channel),
         id=None if number is None else int(number, 16),
@@ -150,4 +170,5 @@ def _parse_record(
         calibration=calibrations.get(int(channel)) if "calibration" in record else None,
         frames=counts["frames"],
         damaged=counts["damaged"],
+        acceleration=acceleration,
     )

@@ -67,10 +67,26 @@ def _batched(
 
 def truth_messages(truth: Iterable[Trajectory]) -> list[Iterator[TimedMessage]]:
     """Return streams of reference poses: exact batches, and one message per pose for viewers."""
+    return _pose_streams("truth", truth)
+
+
+def onboard_messages(onboard: Sequence[Trajectory]) -> list[Iterator[TimedMessage]]:
+    """Return streams of the poses that devices estimated themselves, as :func:`truth_messages`.
+
+    Raises
+    ------
+    InputError
+        Two trajectories have the same device.
+    """
+    check_devices(onboard, "on-board")
+    return _pose_streams("onboard", onboard)
+
+
+def _pose_streams(kind: str, trajectories: Iterable[Trajectory]) -> list[Iterator[TimedMessage]]:
     streams = []
-    for trajectory in truth:
-        streams.append(track_messages(f"/truth_track/{trajectory.device}", trajectory))
-        streams.append(foxglove.poses(f"/truth/{trajectory.device}", trajectory))
+    for trajectory in trajectories:
+        streams.append(track_messages(f"/{kind}_track/{trajectory.device}", trajectory))
+        streams.append(foxglove.poses(f"/{kind}/{trajectory.device}", trajectory))
     return streams
 
 
@@ -129,6 +145,11 @@ def read_truth(session: Session) -> list[Trajectory]:
     exact = read_tracks(session, "/truth_track/")
     exact_topics = {f"/truth/{trajectory.device}" for trajectory in exact}
     return exact + read_poses(session, "/truth/", exact_topics)
+
+
+def read_onboard(session: Session) -> list[Trajectory]:
+    """Read the poses that the devices of a session estimated themselves; may be empty."""
+    return read_tracks(session, "/onboard_track/")
 
 
 def read_odometry(session: Session) -> list[Trajectory]:

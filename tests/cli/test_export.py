@@ -285,7 +285,7 @@ def test_a_tilted_frame_is_not_for_flight(locatk, scene: Scene, tmp_path: Path) 
     assert refused.exit_code == 1
     assert refused.stderr.count("\n") == 1
     assert f"{file}: the frame 'station-3' is not level" in refused.stderr
-    assert "--origin" in refused.stderr
+    assert "calibrate scene SESSION --floor" in refused.stderr
     assert not out.exists()
     assert locatk(*export, "--frame", "as-is").stderr.startswith("Warning: not for flight: the fra")
     assert "# NOT FOR FLIGHT: the frame 'station-3' is not level" in out.read_text()

@@ -134,8 +134,8 @@ class FactoryData:
     unlock_count : int
         Number of times its rotor lost synchronization.
     acceleration : tuple of 3 int
-        Orientation of the station: signed bytes in an undocumented unit. The second is 127 if
-        the station is upright.
+        Direction against gravity in the axes x right, y up, z back: signed bytes, scaled so that
+        the largest is 127 (see :func:`locatk.core.lighthouse.scene.gravity.up_from_acceleration`).
     faults : int
         0 if there are none.
     nonce : int

@@ -369,7 +369,7 @@ def _report_station(
         warnings.append(SolverWarning("station_restarted", message))
     frames = decode_frames(slow_bits(sweeps.tick[rows], sweeps.polynomial[rows], rotor))
     valid_frames = [frame for frame in frames if frame.is_valid]
-    data, data_warnings = _latest_factory_data(channel, valid_frames)
+    data, data_warnings = latest_factory_data(channel, valid_frames)
     report = StationReport(
         channel,
         id=None if data is None else data.id,
@@ -382,11 +382,12 @@ def _report_station(
         calibration=None if data is None else data.calibration,
         frames=len(valid_frames),
         damaged=len(frames) - len(valid_frames),
+        acceleration=None if data is None else data.acceleration,
     )
     return report, warnings + data_warnings
 
 
-def _latest_factory_data(
+def latest_factory_data(
     channel: int, frames: Sequence[OotxFrame]
 ) -> tuple[FactoryData | None, list[SolverWarning]]:
     """Decode the latest usable frame of a station, and check its channel."""
@@ -426,7 +427,11 @@ def slow_bits(tick: Array, polynomial: Int, rotor: Rotor) -> NDArray[np.int8]:
     """
     rotation, _ = rotor.rotation_and_phase(tick)
     step = np.clip(np.diff(rotation, prepend=rotation[0]), 0, MAX_SLOW_BIT_GAP_ROTATIONS)
-    rotation = np.cumsum(step)
+    return vote_slow_bits(np.cumsum(step), polynomial)
+
+
+def vote_slow_bits(rotation: NDArray[np.int64], polynomial: Int) -> NDArray[np.int8]:
+    """Return the slow bit of each rotation from 0 on, by the majority of its sweeps (n,)."""
     votes = np.bincount(rotation, np.where(slow_bit_of(polynomial) > 0, 1, -1))
     has_sweep = np.bincount(rotation) > 0
     return np.where(has_sweep & (votes != 0), votes > 0, MISSING_BIT).astype(np.int8)

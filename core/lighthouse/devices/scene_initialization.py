@@ -546,6 +546,7 @@ def _adjust_scene(
         floor_z=0.0,
         scale="device",
         frame=f"station-{channels[joined[0]]}",
+        frame_source="station",
         notes=tuple(warning.message for warning in warnings),
     )
     return DeviceSceneEstimate(estimated, facts, warnings)

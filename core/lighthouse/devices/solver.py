@@ -9,20 +9,16 @@ which are solved by other modules in the scene of the rigid devices.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import DegenerateError
-from locatk.core.geometry import (
-    Similarity,
-    quaternion_from_matrix,
-    quaternion_multiply,
-    transform_covariance,
-    umeyama,
-)
 from locatk.core.lighthouse.channels import period_ticks
+from locatk.core.lighthouse.devices.alignment import (
+    align_to_markers,
+    alignment_warnings,
+)
 from locatk.core.lighthouse.devices.device_sweeps import (
     MIN_SENSORS,
     received_channels,
@@ -47,34 +43,14 @@ from locatk.core.lighthouse.results import (
     StationDetection,
     StationVerification,
 )
-from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
-from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M, unused_visits_warnings
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.frame import unused_visits_warnings
+from locatk.core.lighthouse.scene.reframing import transform_trajectory
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import Solution, SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
-MIN_MARKERS = 3
-"""Minimum number of visited markers that determine a frame."""
-
-
-@dataclass(frozen=True)
-class MarkerAlignment:
-    """Similarity transform from the frame of an estimated scene to that of its markers.
-
-    Attributes
-    ----------
-    transform : Similarity
-    misfit_m : float
-        Rms distance of the markers from the transformed positions of the devices, in metres.
-    visits : int
-        Number of visits during which a device has poses.
-    """
-
-    transform: Similarity
-    misfit_m: float
-    visits: int
 
 
 def select_rigid_receivers(
@@ -142,12 +118,17 @@ def solve_devices(
     solved = estimate.scene
     if not scene.stations and scene.markers:
         alignment = align_to_markers(scene.markers, trajectories)
-        warnings.extend(_alignment_warnings(alignment))
+        warnings.extend(alignment_warnings(alignment))
         if alignment is not None:
             transform = alignment.transform
-            solved = _transform_scene(solved, transform, scene.frame)
+            solved = replace(
+                solved.transformed(transform),
+                frame=scene.frame,
+                scale="markers",
+                frame_source="markers",
+            )
             trajectories = tuple(
-                _transform_trajectory(t, transform, scene.frame) for t in trajectories
+                transform_trajectory(t, transform, scene.frame) for t in trajectories
             )
             warnings.extend(unused_visits_warnings(scene.markers, alignment.visits))
             facts = replace(facts, marker_misfit_m=alignment.misfit_m, marker_scale=transform.scale)
@@ -292,78 +273,6 @@ def _tracking_facts(
     )
 
 
-# ---- markers
-
-
-def align_to_markers(
-    markers: Sequence[Marker], trajectories: Sequence[Trajectory]
-) -> MarkerAlignment | None:
-    """Estimate the transform from devices that rested on markers to the frame of the markers.
-
-    It includes the scale: markers are farther from each other than the photodiodes of a device.
-    None if fewer than ``MIN_MARKERS`` visits have a pose, or if they are collinear.
-    """
-    marker_positions, device_positions = [], []
-    for marker in markers:
-        for visit in marker.visits:
-            position = _visit_position(visit, trajectories)
-            if position is not None:
-                marker_positions.append(marker.position)
-                device_positions.append(position)
-    if len(marker_positions) < MIN_MARKERS:
-        return None
-    try:
-        transform = umeyama(np.stack(device_positions), np.stack(marker_positions))
-    except DegenerateError:
-        return None
-    offset = transform.apply(device_positions) - marker_positions
-    misfit_m = float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
-    return MarkerAlignment(transform, misfit_m, len(marker_positions))
-
-
-def _visit_position(visit: MarkerVisit, trajectories: Sequence[Trajectory]) -> Array | None:
-    """Return the median position (3,) of a device during a visit; None without a pose."""
-    for trajectory in trajectories:
-        if trajectory.device == visit.device:
-            start_ns, end_ns = visit.start_ns or 0, visit.end_ns or 0
-            is_inside = (trajectory.time_ns >= start_ns) & (trajectory.time_ns <= end_ns)
-            if np.any(is_inside):
-                return np.asarray(np.median(trajectory.position[is_inside], axis=0))
-    return None
-
-
-def _transform_scene(scene: Scene, transform: Similarity, frame: str) -> Scene:
-    """Transform the stations of a scene into the frame of its markers."""
-    stations = tuple(
-        replace(
-            station,
-            position=transform.apply(station.position),
-            rotation=transform.rotation @ station.rotation,
-            covariance=None
-            if station.covariance is None
-            else transform_covariance(station.covariance, transform.scale, transform.rotation),
-        )
-        for station in scene.stations
-    )
-    return replace(scene, stations=stations, frame=frame, scale="markers")
-
-
-def _transform_trajectory(trajectory: Trajectory, transform: Similarity, frame: str) -> Trajectory:
-    """Transform a trajectory into another frame.
-
-    The distances of the photodiodes on the device do not change: the scale differs from 1 by less
-    than 1 %, or a warning reports that the markers do not fit.
-    """
-    rotation = quaternion_from_matrix(transform.rotation)
-    return replace(
-        trajectory,
-        frame=frame,
-        position=transform.apply(trajectory.position),
-        quaternion=quaternion_multiply(rotation, trajectory.quaternion),
-        covariance=transform_covariance(trajectory.covariance, transform.scale, transform.rotation),
-    )
-
-
 # ---- warnings
 
 
@@ -417,26 +326,6 @@ def contradiction_warnings(
             "stations: it was moved after the scene was estimated, or received by reflection",
         )
     ]
-
-
-def _alignment_warnings(alignment: MarkerAlignment | None) -> list[SolverWarning]:
-    if alignment is None:
-        return [
-            SolverWarning(
-                "too_few_markers",
-                f"a device rested on fewer than {MIN_MARKERS} markers that are not on one line: "
-                "the frame is not that of the markers",
-            )
-        ]
-    if alignment.misfit_m > MAX_MARKER_MISFIT_M:
-        return [
-            SolverWarning(
-                "marker_misfit",
-                f"the markers are {1e3 * alignment.misfit_m:.0f} mm (rms) from the positions of "
-                "the device on them: a marker was measured wrong, or the scene is wrong",
-            )
-        ]
-    return []
 
 
 def _scale_warnings(scene: Scene) -> list[SolverWarning]:

@@ -335,6 +335,7 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
         scale,
         prior.frame,
         tuple(warning.message for warning in warnings),
+        frame_source="markers" if scale == "markers" else "station",
     )
     return Solution(
         "lighthouse",

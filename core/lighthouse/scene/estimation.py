@@ -274,7 +274,9 @@ def _estimate_one_station(epochs: Epochs, prior: Scene, *, may_be_in_space: bool
     )
     state = adjustment.state
     raised = replace(state, positions=state.positions + np.array([0.0, 0.0, floor_z]))
-    framed = FramedState(raised, adjustment.station_covariance, floor_z, "markers", prior.frame)
+    framed = FramedState(
+        raised, adjustment.station_covariance, floor_z, "markers", prior.frame, "markers"
+    )
     warnings = (
         *generic_calibration_warnings(epochs.channels.tolist(), state.calibrations),
         *unused_visits_warnings(prior.markers, len(marker_points)),
@@ -393,6 +395,7 @@ def _estimate_several_stations(
         sigma=MODEL_SIGMA_RAD,
         planar=planar,
         marker_misfit=misfit_of_markers if prior.markers else None,
+        ups=np.array([prior.ups.get(int(c), np.full(3, np.nan)) for c in epochs.channels]),
         seed=seed,
     )
     stations = list(estimate.stations)
@@ -522,6 +525,7 @@ def _build_scene(
         framed.scale,
         framed.frame,
         tuple(warning.message for warning in warnings),
+        frame_source=framed.frame_source,
     )
 
 
@@ -566,6 +570,7 @@ def estimate_stations(
     sigma: float,
     planar: bool | None = None,
     marker_misfit: MarkerMisfit | None = None,
+    ups: Array | None = None,
     seed: int = 0,
 ) -> StationsEstimate:
     """Estimate two or more stations from angles alone.
@@ -583,6 +588,9 @@ def estimate_stations(
     marker_misfit : callable, optional
         Misfit of the markers in the state of two stations, given with their columns. It decides
         between the two decompositions of a homography.
+    ups : (s, 3) ndarray, optional
+        Direction against gravity in the axes of each station, ``nan`` if unknown. They decide if
+        the markers do not.
     seed : int
         Seed of the random samples: equal inputs and seeds give equal results.
 
@@ -612,6 +620,7 @@ def estimate_stations(
                     sigma=sigma,
                     planar=planar,
                     marker_misfit=marker_misfit,
+                    ups=ups,
                     seed=seed,
                 )
             except DegenerateError as error:

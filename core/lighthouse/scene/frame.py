@@ -60,7 +60,7 @@ class FramedState:
         As in :class:`~locatk.core.lighthouse.scene.bundle_adjustment.BundleAdjustment`.
     floor_z : float
         Height of the photodiodes in a planar scene, in metres.
-    scale, frame : str
+    scale, frame, frame_source : str
         As in :class:`~locatk.core.lighthouse.scene.model.Scene`.
     marker_misfit_m : float or None
         Rms residual of the markers; None for fewer than :data:`MIN_MARKERS_FOR_MISFIT`.
@@ -72,6 +72,7 @@ class FramedState:
     floor_z: float
     scale: str
     frame: str
+    frame_source: str
     marker_misfit_m: float | None = None
     warnings: tuple[SolverWarning, ...] = ()
 
@@ -128,6 +129,7 @@ def fix_gauge(
         0.0,
         source,
         prior.frame if planar else f"station-{epochs.channels[0]}",
+        "floor" if planar else "station",
         warnings=(*warnings, *scale_warnings),
     )
 
@@ -163,6 +165,7 @@ def _framed_by_markers(
         floor_z,
         "markers",
         prior.frame,
+        "markers",
         misfit if np.isfinite(misfit) else None,
         tuple(warnings),
     )

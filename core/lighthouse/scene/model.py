@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.geometry import Similarity, transform_covariance
 from locatk.core.lighthouse.calibration import Calibration
+
+FRAME_SOURCES = ("markers", "floor", "gravity", "station")
+"""Sources of the axes and the origin of a scene, see :attr:`Scene.frame_source`."""
+
+JOINT_PARAMETERS = 20
+"""Parameters of a station in :attr:`Scene.covariance`: position, rotation vector, calibration."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,8 @@ class Station:
         Homography from its rays (1, y, z) to floor points (1, x, y) in metres, if it is the only
         station and over a floor with markers
         (:func:`~locatk.core.lighthouse.scene.registration.fit_floor_homography`).
+    up : (3,) ndarray, optional
+        Unit vector against gravity in the axes of the station, from its accelerometer.
     """
 
     channel: int
@@ -43,6 +52,7 @@ class Station:
     id: int | None = None
     covariance: NDArray[np.float64] | None = None
     floor_map: NDArray[np.float64] | None = None
+    up: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -111,6 +121,21 @@ class Scene:
         unchanged.
     ids : dict of int to int
         By channel, serial numbers of stations that have yet to be estimated.
+    ups : dict of int to (3,) ndarray
+        By channel, ``Station.up`` of stations that have yet to be estimated.
+    frame_source : str or None
+        Source of the axes and the origin: ``"markers"``, ``"floor"`` (z = 0 is a floor, or a plane
+        at a known height above it), ``"gravity"`` (z is up; the origin is the first station, or the
+        level of the photodiodes is unknown) or ``"station"`` (the axes of the first station, which
+        are not level). None if unknown, as in files of older versions.
+    level_sigma_rad : float or None
+        Standard deviation of the inclination of the z axis against the vertical, or against the
+        floor if this is the source of the frame; about each horizontal axis. None if unknown.
+    covariance : (k, k) ndarray or None
+        Joint covariance of all stations, :data:`JOINT_PARAMETERS` each, in the order of
+        ``stations``: position (m), rotation vector in the frame of the scene (rad), and of the
+        first and then of the second sweep phase, tilt, curve, ``gibmag`` times cosine and sine of
+        ``gibphase``, ``ogeemag`` times cosine and sine of ``ogeephase``.
     """
 
     stations: tuple[Station, ...] = ()
@@ -123,10 +148,70 @@ class Scene:
     notes: tuple[str, ...] = ()
     calibrations: dict[int, Calibration] = field(default_factory=dict)
     ids: dict[int, int] = field(default_factory=dict)
+    ups: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    frame_source: str | None = None
+    level_sigma_rad: float | None = None
+    covariance: NDArray[np.float64] | None = None
+
+    @property
+    def is_on_floor(self) -> bool:
+        """True if the frame is that of markers or of a floor: z is up and 0 on the floor.
+
+        Scenes of older versions, which do not state the source of their frame, count if their scale
+        is that of markers.
+        """
+        source = self.frame_source or ("markers" if self.scale == "markers" else None)
+        return source in ("markers", "floor")
+
+    @property
+    def is_level(self) -> bool:
+        """True if z is up: on a floor, or levelled by gravity."""
+        return self.is_on_floor or self.frame_source == "gravity"
+
+    def transformed(self, to: Similarity) -> Scene:
+        """Return the scene with its stations, their covariances and its floor transformed.
+
+        Markers are kept: they are points in the frame that ``to`` leads to. Names and sources of
+        frame and scale are those of the caller. A homography of the floor is dropped if ``to``
+        tilts the floor.
+        """
+        stations = tuple(
+            replace(
+                station,
+                position=to.apply(station.position),
+                rotation=to.rotation @ station.rotation,
+                covariance=None
+                if station.covariance is None
+                else transform_covariance(station.covariance, to.scale, to.rotation),
+                floor_map=_transform_floor_map(station.floor_map, to),
+            )
+            for station in self.stations
+        )
+        covariance = self.covariance
+        if covariance is not None:
+            own = np.eye(JOINT_PARAMETERS)
+            own[0:3, 0:3], own[3:6, 3:6] = to.scale * to.rotation, to.rotation
+            jacobian = np.kron(np.eye(len(stations)), own)
+            covariance = jacobian @ covariance @ jacobian.T
+        floor_z = self.floor_z
+        if self.planar:
+            floor_z = float(to.scale * floor_z + to.translation[2])
+        return replace(self, stations=stations, covariance=covariance, floor_z=floor_z)
 
     def station(self, channel: int) -> Station | None:
         """Return the station on ``channel``, or None."""
         return next((s for s in self.stations if s.channel == channel), None)
+
+
+def _transform_floor_map(
+    floor_map: NDArray[np.float64] | None, to: Similarity
+) -> NDArray[np.float64] | None:
+    """Return the homography to floor points (1, x, y) in the transformed frame."""
+    if floor_map is None or not np.allclose(to.rotation[2], [0.0, 0.0, 1.0], atol=1e-12):
+        return None
+    to_floor = np.eye(3)
+    to_floor[1:, 0], to_floor[1:, 1:] = to.translation[:2], to.scale * to.rotation[:2, :2]
+    return np.asarray(to_floor @ floor_map)
 
 
 StationArrays = tuple[NDArray[np.float64], NDArray[np.float64], tuple[Calibration, ...]]

@@ -23,6 +23,7 @@ from locatk.core.lighthouse.scene.bundle_adjustment import (
     BundleState,
     adjust_bundle,
 )
+from locatk.core.lighthouse.scene.gravity import MAX_UP_CHI2, MIN_UP_CHI2_GAP, up_chi2
 from locatk.core.lighthouse.scene.keyframes import (
     MIN_RAY_SEPARATION_RAD,
     require_distinct_positions,
@@ -105,7 +106,7 @@ class TwoViewFacts:
     candidates : tuple of TwoViewCandidate or None
         Refined candidates on a plane; None in space.
     candidate_decided_by : str or None
-        ``"markers"`` if these chose the candidate.
+        ``"markers"`` or ``"gravity"`` if these chose the candidate.
     """
 
     plane_fraction: float
@@ -159,6 +160,7 @@ def estimate_station_pair(
     sigma: float,
     planar: bool | None = None,
     marker_misfit: MarkerMisfit | None = None,
+    ups: Array | None = None,
     seed: int = 0,
 ) -> StationPair:
     """Estimate the relative pose of two stations from their common keyframes.
@@ -173,7 +175,7 @@ def estimate_station_pair(
         One per station.
     columns : (int, int)
         Columns of the two stations.
-    sigma, planar, marker_misfit, seed
+    sigma, planar, marker_misfit, ups, seed
         As for :func:`~locatk.core.lighthouse.scene.estimation.estimate_stations`.
 
     Raises
@@ -211,7 +213,13 @@ def estimate_station_pair(
         )
     inliers = common[is_inlier]
     best, tried, decided_by = _choose_candidate(
-        angles[inliers][:, [i, j]], candidates, planar, sigma, marker_misfit, (i, j)
+        angles[inliers][:, [i, j]],
+        candidates,
+        planar,
+        sigma,
+        marker_misfit,
+        (i, j),
+        None if ups is None else ups[[i, j]],
     )
     facts = TwoViewFacts(plane_fraction, plane_median, tried if planar else None, decided_by)
     return StationPair((i, j), best, inliers, planar, facts)
@@ -529,15 +537,18 @@ def _choose_candidate(
     sigma: float,
     marker_misfit: MarkerMisfit | None,
     columns: tuple[int, int],
+    ups: Array | None = None,
 ) -> tuple[BundleAdjustment, tuple[TwoViewCandidate, ...], str | None]:
     """Refine the candidates and choose the one that explains the angles best.
 
     A homography has two valid decompositions, which predict the same angles without noise. Only
-    other knowledge decides between them: the markers, or else that stations are mounted upright,
-    with little roll (the conditions of the Lighthouse paper on the signs of n and t state the
-    same).
+    other knowledge decides between them: the markers, the accelerometers of the stations (``ups``,
+    (2, 3) in their axes, ``nan`` if unknown) on a level floor, or else that stations are mounted
+    upright, with little roll (the conditions of the Lighthouse paper on the signs of n and t state
+    the same).
 
-    Returns the chosen adjustment, the figures of all, and ``"markers"`` if these decided.
+    Returns the chosen adjustment, the figures of all, and ``"markers"`` or ``"gravity"`` if these
+    decided.
     """
     rows = np.unique(np.linspace(0, len(angles) - 1, MAX_CANDIDATE_KEYFRAMES).astype(int))
     refined: list[tuple[float, float, BundleAdjustment]] = []
@@ -571,6 +582,16 @@ def _choose_candidate(
         if misfits[order[0]] < MAX_MARKER_MISFIT_RATIO * misfits[order[1]]:
             chosen = fitting[int(order[0])][2]
             decided_by = "markers"
+    if planar and ups is not None and len(fitting) > 1 and decided_by is None:
+        directions = [
+            np.einsum("kij,kj->ki", adjustment.state.rotations, ups) for _, _, adjustment in fitting
+        ]
+        chi2 = [up_chi2(each, np.array([0.0, 0.0, 1.0])) for each in directions]
+        order = np.argsort(chi2)
+        max_chi2 = MAX_UP_CHI2 * np.count_nonzero(np.isfinite(ups).all(axis=1))
+        if chi2[order[0]] <= max_chi2 and chi2[order[1]] - chi2[order[0]] > MIN_UP_CHI2_GAP:
+            chosen = fitting[int(order[0])][2]
+            decided_by = "gravity"
     figures = tuple(
         TwoViewCandidate(
             float(cost), float(np.degrees(roll)), bool(cost <= max_cost), adjustment is chosen

@@ -125,6 +125,7 @@ class FrameDecoder:
         self.remarks: list[str] = []
         self._deframer = Deframer(self.counts)
         self._nodes: dict[int, _Node] = {}
+        self._pulses = self._unused = 0
 
     def feed(self, data: bytes, *, pause: bool = False) -> list[Batch]:
         """Return the records of the frames that these bytes complete; pauses are not used."""
@@ -151,6 +152,11 @@ class FrameDecoder:
                     f"{_node_name(number)} did not send its tick rate, which is assumed to be "
                     f"{TICK_HZ} Hz"
                 )
+        if self._unused:
+            self.remarks.append(
+                f"{self._unused} of {self._pulses} pulses of the Lighthouse deck are in no sweep: "
+                "their passage has no offset, or they are of another one"
+            )
         return []
 
     def _records(self, contents: Contents) -> list[Batch]:
@@ -169,6 +175,7 @@ class FrameDecoder:
                 valid[group] = False if block is None else block.valid
                 if block is not None:
                     pieces += _split(block, group, sources, contents, heads)
+                    self._count_pulses(block)
         self.counts.frames += int(valid.sum())
         self.counts.bad += int((~valid).sum())
         self.counts.skipped += int(contents.wire[~valid].sum())
@@ -177,6 +184,12 @@ class FrameDecoder:
         for piece in pieces:
             streams.setdefault(piece.stream, []).append(piece)
         return [batch for several in streams.values() for batch in _merged(several)]
+
+    def _count_pulses(self, block: Block) -> None:
+        """Count the pulses of a Lighthouse deck, and those without a sweep."""
+        if block.is_present is not None:
+            self._pulses += int(np.count_nonzero(block.is_present[block.valid])) + block.unused
+            self._unused += block.unused
 
     def _count_lost(self, heads: NDArray[np.void]) -> NDArray[np.bool_]:
         """Count the missing sequence numbers; return which frames are the restart of a device."""
@@ -300,18 +313,22 @@ def _split(
     batches = []
     for index in np.unique(sources.of[frames[block.valid]]).tolist():
         number, ticks = sources.known[index]
-        which = np.flatnonzero(block.valid & (sources.of[frames] == index))
-        each = block.tick.shape[1]
+        is_chosen = (block.valid & (sources.of[frames] == index))[:, None]
+        if block.is_present is not None:
+            is_chosen = is_chosen & block.is_present
+        frame, record = np.nonzero(np.broadcast_to(is_chosen, block.tick.shape))
+        if not len(frame):
+            continue
+        stream_ticks = block.ticks or ticks
         batches.append(
             Batch(
-                Stream(block.kind, str(number) if number else "", block.sensors, ticks=ticks),
-                np.repeat(contents.end[frames[which]], each),
-                {
-                    name: column[which].reshape(-1, *column.shape[2:])
-                    for name, column in block.columns.items()
-                },
-                block.tick[which].ravel(),
-                np.repeat(heads["sequence"][frames[which]].astype(np.int64), each),
+                Stream(
+                    block.kind, str(number) if number else "", block.sensors, ticks=stream_ticks
+                ),
+                contents.end[frames[frame]],
+                {name: column[frame, record] for name, column in block.columns.items()},
+                block.tick[frame, record],
+                heads["sequence"][frames[frame]].astype(np.int64),
             )
         )
     return batches

@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from locatk.core.lighthouse.channels import channel_of
+from locatk.core.lighthouse.recording import UNKNOWN
+from locatk.formats.devices.interface import Ticks
 from locatk.formats.devices.locatk_frames.framing import Bytes, encode_frame
 
 PROTOCOL_VERSION = 1
@@ -37,6 +40,21 @@ COUNT_STEPS = 256
 
 COUNT_LIMIT = (1 << 17) * COUNT_STEPS
 """Limit of the counts of sweeps: the sequence has 2^17 - 1 states."""
+
+DECK_SENSORS = 4
+"""Photodiodes of the Lighthouse deck."""
+
+DECK_TICKS = Ticks(24e6, 24, "deck")
+"""Clock of the Lighthouse deck (bitcraze/lighthouse-fpga, readme)."""
+
+MAX_DECK_DELAY_TICKS = 10_000
+"""Longest time between two pulses of one passage of a light plane over the deck: 0.4 ms, in which
+the rotor turns by 7.5 degrees. Later pulses are of another passage (crazyflie-firmware
+``pulse_processor_v2.c`` separates passages by the same limit; ``lighthouse_transmit.c``, which
+sends them, does not)."""
+
+MAX_QUATERNION_ERROR = 0.01
+"""Largest deviation of the length of a quaternion from 1, for values of half precision."""
 
 _HEADER = struct.Struct("<BBHI")
 _SERIES = struct.Struct("<BBBBI")
@@ -61,6 +79,11 @@ _SWEEP = np.dtype(
         ("count", "<u4"),
     ]
 )
+_DECK_PASSAGE = np.dtype(
+    [("head", "u1", 3), ("reference", "u1", 3), ("delay", "<i2", DECK_SENSORS)]
+)
+_ABSENT_DELAY = 0x7FFF
+_TICKS_PER_COUNT = 4
 
 
 class Type(IntEnum):
@@ -73,6 +96,9 @@ class Type(IntEnum):
     ODOMETRY = 5
     LIGHTHOUSE_CAPTURE = 6
     LIGHTHOUSE_SWEEP = 7
+    IMU = 8
+    POSE = 9
+    LIGHTHOUSE_DECK = 10
 
 
 class FrameWriter:
@@ -118,7 +144,7 @@ def series(
     scale: float | None = None,
     temperature: ArrayLike | None = None,
 ) -> bytes:
-    """Return the payload of samples of magnetometers (k, N, 3) or hall sensors (k, N).
+    """Return the payload of samples (k, N, values of a sensor) or (k, N).
 
     Parameters
     ----------
@@ -224,12 +250,18 @@ class Block:
     Attributes
     ----------
     kind, sensors
-        As in :class:`.decoder.Stream`.
+        As in :class:`.interface.Stream`.
     valid : (n,) bool ndarray
         Frames whose values are all valid.
     tick : (n, k) int64 ndarray
     columns : dict of str to (n, k, ...) ndarray
-        As in :class:`.decoder.Batch`.
+        As in :class:`.interface.Batch`.
+    ticks : Ticks or None
+        Counter of ``tick``, if it is not that of the headers.
+    is_present : (n, k) bool ndarray or None
+        Records that there are; None if all are.
+    unused : int
+        Measurements in valid frames that give no record.
     """
 
     kind: str
@@ -237,6 +269,9 @@ class Block:
     valid: NDArray[np.bool_]
     tick: NDArray[np.int64]
     columns: dict[str, NDArray[Any]]
+    ticks: Ticks | None = None
+    is_present: NDArray[np.bool_] | None = None
+    unused: int = 0
 
 
 @dataclass(frozen=True)
@@ -314,6 +349,33 @@ def _read_odometry(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     return Block("odometry", 0, valid, series_data.tick, columns)
 
 
+def _read_imu(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
+    series_data = _read_series(payloads, tick, 6, 0)
+    if series_data is None or series_data.values.shape[2] != 6:
+        return None
+    columns: dict[str, NDArray[Any]] = {
+        "acceleration_m_s2": series_data.values[..., :3],
+        "angular_rate_rad_s": series_data.values[..., 3:],
+    }
+    return Block("imu", 0, series_data.valid, series_data.tick, columns)
+
+
+def _read_poses(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
+    series_data = _read_series(payloads, tick, 7, 0)
+    if series_data is None or series_data.values.shape[2] != 7:
+        return None
+    position, quaternion = series_data.values[..., :3], series_data.values[..., 3:]
+    length = np.linalg.norm(quaternion, axis=2)
+    with np.errstate(invalid="ignore"):
+        valid = series_data.valid & np.isfinite(position).all((1, 2))
+        valid &= np.logical_and.reduce(np.abs(length - 1) <= MAX_QUATERNION_ERROR, axis=1)
+    columns: dict[str, NDArray[Any]] = {
+        "position_m": position,
+        "quaternion_xyzw": quaternion / np.where(valid[:, None], length, 1.0)[..., None],
+    }
+    return Block("poses", 0, valid, series_data.tick, columns)
+
+
 def _read_records(payloads: Bytes, dtype: np.dtype[np.void]) -> NDArray[np.void] | None:
     """Return records (n, k); None if the size is not a multiple of the record size."""
     if not payloads.shape[1] or payloads.shape[1] % dtype.itemsize:
@@ -357,12 +419,57 @@ def _read_sweeps(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     )
 
 
+def _read_deck(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
+    """Read passages of light planes over the Lighthouse deck, as a Crazyflie sends them.
+
+    The reference time is the start of the pulse whose offset was found, or of the first pulse if
+    none was; delays are those of the middles of the pulses after it. So offset and delay add up to
+    the rotation at the middle of each pulse.
+    """
+    passages = _read_records(payloads, _DECK_PASSAGE)
+    if passages is None:
+        return None
+    byte_weights = np.array([1, 1 << 8, 1 << 16])
+    head = passages["head"] @ byte_weights
+    reference = passages["reference"] @ byte_weights
+    # In the order of the pulses, because times of a stream must ascend.
+    sensor = np.argsort(passages["delay"], axis=2, kind="stable")
+    delay = np.take_along_axis(passages["delay"], sensor, axis=2).astype(np.int64)
+    offset = (head & 0x1FFFF)[..., None]
+    count = offset + delay / _TICKS_PER_COUNT
+    is_received = delay != _ABSENT_DELAY
+    is_present = is_received & (np.abs(delay) <= MAX_DECK_DELAY_TICKS) & (offset > 0) & (count >= 0)
+    valid = np.logical_and.reduce(head & 0xC0000 == 0, axis=1)
+    polynomial = (head >> 20 << 1 | head >> 17 & 1).astype(np.int32)[..., None]
+    values = {
+        "sensor": sensor.astype(np.int32),
+        "channel": channel_of(polynomial).astype(np.int32),
+        "polynomial": polynomial,
+        "sweep": np.int32(UNKNOWN),
+        "count": count,
+    }
+    size = (len(payloads), passages.shape[1] * DECK_SENSORS)
+    columns: dict[str, NDArray[Any]] = {
+        name: np.broadcast_to(value, delay.shape).reshape(size) for name, value in values.items()
+    }
+    return Block(
+        "lighthouse",
+        DECK_SENSORS,
+        valid,
+        ((reference[..., None] + delay) & (1 << DECK_TICKS.bits) - 1).reshape(size),
+        columns,
+        DECK_TICKS,
+        is_present.reshape(size),
+        int(np.count_nonzero(is_received[valid] & ~is_present[valid])),
+    )
+
+
 def _in_range(values: NDArray[Any], low: int, high: int) -> NDArray[np.bool_]:
     inside: NDArray[np.bool_] = (values >= low) & (values <= high)
     return inside
 
 
-SERIES = (Type.MAGNETOMETERS, Type.HALLS, Type.ODOMETRY)
+SERIES = (Type.MAGNETOMETERS, Type.HALLS, Type.ODOMETRY, Type.IMU, Type.POSE)
 """Types whose layout follows from the size and the first :data:`SHAPE_BYTES` bytes; that of the
 others follows from the size."""
 
@@ -374,6 +481,9 @@ READERS: dict[Type, Callable[[Bytes, NDArray[np.int64]], Block | None]] = {
     Type.ODOMETRY: _read_odometry,
     Type.LIGHTHOUSE_CAPTURE: _read_captures,
     Type.LIGHTHOUSE_SWEEP: _read_sweeps,
+    Type.IMU: _read_imu,
+    Type.POSE: _read_poses,
+    Type.LIGHTHOUSE_DECK: _read_deck,
 }
 """Functions that convert payloads (n, size) of one layout and the ticks (n,) of their headers to a
 block, or None if there is no such layout. Types without records are parsed one by one."""

@@ -186,6 +186,7 @@ def _station_reports(
                 None if data is None else data.calibration,
                 sum(frame.is_valid for frame in frames),
                 sum(not frame.is_valid for frame in frames),
+                None if data is None else data.acceleration,
             )
         )
     return tuple(reports)
@@ -242,6 +243,7 @@ def _scene(
         scale="device",
         frame=FRAME,
         notes=("stations as libsurvive solved them (LH_POSE)",),
+        frame_source="gravity",  # The IMU of the tracker levels libsurvive's world.
         calibrations={c: value for c, value in calibrations.items() if c not in posed_channels},
         ids={c: value for c, value in ids.items() if c not in posed_channels},
     )

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import rotation_exp
+from locatk.core.lighthouse.devices.alignment import align_to_markers
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps, SweepWindows
 from locatk.core.lighthouse.devices.pose_fit import DeviceStates
 from locatk.core.lighthouse.devices.scene_initialization import (
@@ -27,7 +28,6 @@ from locatk.core.lighthouse.devices.scene_initialization import (
     select_keyframes,
 )
 from locatk.core.lighthouse.devices.solver import (
-    align_to_markers,
     contradiction_warnings,
     device_warnings,
     merge_solutions,

@@ -17,8 +17,8 @@ from locatk.core.lighthouse.demodulation import ootx
 from locatk.core.lighthouse.demodulation.pipeline import (
     DemodulatedRecording,
     _count_missed,
-    _latest_factory_data,
     demodulate_recording,
+    latest_factory_data,
     slow_bits,
 )
 from locatk.core.lighthouse.demodulation.rotor import Rotor
@@ -388,14 +388,14 @@ def test_the_latest_usable_factory_data() -> None:
     broken = bytearray(valid.payload)
     broken[8:10] = struct.pack("<H", 0x7E00)
     frames = [valid, replace(valid, payload=bytes(broken))]
-    data, warnings = _latest_factory_data(4, frames)
+    data, warnings = latest_factory_data(4, frames)
     assert data is not None
     assert data.id == 17
     assert [warning.code for warning in warnings] == ["invalid_factory_data"]
-    data, warnings = _latest_factory_data(5, [valid])
+    data, warnings = latest_factory_data(5, [valid])
     assert data is not None
     assert [warning.code for warning in warnings] == ["channel_mismatch"]
-    assert _latest_factory_data(4, []) == (None, [])
+    assert latest_factory_data(4, []) == (None, [])
 
 
 def test_the_light_of_a_doubled_channel_alone_is_an_error_with_a_remedy(light: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,8 +14,8 @@ from locatk.core.errors import ArtifactError
 from locatk.core.geometry import rotation_exp
 from locatk.core.lighthouse.calibration import MODELS, Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
+from locatk.core.lighthouse.scene.model import FRAME_SOURCES, JOINT_PARAMETERS
 from locatk.formats.artifacts import scene as artifacts
-from locatk.formats.artifacts.kinds import MAX_VARIANCE
 from locatk.formats.artifacts.scene import dumps_scene, format_time, loads_scene, parse_time
 
 # ---- round trips
@@ -49,10 +48,15 @@ def calibrations(draw: st.DrawFn) -> Calibration:
     return Calibration(draw(vectors(14)).reshape(2, 7), source, model)
 
 
+def directions() -> st.SearchStrategy[np.ndarray]:
+    return vectors(3).map(lambda v: rotation_exp(v % 3)[:, 2])
+
+
 @st.composite
 def stations(draw: st.DrawFn, channel: int) -> Station:
-    values = st.floats(-MAX_VARIANCE, MAX_VARIANCE) | st.sampled_from((0.0, math.nan))
-    covariance = st.lists(values, min_size=36, max_size=36).map(lambda v: np.array(v).reshape(6, 6))
+    # Of any rank: rows of whole numbers, many of which are 0.
+    rows = st.lists(st.integers(-3, 3), min_size=36, max_size=36).map(np.array)
+    covariance = rows.map(lambda v: v.reshape(6, 6) @ v.reshape(6, 6).T * 1e-7)
     return Station(
         channel,
         draw(vectors(3)),
@@ -61,6 +65,7 @@ def stations(draw: st.DrawFn, channel: int) -> Station:
         draw(st.none() | numbers),
         draw(st.none() | covariance),
         draw(st.none() | vectors(9).map(lambda v: v.reshape(3, 3))),
+        draw(st.none() | directions()),
     )
 
 
@@ -85,6 +90,9 @@ def scenes(draw: st.DrawFn) -> Scene:
         notes=tuple(draw(st.lists(st.text(max_size=20), max_size=2))),
         calibrations=draw(st.dictionaries(channels, calibrations(), max_size=3)),
         ids=draw(st.dictionaries(channels, numbers, max_size=3)),
+        ups=draw(st.dictionaries(channels, directions(), max_size=3)),
+        frame_source=draw(st.none() | st.sampled_from(FRAME_SOURCES)),
+        level_sigma_rad=draw(st.none() | st.floats(0, 3)),
     )
 
 
@@ -232,6 +240,18 @@ def test_serial_numbers_of_stations_before_solving() -> None:
     assert loads_scene(CALIBRATIONS.replace('id = "4cc60647"', "")).ids == {}
 
 
+JOINT = "[joint_covariance]\nfactor = "
+
+
+def covariance_rows(*variances: float | str, upper: float = 0, lower: float = 0) -> str:
+    rows: list[list[float | str]] = [[0] * len(variances) for _ in variances]
+    for k, variance in enumerate(variances):
+        rows[k][k] = variance
+    if rows:
+        rows[0][1], rows[1][0] = upper, lower
+    return "[" + ", ".join(f"[{', '.join(map(str, row))}]" for row in rows) + "]"
+
+
 METRIC = HEAD + 'scale = "markers"\n' + STATION
 
 
@@ -267,6 +287,30 @@ METRIC = HEAD + 'scale = "markers"\n' + STATION
         (METRIC.replace('"none"', '"maker"'), "stations[0].calibration.source", "factory"),
         (METRIC.replace('"none"', '"factory"'), "stations[0].calibration", "missing key 'first'"),
         (METRIC + STATION, "stations[1].channel", "twice"),
+        *(
+            (METRIC + f"covariance_m_rad = {rows}", "stations[0].covariance_m_rad", words)
+            for rows, words in (
+                (covariance_rows(), "6 rows of 6 numbers"),
+                (covariance_rows(*[1] * 5, -1), "a variance is negative"),
+                (covariance_rows(*[1] * 6, upper=0.5), "not symmetric"),
+                (covariance_rows(*[1] * 6, upper=2, lower=2), "not positive semi-definite"),
+                (covariance_rows(0, *[1] * 5, upper=2, lower=2), "a variance is 0"),
+            )
+        ),
+        (
+            METRIC + f"covariance_m_rad = {covariance_rows(*['nan'] * 6)}",
+            "stations[0].covariance_m_rad[0][0]",
+            "finite",
+        ),
+        (METRIC + "up = [0, 0, 0]", "stations[0].up", "not all 0"),
+        (METRIC + "up = [0, 1]", "stations[0].up", "list of 3 numbers"),
+        (HEAD + 'frame_source = "floors"', "frame_source", "not one of markers, floor"),
+        (HEAD + "level_sigma_deg = -1", "level_sigma_deg", "at least 0"),
+        (HEAD + "[joint_covariance]", "joint_covariance", "missing key 'factor'"),
+        (HEAD + JOINT + "[]", "joint_covariance.factor", "rows of 1, 2, 3"),
+        (HEAD + JOINT + "[[1], [2]]", "joint_covariance.factor[1]", "list of 2 numbers"),
+        (HEAD + JOINT + "[[nan]]", "joint_covariance.factor[0][0]", "finite"),
+        (METRIC + JOINT + "[[1]]", "joint_covariance.factor", "expected 20 rows"),
         (METRIC.replace("channel = 1", 'channel = 1\nid = "xyz"'), "stations[0].id", "hexa"),
         (CALIBRATIONS.replace("4cc60647", "0x4c"), "calibrations[0].id", "hexa"),
         (CALIBRATIONS.replace('"4cc60647"', "12"), "calibrations[0].id", "a string"),
@@ -310,6 +354,37 @@ def test_errors_name_key_and_expected_value(
     refused: Callable[..., None], text: str, where: str | int | None, words: str
 ) -> None:
     refused(artifacts.SCENE, text, where, words)
+
+
+def test_the_joint_covariance_of_stations_is_kept_to_a_millionth() -> None:
+    rng = np.random.default_rng(7)
+    stations = tuple(
+        Station(channel, np.zeros(3), np.eye(3), Calibration(np.zeros((2, 7)), "none"))
+        for channel in (2, 5)
+    )
+    size = JOINT_PARAMETERS * len(stations)
+    scales = 10.0 ** rng.uniform(-5, 1, size)
+    for rank in (size, size - 6):  # The gauge of a scene has no variance.
+        root = scales[:, None] * rng.normal(size=(size, rank))
+        covariance = root @ root.T
+        scene = Scene(stations=stations, scale="device", covariance=covariance)
+        text = dumps_scene(scene)
+        read = loads_scene(text).covariance
+        assert read is not None
+        sigma = np.sqrt(np.diagonal(covariance))
+        assert np.max(np.abs(read - covariance) / np.outer(sigma, sigma)) < 1e-5
+        assert len(text) < 22_000
+    with pytest.raises(ValueError, match="negative"):
+        dumps_scene(Scene(stations=stations, covariance=-np.eye(size)))
+
+
+def test_directions_are_normalised() -> None:
+    up = loads_scene(METRIC + "up = [0, 3, 4]").stations[0].up
+    assert up is not None
+    assert up.tolist() == [0.0, 0.6, 0.8]
+    scene = loads_scene(HEAD + "[[calibrations]]\nchannel = 3\nup = [0, 0, 2]\n")
+    assert scene.ups[3].tolist() == [0.0, 0.0, 1.0]
+    assert scene.calibrations == {}
 
 
 def test_unknown_keys_get_a_suggestion() -> None:

@@ -54,6 +54,13 @@ def values(kind: str, n: int, seed: int = 0) -> dict[str, Any]:
         return {**numbers, "bits": bits, "bit_offset": rng.integers(0, 9, n)}
     if kind == "odometry":
         return {name: rng.normal(size=n) for name in ("x_m", "y_m", "heading_rad")}
+    if kind == "imu":
+        names = ("acceleration_m_s2", "angular_rate_rad_s")
+        return {name: rng.normal(size=(n, 3)) for name in names}
+    if kind == "poses":
+        quaternion = rng.normal(size=(n, 4))
+        quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+        return {"position_m": rng.normal(size=(n, 3)), "quaternion_xyzw": quaternion}
     return {"value": rng.normal(size=(n, 2))}
 
 
@@ -63,6 +70,8 @@ STREAMS = {
     "lighthouse": (Stream("lighthouse"), messages.SWEEPS),
     "captures": (Stream("captures"), messages.CAPTURES),
     "odometry": (Stream("odometry"), messages.ODOMETRY),
+    "imu": (Stream("imu"), messages.IMU),
+    "poses": (Stream("poses"), messages.POSES),
     "readings": (Stream("readings", names=("a", "b")), messages.readings(2)),
 }
 
@@ -92,13 +101,15 @@ def test_every_value_comes_through(kind: str, node: str) -> None:
     )
     device = f"red-{node}" if node else "red"
     (stamped,) = made
-    assert stamped.topic == f"/{kind}/{device}"
+    topic = {"poses": "onboard_track"}.get(kind, kind)
+    assert stamped.topic == f"/{topic}/{device}"
     assert stamped.time_ns == START_NS + 999 * MS
     assert stamped.publish_ns == START_NS  # no clock is told, so the ticks are only kept
     batches = unpacked(made, layout)
     assert batches.texts["device"] == [device]
     np.testing.assert_array_equal(batches.columns["time_ns"], START_NS + np.arange(7) * 20 * MS)
-    np.testing.assert_array_equal(batches.columns["device_ticks"], tick)
+    if kind != "poses":
+        np.testing.assert_array_equal(batches.columns["device_ticks"], tick)
     for name, column in columns.items():
         np.testing.assert_array_equal(batches.columns[name], column)
     if "sequence" in batches.columns:
@@ -226,6 +237,32 @@ def test_streams_of_one_device_share_its_clock() -> None:
     assert first.tick_count == 10
 
 
+def test_a_device_may_have_two_clocks() -> None:
+    """The Crazyflie's own, and that of its deck, which wraps every 0.7 s and runs otherwise."""
+    n = 400
+    ends = np.arange(1, n + 1)
+    arrivals, streams = arrivals_of(ends), MessageEncoder("red")
+    deck = Stream("lighthouse", sensors=4, ticks=Ticks(24e6, 24, "deck"))
+    imu = Stream("imu", ticks=Ticks(1e3, 32))
+    tick = {deck: ends * 480_096 & 0xFFFFFF, imu: 500_000 + ends * 20}
+    times: dict[Stream, list[int]] = {deck: [], imu: []}
+    for part in range(0, n, 10):
+        rows = slice(part, part + 10)
+        for stream in (deck, imu):
+            columns = {key: column[rows] for key, column in values(stream.kind, n).items()}
+            batch = Batch(stream, ends[rows], columns, tick=tick[stream][rows])
+            for each in streams.messages([batch], arrivals, START_NS):
+                message: Any = each.message
+                times[stream] += message.time_ns
+    for stream in (deck, imu):
+        delay_ns = np.array(times[stream]) - START_NS - (ends - 1) * 20 * MS
+        assert np.abs(delay_ns[n // 2 :]).max() < 0.1 * MS
+    clocks = streams.clocks()
+    assert sorted(clocks) == ["red", "red-deck"]
+    assert clocks["red-deck"].drift_ppm == pytest.approx(200, abs=1)
+    assert clocks["red"].drift_ppm == pytest.approx(0, abs=1)
+
+
 def test_after_a_restart_the_ticks_may_be_others() -> None:
     """Unplugged for a second, the device counts from 0 again: no time is bent for it."""
     streams = MessageEncoder("red")
@@ -292,5 +329,12 @@ def test_recorded_streams_equal_written_ones(tmp_path: Path) -> None:
     sweeps = observations.read_sweeps(session)
     np.testing.assert_array_equal(sweeps.count, columns["lighthouse"]["count"])
     np.testing.assert_array_equal(sweeps.time_ns, samples.time_ns)
+    (imu,) = observations.read_imu(session)
+    assert imu.device == "red"
+    np.testing.assert_array_equal(imu.acceleration, columns["imu"]["acceleration_m_s2"])
+    np.testing.assert_array_equal(imu.angular_rate, columns["imu"]["angular_rate_rad_s"])
+    (track,) = tracks.read_onboard(session)
+    assert track.device == "red"
+    np.testing.assert_array_equal(track.quaternion, columns["poses"]["quaternion_xyzw"])
     (odometry,) = tracks.read_odometry(session)
     np.testing.assert_array_equal(odometry.position[:, 0], columns["odometry"]["x_m"])

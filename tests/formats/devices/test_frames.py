@@ -106,6 +106,26 @@ def test_odometry() -> None:
     np.testing.assert_array_equal(np.transpose(found), poses)
 
 
+def test_imu() -> None:
+    samples = np.arange(12, dtype=float).reshape(2, 6)
+    samples[1, 3:] = np.nan  # The gyroscope was not sampled.
+    batch, _ = one(Type.IMU, payloads.series(samples[:, None], 10))
+    assert batch.stream == Stream("imu", ticks=MHZ)
+    np.testing.assert_array_equal(batch.columns["acceleration_m_s2"], samples[:, :3])
+    np.testing.assert_array_equal(batch.columns["angular_rate_rad_s"], samples[:, 3:])
+    assert batch.tick is not None
+    assert batch.tick.tolist() == [7, 17]
+
+
+def test_poses_of_the_device() -> None:
+    poses = np.array([[1, 2, 3, 0.0, 0.0, 0.6, 0.8], [4, 5, 6, 0.0, 0.0, 0.0, 1.004]])
+    batch, _ = one(Type.POSE, payloads.series(poses[:, None], 20))
+    assert batch.stream == Stream("poses", ticks=MHZ)
+    np.testing.assert_array_equal(batch.columns["position_m"], poses[:, :3])
+    expected = [[0, 0, 0.6, 0.8], [0, 0, 0, 1]]  # rounded quaternions have their length again
+    np.testing.assert_allclose(batch.columns["quaternion_xyzw"], expected, atol=1e-7)
+
+
 def test_lighthouse_sweeps() -> None:
     payload = payloads.sweeps(
         [9, 2**32 - 1, 11],
@@ -178,6 +198,17 @@ WRONG = {
     "odometry of two": (Type.ODOMETRY, payloads.series(np.ones((1, 2, 3)), 0)),
     "odometry as counts": (Type.ODOMETRY, payloads.series(np.ones((1, 1, 3)), 0, scale=1)),
     "odometry that is no number": (Type.ODOMETRY, payloads.odometry([[0, 0, np.nan]], 0)),
+    "imu of two": (Type.IMU, payloads.series(np.ones((1, 2, 6)), 0)),
+    "imu of three values": (Type.IMU, payloads.series(np.ones((1, 1, 3)), 0)),
+    "infinite acceleration": (Type.IMU, payloads.series([[[np.inf] * 6]], 0)),
+    "pose of six values": (Type.POSE, payloads.series(np.ones((1, 1, 6)), 0)),
+    "pose that is no number": (Type.POSE, payloads.series([[[np.nan, 0, 0, 0, 0, 0, 1]]], 0)),
+    "quaternion that is no number": (Type.POSE, payloads.series([[[0] * 6 + [np.nan]]], 0)),
+    "quaternion of length 1.1": (Type.POSE, payloads.series([[[0] * 6 + [1.1]]], 0)),
+    "quaternion of length 0": (Type.POSE, payloads.series([[[0] * 7]], 0)),
+    "no passage": (Type.LIGHTHOUSE_DECK, b""),
+    "half a passage": (Type.LIGHTHOUSE_DECK, bytes(7)),
+    "not reserved in a passage": (Type.LIGHTHOUSE_DECK, bytes([0, 0, 4]) + bytes(11)),
     "no sweep": (Type.LIGHTHOUSE_SWEEP, b""),
     "half a sweep": (Type.LIGHTHOUSE_SWEEP, payloads.sweeps(**SWEEP)[:6]),
     "channel 17": (Type.LIGHTHOUSE_SWEEP, payloads.sweeps(**{**SWEEP, "channel": [17]})),
@@ -409,6 +440,16 @@ def test_a_temperature_now_and_then() -> None:
     assert listed(pieces) == listed(whole)
 
 
+def deck_passages(random: np.random.Generator, count: int) -> bytes:
+    """Records, some without an offset, and with photodiodes in the dark."""
+    records = b""
+    for _ in range(count):
+        head = int(random.integers(0, 2)) * (1 << 17 | int(random.integers(1, 1 << 17)))
+        delays = random.choice([-300, 0, 150, 9_999, 10_001, 0x7FFF], 4).astype("<i2")
+        records += head.to_bytes(3, "little") + random.bytes(3) + delays.tobytes()
+    return records
+
+
 def some_frames(count: int, seed: int, nodes: int = 3) -> list[bytes]:
     """Frames of all types from random values."""
     random = np.random.default_rng(seed)
@@ -431,9 +472,12 @@ def some_frames(count: int, seed: int, nodes: int = 3) -> list[bytes]:
             Type.LIGHTHOUSE_CAPTURE: payloads.captures(
                 ticks, [0] * k, [n % 32] * k, [0] * k, random.integers(0, 1 << 62, k)
             ),
+            Type.IMU: payloads.series(random.normal(size=(k, 1, 6)), 9),
+            Type.POSE: payloads.series([[[*random.normal(size=3), 0, 0, 0, 1]]], 9),
+            Type.LIGHTHOUSE_DECK: deck_passages(random, k),
             Type(3): payloads.series(field, 9),
         }
-        type = Type(int(random.integers(1, 8)))
+        type = Type(int(random.integers(1, 11)))
         frames.append(writers[int(random.integers(0, nodes))].frame(type, 1000 * n, kinds[type]))
     return frames
 

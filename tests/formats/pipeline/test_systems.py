@@ -51,7 +51,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def solve(sweeps: Any, scene: Scene, options: Any, **more: Any) -> Solution:
         last.update(more, scene=scene)
-        return Solution("lighthouse", "bundle", (), warnings=(OF_SOLVER,))
+        return Solution("lighthouse", "bundle", (), artifact=Scene(), warnings=(OF_SOLVER,))
 
     monkeypatch.setattr(lighthouse, "solve", solve, raising=False)
     return last
@@ -83,7 +83,7 @@ def test_one_photodiode_is_no_rigid_device(
 def test_receivers_and_what_stations_sent(
     session: Path, tmp_path: Path, given: dict[str, Any]
 ) -> None:
-    """Another scene takes the place of the session's; of themselves the stations know best."""
+    """An artifact completes the session's scene; of themselves the stations know best."""
     sent = Calibration(np.full((2, 7), 0.01), "factory")
     path, room = tmp_path / "light.mcap", tmp_path / "scene.toml"
     observations.write_session(
@@ -104,7 +104,7 @@ def test_receivers_and_what_stations_sent(
     )
     solution = solve_session(path, SolveRequest(artifact=room)).solution
     scene = given["scene"]
-    assert [marker.name for marker in scene.markers] == ["new"]
+    assert [marker.name for marker in scene.markers] == ["new", "old"]
     assert {c: each.source for c, each in scene.calibrations.items()} == {
         1: "factory",
         2: "estimated",

@@ -1,0 +1,221 @@
+"""Standstills of devices, found from their sweeps without a scene.
+
+A device that rests repeats its rotor angles. Markers and points on the floor are visited by
+standing on them for a few seconds, so that neither a clock nor a list of times is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.lighthouse.epochs import Epochs, group_epochs, rotor_angles
+from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, Sweeps
+from locatk.core.lighthouse.scene.keyframes import STANDSTILL_ANGLE_RAD
+
+Array = NDArray[np.float64]
+
+WINDOW_S = 0.25
+"""Time over which angles are averaged [s]: about twelve rotations."""
+
+MIN_EPOCHS_PER_WINDOW = 2
+"""Fewest epochs from which the angle of a window is used."""
+
+MIN_STANDSTILL_S = 1.5
+"""Shortest standstill [s]. Robots that turn or brake rest for less."""
+
+MAX_SPREAD_SIGMAS = 8.0
+"""Largest spread of the angles of a rest, in standard deviations of the angle of a window, beyond
+:data:`~locatk.core.lighthouse.scene.keyframes.STANDSTILL_ANGLE_RAD`: the range of the medians of a
+minute of Gaussian noise is 7 of them."""
+
+MAX_STANDSTILL_ANGLE_RAD = 4e-3
+"""Largest spread of the angles of a rest, however noisy they are [rad]: 8 mm at 2 m."""
+
+STILL_QUANTILE = 0.75
+"""Fraction of the light planes whose angles must be constant: one station of several may be
+received by reflection at times."""
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """Time during which a device rested.
+
+    Attributes
+    ----------
+    device : str
+    start_ns, end_ns : int
+        Nanoseconds since the epoch, within the rest.
+    channels : tuple of int
+        Stations that it received.
+    """
+
+    device: str
+    start_ns: int
+    end_ns: int
+    channels: tuple[int, ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        """Duration in seconds."""
+        return (self.end_ns - self.start_ns) / NANOSECONDS_PER_S
+
+
+def find_standstills(
+    sweeps: Sweeps, *, min_duration_s: float = MIN_STANDSTILL_S
+) -> list[Standstill]:
+    """Find the standstills of all devices, in the order of time.
+
+    Parameters
+    ----------
+    sweeps : Sweeps
+    min_duration_s : float
+        Shorter ones are left out.
+
+    Returns
+    -------
+    list of Standstill
+        Two rests at one position without motion between them, as when the light is interrupted,
+        are one standstill.
+    """
+    epochs = group_epochs(sweeps)
+    angles = rotor_angles(epochs).reshape(len(epochs), 2 * len(epochs.channels))
+    standstills: list[Standstill] = []
+    for device in sweeps.devices:
+        photodiodes = [k for k, name in enumerate(epochs.devices) if _device_of(name) == device]
+        if photodiodes:
+            standstills += _device_standstills(device, epochs, angles, photodiodes, min_duration_s)
+    return sorted(standstills, key=lambda each: each.start_ns)
+
+
+def _device_of(photodiode: str) -> str:
+    """Return the device of a photodiode's name, as in ``device/0``."""
+    device, separator, number = photodiode.rpartition("/")
+    return device if separator and number.isdigit() else photodiode
+
+
+def _device_standstills(
+    device: str,
+    epochs: Epochs,
+    angles: Array,
+    photodiodes: Sequence[int],
+    min_duration_s: float,
+) -> list[Standstill]:
+    """Find the standstills of one device, in the order of time."""
+    rows = np.flatnonzero(np.isin(epochs.device, photodiodes))
+    if len(rows) == 0:
+        return []
+    window_ns = round(WINDOW_S * NANOSECONDS_PER_S)
+    first_ns = int(epochs.time_ns[rows].min())
+    window = (epochs.time_ns[rows] - first_ns) // window_ns
+    windows, medians = _window_medians(window, epochs.device[rows], angles[rows], photodiodes)
+    if len(windows) == 0:
+        return []
+    max_spread_rad = _max_spread(window, epochs.device[rows], angles[rows])
+    rests = _split_rests(medians, max_spread_rad)
+    rests = _merge_rests(medians, rests, max_spread_rad)
+    standstills = []
+    for first, last in rests:
+        # Up to half of the first and the last window may be of the motion.
+        start_ns = first_ns + int(windows[first]) * window_ns + window_ns // 2
+        end_ns = first_ns + int(windows[last]) * window_ns + window_ns // 2
+        if end_ns - start_ns + window_ns < min_duration_s * NANOSECONDS_PER_S:
+            continue
+        is_received = np.isfinite(medians[first : last + 1]).any(axis=0)
+        by_station = is_received.reshape(len(photodiodes), len(epochs.channels), 2).any(axis=(0, 2))
+        channels = tuple(int(c) for c in epochs.channels[by_station])
+        standstills.append(Standstill(device, start_ns, end_ns, channels))
+    return standstills
+
+
+def _window_medians(
+    window: NDArray[np.int64], device: NDArray[np.int64], angles: Array, photodiodes: Sequence[int]
+) -> tuple[NDArray[np.int64], Array]:
+    """Return the windows with data, ascending, and the median angles (w, photodiodes x planes)."""
+    windows, row = np.unique(window, return_inverse=True)
+    planes = angles.shape[1]
+    medians = np.full((len(windows), len(photodiodes) * planes), np.nan)
+    for number, photodiode in enumerate(photodiodes):
+        own = np.flatnonzero(device == photodiode)
+        own = own[np.argsort(row[own], kind="stable")]
+        starts: list[int] = np.flatnonzero(np.diff(row[own], prepend=-1)).tolist()
+        for start, end in zip(starts, [*starts[1:], len(own)], strict=True):
+            block = angles[own[start:end]]
+            is_known = np.count_nonzero(np.isfinite(block), axis=0) >= MIN_EPOCHS_PER_WINDOW
+            columns = number * planes + np.flatnonzero(is_known)
+            medians[row[own[start]], columns] = np.nanmedian(block[:, is_known], axis=0)
+    # Windows at the edge of a pause have too few epochs, and must not divide a rest.
+    is_received = np.count_nonzero(np.isfinite(medians), axis=1) >= 2
+    return windows[is_received], medians[is_received]
+
+
+def _max_spread(window: NDArray[np.int64], device: NDArray[np.int64], angles: Array) -> float:
+    """Return the largest spread of the medians of a rest, from the noise of the angles."""
+    is_neighbour = (np.diff(window) == 0) & (np.diff(device) == 0)
+    steps = np.abs(np.diff(angles, axis=0)[is_neighbour])
+    steps = steps[np.isfinite(steps)]
+    if len(steps) == 0:
+        return STANDSTILL_ANGLE_RAD
+    # The lower quartile of the steps is of rests if the device rests for a quarter of the time;
+    # that of Gaussian steps is 0.45 standard deviations of an angle.
+    sigma_rad = float(np.quantile(steps, 0.25)) / 0.4506
+    number = max(MIN_EPOCHS_PER_WINDOW, len(window) / len(np.unique(np.c_[window, device], axis=0)))
+    spread_rad = STANDSTILL_ANGLE_RAD + MAX_SPREAD_SIGMAS * sigma_rad / np.sqrt(number)
+    return float(min(spread_rad, MAX_STANDSTILL_ANGLE_RAD))
+
+
+def _split_rests(medians: Array, max_spread_rad: float) -> list[tuple[int, int]]:
+    """Return the first and last rows of the longest runs of windows with constant angles.
+
+    The spread of the angles within a run is limited, so that a slow motion is none. Windows without
+    data do not end a run.
+    """
+    rests: list[tuple[int, int]] = []
+    start = 0
+    low, high = medians[0].copy(), medians[0].copy()
+    for row in range(1, len(medians) + 1):
+        if row < len(medians):
+            new_low, new_high = np.fmin(low, medians[row]), np.fmax(high, medians[row])
+            is_common = np.isfinite(medians[row - 1]) & np.isfinite(medians[row])
+            if _is_still((new_high - new_low)[is_common], max_spread_rad):
+                low, high = new_low, new_high
+                continue
+        if row - 1 > start:
+            rests.append((start, row - 1))
+        if row < len(medians):
+            start, low, high = row, medians[row].copy(), medians[row].copy()
+    return rests
+
+
+def _is_still(spread: Array, max_spread_rad: float) -> bool:
+    """Return whether the angles of enough light planes have a small spread."""
+    if len(spread) < 2:
+        return False
+    return bool(np.quantile(spread, STILL_QUANTILE, method="lower") <= max_spread_rad)
+
+
+def _merge_rests(
+    medians: Array, rests: list[tuple[int, int]], max_spread_rad: float
+) -> list[tuple[int, int]]:
+    """Merge neighbouring rests at one position, if there is no motion between them."""
+    merged: list[tuple[int, int]] = []
+    for first, last in rests:
+        if merged and first == merged[-1][1] + 1:
+            previous = medians[merged[-1][0] : merged[-1][1] + 1]
+            change = np.abs(_row_median(previous) - _row_median(medians[first : last + 1]))
+            if _is_still(change[np.isfinite(change)], max_spread_rad):
+                merged[-1] = (merged[-1][0], last)
+                continue
+        merged.append((first, last))
+    return merged
+
+
+def _row_median(medians: Array) -> Array:
+    """Return the median of each column, ``nan`` if it has no value."""
+    result = np.full(medians.shape[1], np.nan)
+    is_known = np.isfinite(medians).any(axis=0)
+    result[is_known] = np.nanmedian(medians[:, is_known], axis=0)
+    return result
