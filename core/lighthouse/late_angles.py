@@ -222,7 +222,8 @@ def _possible_fraction(turns: Array) -> tuple[float, float]:
     width = round(MAX_DELAY_TURNS * DELAY_BINS)
     inside = sums[width : width + DELAY_BINS] - sums[:DELAY_BINS]
     # Of equal arcs the middle one is taken: wrong delays are then on both sides of it.
-    first = int(np.median(np.flatnonzero(inside == inside.max())))
+    best = np.exp(2j * np.pi * np.flatnonzero(inside == inside.max()) / DELAY_BINS)
+    first = round(float(np.angle(best.mean())) / (2 * np.pi) * DELAY_BINS) % DELAY_BINS
     return float(inside[first] / len(turns)), first / DELAY_BINS
 
 
