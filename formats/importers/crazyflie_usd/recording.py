@@ -328,6 +328,14 @@ def _facts(
     }
     if logged.rejected:
         facts["rejected"] = describe_rejected(logged.rejected)
+    unused = {
+        name
+        for each in log.events.values()
+        for name in each.columns
+        if "." in name and len(each) and name not in USED_VARIABLES
+    }
+    if unused:
+        facts["not_used"] = list_names(unused, len(unused))
     if logged.repeated:
         facts["repeated"] = f"{logged.repeated} events {event} repeat the value before them"
     return facts

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
+import subprocess
 import zlib
 from pathlib import Path
 from types import ModuleType
@@ -222,6 +224,7 @@ def test_a_flight_becomes_a_session(
     session = read_crazyflie_usd([write(log, tmp_path)])
     assert session.lost is None
     assert session.warnings == []
+    assert session.facts["not_used"] == "pm.vbat, range.zrange"
     assert len(session.sweeps) > 0.95 * sum(event[1] == 11 for event in log.events)
     check_sweeps(session, flight, tolerance_s=1e-3)
     assert f"ran at {rate:.4f}"[:-1] in session.facts["clock"]
@@ -405,6 +408,34 @@ def test_calibrations_come_from_the_configuration(crazyflie: ModuleType, tmp_pat
     assert [station.channel for station in scene.stations] == [1, 2]
     with pytest.raises(InputError, match="no configuration"):
         read_crazyflie_usd([path], stations=True)
+
+
+def test_a_configuration_of_cflib_is_read(crazyflie: ModuleType, tmp_path: Path) -> None:
+    """Written by cflib (GPL), as a program in an environment of its own."""
+    python = os.environ.get("LOCATK_CFLIB_PYTHON")
+    if not python:
+        pytest.skip("LOCATK_CFLIB_PYTHON does not name a Python with cflib")
+    program = """
+import sys
+from cflib.crazyflie.mem.lighthouse_memory import LighthouseBsCalibration, LighthouseBsGeometry
+from cflib.localization import LighthouseConfigFileManager
+geometry, calibration = LighthouseBsGeometry(), LighthouseBsCalibration()
+geometry.origin, geometry.valid = [1.0, 2.0, 3.0], True
+geometry.rotation_matrix = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+calibration.uid, calibration.valid = 1234, True
+calibration.sweeps[1].tilt, calibration.sweeps[1].gibmag = 0.046, 0.005
+LighthouseConfigFileManager.write(sys.argv[1], {1: geometry}, {1: calibration}, 2)
+"""
+    config = tmp_path / "system.yaml"
+    subprocess.run([python, "-c", program, str(config)], check=True)
+    path = write(crazyflie.write_flight(crazyflie.Flight(2.5), np.random.default_rng(6)), tmp_path)
+    scene = read_crazyflie_usd([path], config=config, stations=True).scene
+    assert scene is not None
+    [station] = scene.stations
+    assert (station.channel, station.id) == (2, 1234)
+    np.testing.assert_array_equal(station.position, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(station.rotation @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    assert station.calibration.source == "factory"
 
 
 def test_a_receiver_has_a_place_on_its_device(crazyflie: ModuleType, tmp_path: Path) -> None:
