@@ -9,7 +9,7 @@ and in another terminal, on the same computer::
     locatk capture socket://127.0.0.1:19860 -o flight.mcap
 
 End the capture first, then this script, both with Ctrl-C. The Crazyflie needs a Lighthouse deck,
-and firmware of September 2020 or later.
+and firmware of after July 2021 (crazyflie-firmware, pull request 807).
 
 A Crazyradio serves one program at a time. To record while your own program flies the Crazyflie, put
 this file beside it and stream from there::
