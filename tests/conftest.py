@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import gc
+import importlib.util
 import os
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -54,6 +57,18 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"published recordings are not in {folder} (see LOCATK_DATA)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def crazyflie() -> ModuleType:
+    """Module with simulated flights of a Crazyflie and a writer of its logs."""
+    spec = importlib.util.spec_from_file_location("crazyflie", ROOT / "tests" / "crazyflie.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["crazyflie"] = module  # dataclasses look up their module
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture

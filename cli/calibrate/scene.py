@@ -224,7 +224,7 @@ def solve_scene(
 
 def frame_text(frame: FrameFacts, report: SolveReport) -> str:
     """Format the standstills, and the source and the standard deviations of the frame."""
-    unit, per_m = ("mm", 1e3) if report.is_metric else ("1e-3", 1e3)
+    unit = "mm" if report.is_metric else "1e-3"
     figures = [
         (name, None if value is None else f"{factor * value:.2g} {suffix}")
         for name, value, factor, suffix in (
@@ -236,10 +236,11 @@ def frame_text(frame: FrameFacts, report: SolveReport) -> str:
     ]
     known = ", ".join(f"{name} {value}" for name, value in figures if value is not None)
     parts = [console.wrapped(f"frame: from {frame.source}{f', sigma: {known}' if known else ''}")]
-    if frame.up_deviation_rad is not None and frame.up_sigma_rad is not None:
+    deviation_rad, sigma_rad = frame.up_deviation_rad, frame.up_sigma_rad
+    if deviation_rad is not None and sigma_rad is not None and frame.source != "gravity":
         parts.append(
-            f"gravity: {math.degrees(frame.up_deviation_rad):.1f} deg from z by the accelerometers "
-            f"of the stations (sigma {math.degrees(frame.up_sigma_rad):.1f} deg)"
+            f"gravity: {math.degrees(deviation_rad):.1f} deg from z by the accelerometers of the "
+            f"stations (sigma {math.degrees(sigma_rad):.1f} deg)"
         )
     rests = frame.standstills or ()
     if rests:
@@ -257,7 +258,7 @@ def frame_text(frame: FrameFacts, report: SolveReport) -> str:
                         *(
                             ("-",) * 3
                             if rest.position_m is None
-                            else (f"{per_m * value:.0f}" for value in rest.position_m)
+                            else (round(1e3 * value) for value in rest.position_m)
                         ),
                         rest.role or "-",
                     )

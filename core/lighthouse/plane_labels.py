@@ -73,8 +73,9 @@ MAX_EXTRAPOLATION_S = 1.0
 
 # ---- planes
 
-MAX_PASSAGE_GAP_TURNS = 0.02
-"""Longest gap between pulses of one passage [rotations], about :data:`MAX_GROUP_GAP_TICKS`."""
+MAX_PASSAGE_GAP_TURNS = MIN_PLANE_DELAY_TURNS / 2
+"""Longest gap between sweeps of one passage [rotations], for devices of any size: half of the
+shortest delay between the planes."""
 
 MAX_HISTORY_ROTATIONS = 12
 """Largest distance of neighbouring rotations that determine the plane of a single passage: 0.25 s.
@@ -172,8 +173,9 @@ def track_rotor(tick: IntArray, offset: IntArray, period: float) -> RotorTrack |
         is_possible = (np.abs(step) <= max_rate) & (elapsed <= 4 * lag)
         if is_possible.any():
             rate += float(np.median(step[is_possible]))
-    # Offsets are in ticks of the station, whose clock determines the rotor.
-    residual = zero - rate * (time + offset[order])
+    # Offsets are in ticks of the station, whose clock determines the rotor: the true zero is
+    # ``zero - rate * offset``, and the phase there without its change is the following.
+    residual = zero - rate * time
     interval = np.floor(time / (ROTOR_INTERVAL_S * PULSE_HZ))
     starts = np.flatnonzero(np.diff(interval, prepend=-1.0))
     middles: list[float] = []
@@ -235,6 +237,38 @@ def label_planes(rotation: IntArray, phase: Array) -> IntArray:
     passage_phase = np.bincount(number, phase[order]) / np.bincount(number)
     plane = np.empty(len(rotation), np.int64)
     plane[order] = _label_passages(passage_rotation, passage_phase)[number]
+    return plane
+
+
+def assign_planes(time_ns: IntArray, channel: NDArray[np.int32], count: Array) -> IntArray:
+    """Assign the sweeps of one device under any stations to light planes.
+
+    Parameters
+    ----------
+    time_ns : (n,) int64 ndarray
+        Times of the light, to a quarter of a rotation.
+    channel : (n,) int ndarray
+        1 to 16.
+    count : (n,) ndarray
+        LFSR steps since the rotor's zero, less than a rotation.
+
+    Returns
+    -------
+    (n,) int64 ndarray
+        0, 1, or -1 if the plane is ambiguous.
+    """
+    plane = np.full(len(time_ns), UNKNOWN, np.int64)
+    for value in np.unique(channel).tolist():
+        rows = np.flatnonzero(channel == value)
+        period_ns = float(period_ticks(value)) / TICK_HZ * 1e9
+        phase = count[rows] / period_counts(value)
+        zero = (time_ns[rows] - time_ns[rows[0]]) / period_ns - phase
+        order = np.argsort(zero)
+        # Only differences to the next rotation are rounded: the period is not exactly nominal.
+        steps = np.rint(np.diff(zero[order], prepend=zero[order[:1]]))
+        rotation = np.empty(len(rows), np.int64)
+        rotation[order] = np.cumsum(steps)
+        plane[rows] = label_planes(rotation, phase)
     return plane
 
 

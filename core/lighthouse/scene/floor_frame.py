@@ -160,7 +160,7 @@ def _fit_normal(
     vertical = None if up is None else up.direction
     normal = vertical
     if normal is None:
-        normal = np.linalg.svd(points, full_matrices=False)[2][2]
+        normal = np.linalg.svd(points)[2][2]
         normal = normal * (np.sign(normal @ stations.mean(axis=0)) or 1.0)
     for _ in range(MAX_ITERATIONS):
         # A rotation by (a, b, 0) in a frame with z along the normal turns it to (b, -a, 1).

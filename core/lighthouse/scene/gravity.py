@@ -38,7 +38,7 @@ class UpMeasurement:
     Attributes
     ----------
     source : str
-        Name for messages, as in ``"the station on channel 3"``.
+        Name for messages, as in ``"channel 3"``.
     direction : (3,) ndarray
         Unit vector.
     sigma_rad : float
@@ -97,7 +97,7 @@ def with_ups(scene: Scene, ups: Mapping[int, Array]) -> Scene:
 def station_ups(scene: Scene) -> list[UpMeasurement]:
     """Return the directions of the accelerometers of the stations, in the frame of the scene."""
     return [
-        UpMeasurement(f"the station on channel {station.channel}", station.rotation @ station.up)
+        UpMeasurement(f"channel {station.channel}", station.rotation @ station.up)
         for station in scene.stations
         if station.up is not None
     ]

@@ -167,8 +167,6 @@ def _frame_facts(
         facts = replace(
             facts, heading_sigma_rad=heading_rad, origin_sigma_m=origin_m, scale_sigma=scale
         )
-    if up is None or up.direction is None:
-        return facts
     own = estimate_up(station_ups(scene))
     if own is not None and own.direction is not None:
         deviation_rad = float(angles_between(own.direction, VERTICAL))
@@ -184,7 +182,7 @@ def _contradiction_warning(up: UpEstimate) -> SolverWarning:
     return SolverWarning(
         "up_contradicts_others",
         f"the accelerometers of {_join(up.contradicting)} contradict the others by more than three "
-        "standard deviations: a station was tilted since it sent its factory data, or the "
+        "standard deviations: a station was tilted after the scene was estimated, or the "
         "arrangement of the stations is wrong",
     )
 

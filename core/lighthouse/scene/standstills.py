@@ -82,7 +82,7 @@ def find_standstills(
         are one standstill.
     """
     epochs = group_epochs(sweeps)
-    angles = rotor_angles(epochs).reshape(len(epochs), -1)
+    angles = rotor_angles(epochs).reshape(len(epochs), 2 * len(epochs.channels))
     standstills: list[Standstill] = []
     for device in sweeps.devices:
         photodiodes = [k for k, name in enumerate(epochs.devices) if _device_of(name) == device]
@@ -112,6 +112,8 @@ def _device_standstills(
     first_ns = int(epochs.time_ns[rows].min())
     window = (epochs.time_ns[rows] - first_ns) // window_ns
     windows, medians = _window_medians(window, epochs.device[rows], angles[rows], photodiodes)
+    if len(windows) == 0:
+        return []
     max_spread_rad = _max_spread(window, epochs.device[rows], angles[rows])
     rests = _split_rests(medians, max_spread_rad)
     rests = _merge_rests(medians, rests, max_spread_rad)
@@ -145,7 +147,9 @@ def _window_medians(
             is_known = np.count_nonzero(np.isfinite(block), axis=0) >= MIN_EPOCHS_PER_WINDOW
             columns = number * planes + np.flatnonzero(is_known)
             medians[row[own[start]], columns] = np.nanmedian(block[:, is_known], axis=0)
-    return windows, medians
+    # Windows at the edge of a pause have too few epochs, and must not divide a rest.
+    is_received = np.count_nonzero(np.isfinite(medians), axis=1) >= 2
+    return windows[is_received], medians[is_received]
 
 
 def _max_spread(window: NDArray[np.int64], device: NDArray[np.int64], angles: Array) -> float:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import quaternion_from_matrix
 from locatk.core.inertial import STANDARD_GRAVITY_M_S2, InertialSamples
+from locatk.core.printable import escape_controls
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.crazyflie import FRAME
 
@@ -223,6 +224,6 @@ def decompress_quaternions(packed: NDArray[np.uint32]) -> Array:
 
 def list_names(names: Iterable[str], limit: int = 12) -> str:
     """Return names in order, at most ``limit`` of them, for a message."""
-    ordered = sorted(names)
+    ordered = sorted(map(escape_controls, names))
     more = [f"and {len(ordered) - limit} more"] if len(ordered) > limit else []
     return ", ".join([*ordered[:limit], *more]) or "none"

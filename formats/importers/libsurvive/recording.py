@@ -243,6 +243,7 @@ def _scene(
         scale="device",
         frame=FRAME,
         notes=("stations as libsurvive solved them (LH_POSE)",),
+        frame_source="gravity",  # The IMU of the tracker levels libsurvive's world.
         calibrations={c: value for c, value in calibrations.items() if c not in posed_channels},
         ids={c: value for c, value in ids.items() if c not in posed_channels},
     )

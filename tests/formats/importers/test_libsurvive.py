@@ -23,6 +23,12 @@ from locatk.core.lighthouse.demodulation.ootx import encode_frame
 from locatk.core.lighthouse.demodulation.tracker_syncs import fit_rotor
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.scene.gravity import (
+    estimate_up,
+    station_ups,
+    up_from_acceleration,
+    with_ups,
+)
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.libsurvive import rec_file
 from locatk.formats.importers.libsurvive.device import read_stored_calibrations
@@ -743,6 +749,28 @@ def test_published_calibrations_are_those_that_libsurvive_stored(
         assert difference.max() < 5.1e-7
         assert station.period_ticks is not None
         assert abs(station.period_ticks / period_ticks(station.channel) - 1) < 10e-6
+
+
+@pytest.mark.slow
+def test_published_accelerometers_agree_with_the_level_of_the_tracker(
+    imported: ImportedSession,
+) -> None:
+    """libsurvive levels its world by the tracker's IMU, independent of the stations."""
+    assert imported.scene is not None
+    ups = {
+        each.channel: up
+        for each in imported.stations
+        if each.acceleration and (up := up_from_acceleration(each.acceleration)) is not None
+    }
+    measured = station_ups(with_ups(imported.scene, ups))
+    up = estimate_up(measured)
+    assert up is not None
+    assert up.direction is not None
+    assert (len(up.used), up.contradicting) == (4, ())
+    inclinations = [np.degrees(np.arccos(each.direction[2])) for each in measured]
+    assert inclinations == pytest.approx([2.7, 3.7, 1.2, 1.8], abs=0.1)
+    assert np.degrees(np.arccos(up.direction[2])) < 1.5
+    assert imported.scene.is_level
 
 
 @pytest.mark.slow

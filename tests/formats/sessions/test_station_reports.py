@@ -37,6 +37,7 @@ def stations(draw: st.DrawFn, channel: int) -> StationReport:
         calibration=draw(st.none() | calibration),
         frames=draw(counts),
         damaged=draw(counts),
+        acceleration=draw(st.none() | st.tuples(*[st.integers(-128, 127)] * 3)),
     )
 
 
@@ -133,6 +134,8 @@ def test_impossible_reports_are_not_written(
         ("station-3", "missed", "-1", "missed"),
         ("station-3", "frames", "9" * 5000, "frames"),
         ("station-3", "damaged", "٣", "damaged"),
+        ("station-3", "acceleration", "1 2", "acceleration '1 2' is not three signed bytes"),
+        ("station-3", "acceleration", "1 2 999", "not three signed bytes"),
     ],
 )
 def test_a_damaged_record_is_named(

@@ -12,7 +12,6 @@ import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -324,22 +323,3 @@ def to_quaternion(matrix: Array) -> Array:
     y = (matrix[:, 0, 2] - matrix[:, 2, 0]) / (4 * w)
     z = (matrix[:, 1, 0] - matrix[:, 0, 1]) / (4 * w)
     return np.column_stack([x, y, z, w])
-
-
-@dataclass(frozen=True)
-class CrazyflieTools:
-    """What the tests of both importers use."""
-
-    Flight = Flight
-    UsdWriter = UsdWriter
-    stations = staticmethod(stations)
-    rotations = staticmethod(rotations)
-    deck_frames = staticmethod(deck_frames)
-    firmware_angles = staticmethod(firmware_angles)
-    write_flight = staticmethod(write_flight)
-    to_quaternion = staticmethod(to_quaternion)
-
-
-@pytest.fixture(scope="session")
-def crazyflie() -> type[CrazyflieTools]:
-    return CrazyflieTools
