@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_TOOLS: dict[str, Any] = runpy.run_path(
-    str(Path(__file__).resolve().parents[1] / "formats" / "importers" / "conftest.py")
-)
+_TOOLS: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().parents[1] / "crazyflie.py"))
 
 FLOOR_M = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 """Origin, point on the x axis, two others."""

@@ -28,12 +28,16 @@ from scipy.spatial.transform import Rotation
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+from locatk.formats.artifacts.receiver import RECEIVER_FILE, dumps_receiver
+from locatk.formats.capture.ingestion import SerialIntake
+from locatk.formats.capture.reader_thread import ReceivedData
 from locatk.formats.devices.interface import Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames.decoder import FrameDecoder
 from locatk.formats.devices.locatk_frames.framing import encode_frame
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.observations import read_imu, read_onboard, read_sweeps
 from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.writer import SessionWriter
 
 LIMIT_S = 30.0
 
@@ -549,3 +553,75 @@ def test_cflib_understands_what_the_script_asks(
     assert crazyflie.asked[0] == start[0]
     assert set(crazyflie.asked[:3]) == {*start, "lighthouse.enLhRawStream=1"}
     assert {*stop, "stop stateEstimate.x", "lighthouse.enLhRawStream=0"} == set(crazyflie.asked[3:])
+
+
+# ---- to poses
+
+
+def raw_packets(flight: Any, rng: np.random.Generator) -> list[tuple[float, bytes]]:
+    """Times in s and packets of a deck whose clock is 7 ppm slow."""
+    found = []
+    crossings = flight.crossings()
+    key = crossings["channel"] * 10_000_000 + crossings["turn"] * 2 + crossings["plane"]
+    slow_bits = rng.integers(0, 2, (17, int(crossings["turn"].max()) + 1))
+    for number in np.unique(key):
+        rows = np.flatnonzero(key == number)
+        channel, turn = int(crossings["channel"][rows[0]]), int(crossings["turn"][rows[0]])
+        seen = rows[rng.random(len(rows)) < 0.97]
+        if len(seen) < 2:
+            continue
+        tick = np.rint(crossings["t"][seen] * DECK_HZ).astype(int)
+        reference = int(tick[1]) - PULSE_TICKS // 2
+        period = {1: 959_000, 2: 957_000, 3: 953_000}[channel] / 8
+        offset = round(crossings["fraction"][seen[1]] * period - PULSE_TICKS / 8)
+        delays = dict(zip(crossings["sensor"][seen].tolist(), tick - reference, strict=True))
+        bit = int(slow_bits[channel, turn])
+        found.append((crossings["t"][seen].max(), passage(channel, bit, offset, reference, delays)))
+    return packets_of(sorted(found))
+
+
+@pytest.mark.slow
+def test_the_stream_of_a_flight_is_solved(
+    crazyflie: ModuleType, module: ModuleType, tmp_path: Path, locatk: Callable[..., Result]
+) -> None:
+    """Frames of the script, delayed by the radio, of a flight that another simulator made."""
+    rng = np.random.default_rng(4)
+    flight = crazyflie.Flight(seconds=14.0)
+    start_ns = 1_800_000_000_000_000_000
+    packets = [
+        (time_s, module.LIGHTHOUSE_DECK, 0, data) for time_s, data in raw_packets(flight, rng)
+    ]
+    time_s = np.arange(0.0, flight.seconds, 0.02)
+    quaternion = Rotation.from_matrix(flight.rotation(time_s)).as_quat()
+    for t, position, q in zip(time_s, flight.position(time_s), quaternion, strict=True):
+        packets.append((t, module.POSE, round(1000 * t), module.encode_series((*position, *q))))
+    arrivals = np.array([packet[0] for packet in packets]) + 0.002
+    arrivals += rng.exponential(0.004, len(packets))
+    order = np.argsort(arrivals, kind="stable")
+    intake = SerialIntake("crazyflie", "socket://here:1", "locatk")
+    run = tmp_path / "run.mcap"
+    with SessionWriter(run, system="lighthouse") as writer:
+        writer.attach_toml(RECEIVER_FILE, dumps_receiver(DECK))
+        stamped = []
+        hello = struct.pack("<B3xI", 1, 1000)
+        data = module.encode_frame(module.HELLO, 0, 0, hello)
+        for sequence, index in enumerate(order.tolist(), 1):
+            _, kind, tick, payload = packets[index]
+            data += module.encode_frame(kind, sequence, tick, payload)
+            received = ReceivedData(start_ns + int(arrivals[index] * 1e9), data, len(data))
+            stamped += intake.take([received])
+            data = b""
+        for each in [*stamped, *intake.finish()]:
+            writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
+    assert intake.remarks() == []
+    solved = tmp_path / "solved.mcap"
+    assert locatk("solve", run, "-o", solved).exit_code == 0
+    # What the Crazyflie sends as its own estimate is the truth here. It has another clock, which
+    # is synchronized after some seconds.
+    result = locatk("eval", run, "--onboard", "--truth", solved, "--align", "se3", "--json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["n"] > 650
+    assert figures["median_m"] < 0.003
+    assert figures["p95_m"] < 0.008
+    assert figures["ape"]["rotation_deg"]["median"] < 0.3
