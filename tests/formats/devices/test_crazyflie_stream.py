@@ -31,6 +31,7 @@ from locatk.core.lighthouse.simulation.session import SimulationOptions, simulat
 from locatk.formats.artifacts.receiver import RECEIVER_FILE, dumps_receiver
 from locatk.formats.capture.ingestion import SerialIntake
 from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.devices import find_device
 from locatk.formats.devices.interface import Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames.decoder import FrameDecoder
 from locatk.formats.devices.locatk_frames.framing import encode_frame
@@ -165,6 +166,14 @@ def test_pulses_that_belong_to_no_sweep_are_reported(data: bytes, used: int) -> 
         f"{total - used - 1} of {total} pulses of the Lighthouse deck are in no sweep: their "
         "passage has no offset, or they are of another one"
     ]
+
+
+def test_only_a_deck_has_its_photodiodes() -> None:
+    device = find_device("locatk")
+    deck = Stream("lighthouse", sensors=4)
+    assert device.default_artifacts(deck) == {RECEIVER_FILE: dumps_receiver(DECK)}
+    for stream in (Stream("lighthouse"), Stream("halls", sensors=4), Stream("imu")):
+        assert device.default_artifacts(stream) == {}
 
 
 @pytest.mark.parametrize(
