@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from locatk.core.lighthouse.demodulation import ootx
+from locatk.core.lighthouse.demodulation import ootx, sweep_reports
 from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Sweeps
@@ -87,6 +87,16 @@ def test_times_may_be_wrong_by_milliseconds_and_sweeps_missing() -> None:
 
 def test_a_recording_shorter_than_a_frame_has_none() -> None:
     assert report_stations(sweeps_of({1: 1}, 400)) == ((), ())
+
+
+def test_devices_that_report_few_rotations_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gateway reports one rotation of five: no frame can be found, and none is searched."""
+    sweeps = sweeps_of({1: 1}, 5000)
+    rotation = np.rint((sweeps.time_ns - sweeps.time_ns[0]) * 1e-9 / PERIODS[1]).astype(int)
+    few = sweeps.take(rotation % 5 == 0)
+    assert ootx.decode_frames(np.where(np.arange(5000) % 5, -1, 1)) == []
+    monkeypatch.setattr(sweep_reports, "decode_frames", pytest.fail)
+    assert report_stations(few) == ((), ())
 
 
 def test_slow_bits_of_chance_are_no_factory_data() -> None:
