@@ -82,20 +82,20 @@ def passage(
 def passages_of(sweeps: Sweeps, start_ns: int) -> list[tuple[float, bytes]]:
     """Times in s and records of a deck; the second pulse of a passage has the offset."""
     time_s = (sweeps.time_ns - start_ns) * 1e-9
-    middle = np.rint(time_s * DECK_HZ).astype(np.int64) + 16_000_000
+    start = np.rint(time_s * DECK_HZ).astype(np.int64) + 16_000_000
     found = []
     for polynomial in np.unique(sweeps.polynomial):
         rows = np.flatnonzero(sweeps.polynomial == polynomial)
-        for group in np.split(rows, np.flatnonzero(np.diff(middle[rows]) > 10_000) + 1):
+        for group in np.split(rows, np.flatnonzero(np.diff(start[rows]) > 10_000) + 1):
             first = group[min(1, len(group) - 1)]
-            reference = int(middle[first]) - PULSE_TICKS // 2
-            # The middles agree with the counts, to a tick.
+            reference = int(start[first])
+            # The starts agree with the counts, to a tick.
             steps = np.rint(4 * (sweeps.count[group] - sweeps.count[first])).astype(int)
             delays = {
                 int(s): int(d) + PULSE_TICKS // 2
                 for s, d in zip(sweeps.sensor[group], steps, strict=True)
             }
-            offset = round(sweeps.count[first] - PULSE_TICKS / 8)
+            offset = round(sweeps.count[first])
             number = int(polynomial)
             data = passage(number // 2 + 1, number % 2, offset, reference, delays)
             found.append((float(time_s[group].max()), data))
@@ -129,20 +129,91 @@ def decoded(*payloads: bytes) -> tuple[dict[str, NDArray[Any]], FrameDecoder]:
 
 def test_a_passage_over_four_photodiodes() -> None:
     # The reference is the start of the pulse of sensor 1; delays include half of each width.
-    columns, decoder = decoded(passage(3, 1, 40_000, 100, {1: 145, 0: -55, 3: 1200, 2: 1100}))
+    columns, decoder = decoded(passage(3, 1, 40_000, 1000, {1: 145, 0: -55, 3: 1200, 2: 1100}))
     assert columns["sensor"].tolist() == [0, 1, 2, 3]
     assert set(columns["channel"]) == {3}
     assert set(columns["polynomial"]) == {5}
     assert set(columns["sweep"]) == {-1}
-    assert columns["count"].tolist() == [40_000 + d / 4 for d in (-55, 145, 1100, 1200)]
-    assert columns["tick"].tolist() == [45, 245, 1200, 1300]
+    assert columns["count"].tolist() == [40_000 + d / 4 for d in (-200, 0, 955, 1055)]
+    assert columns["tick"].tolist() == [800, 1000, 1955, 2055]
     assert (decoder.counts.frames, decoder.counts.bad, decoder.remarks) == (2, 0, [])
 
 
 def test_times_ascend_and_wrap_with_the_clock_of_the_deck() -> None:
-    columns, _ = decoded(passage(1, 0, 30_000, 0xFFFFF0, {3: 10, 0: 20, 1: 4000, 2: -100}))
+    columns, _ = decoded(passage(1, 0, 30_000, 0xFFFFF0, {3: 160, 0: 170, 1: 4000, 2: -100}))
     assert columns["sensor"].tolist() == [2, 3, 0, 1]
-    assert columns["tick"].tolist() == [0xFFFF8C, 0xFFFFFA, 4, 3984]
+    assert columns["tick"].tolist() == [0xFFFFF0 - 260, 0xFFFFF0, 0xFFFFFA, 3840 - 16]
+
+
+@pytest.mark.parametrize(
+    ("delays", "half_width"),
+    [
+        ([-300, 145, 500, 900], 145),  # the second pulse has the offset
+        ([120, 145, 900, 990], 145),  # although the first one could have it, too
+        ([-900, -800, 130, 900], 130),  # only the third one can
+        ([-900, 20, 190, 400], 190),  # the one with the most typical delay
+        ([160], 160),
+        ([-900, -800, -700, 2000], 150),  # its pulse was replaced by a later one
+        ([-900, 900], 150),
+    ],
+)
+def test_sweeps_refer_to_the_starts_of_pulses(delays: list[int], half_width: int) -> None:
+    columns, _ = decoded(passage(1, 0, 40_000, 50_000, dict(enumerate(delays))))
+    assert columns["count"].tolist() == [40_000 + (d - half_width) / 4 for d in delays]
+
+
+PUBLISHED_FRAMES = """
+    1 5431ed 13d None     0 128aa
+    0 543291 141    0 28992 1a639
+    3 5436c4 147    0     0 1f5dc
+    2 543769 140    0     0 026f3
+    0 56bcd9 120 None     0 1b903
+    1 56be78 110    0 70714 175a5
+    2 56c094 113    0     0 05879
+    3 56c21a 12a    0     0 1c094
+    1 5b82f5 13f None     0 0debe
+    0 5b8395 144    1 28992 11c42
+    3 5b87c8 146    1     0 194c5
+    2 5b8870 144    1     0 19e30
+    0 5e0dcf 118 None     0 19864
+    1 5e0f71 119    1 70711 1511f
+    2 5e1189 113    1     0 0d239
+    3 5e1314 127    1     0 08c31
+"""
+"""Sensor, time, width, polynomial, offset and beam word of frames that a deck sent: readme of
+bitcraze/lighthouse-fpga."""
+
+
+def test_published_frames_give_the_same_sweeps_by_wire_and_by_radio() -> None:
+    wire, packets = b"\xff" * 12, []
+    delays: dict[int, tuple[int, int]] = {}
+    channel, reference, offset = -1, 0, 0
+    for line in PUBLISHED_FRAMES.split("\n")[1:-1]:
+        sensor, tick, width, polynomial, position, word = line.split()
+        number = None if polynomial == "None" else int(polynomial)
+        head = 0xFC if number is None else number << 2
+        fields = ((head | int(sensor), 1), (int(width, 16), 2), (int(position), 3))
+        fields = (*fields, (int(word, 16), 3), (int(tick, 16), 3))
+        wire += b"".join(value.to_bytes(size, "little") for value, size in fields)
+        # As lighthouse_transmit.c: a record when all four photodiodes were lit.
+        delays[int(sensor)] = int(tick, 16), int(width, 16) // 2
+        if number is not None and channel < 0:
+            channel, reference = number, int(tick, 16)
+        if int(position):
+            reference, offset = int(tick, 16), int(position)
+        if len(delays) == 4:
+            sent = {key: start + half - reference for key, (start, half) in delays.items()}
+            packets.append(passage(channel // 2 + 1, channel % 2, offset, reference, sent))
+            delays, channel, offset = {}, -1, 0
+    by_radio, _ = decoded(packets[0] + packets[1], packets[2] + packets[3])
+    deck = find_device("lighthouse-deck").create_decoder(Options())
+    batches = [*deck.feed(wire), *deck.finish()]
+    for name in ("sensor", "channel", "polynomial", "count"):
+        by_wire = np.concatenate([batch.columns[name] for batch in batches])
+        # Widths of the pulses of a passage differ by 29 ticks at most, counts by an eighth of it.
+        tolerance = 29 / 8 if name == "count" else 0
+        np.testing.assert_allclose(by_radio[name], by_wire, atol=tolerance, rtol=0)
+    assert len(by_radio["count"]) == 16
 
 
 def test_photodiodes_without_light_give_no_sweep() -> None:
@@ -157,7 +228,7 @@ def test_photodiodes_without_light_give_no_sweep() -> None:
     [
         (passage(1, 0, 0, 0, {0: 100, 1: 200}), 0),  # no offset
         (passage(1, 0, 30_000, 0, {0: 100, 1: 10_001, 2: -10_001}), 1),  # another passage
-        (passage(1, 0, 30, 0, {0: 100, 1: -121}), 1),  # before the rotor's zero
+        (passage(1, 0, 30, 0, {0: 100, 1: -21}), 1),  # before the rotor's zero
     ],
 )
 def test_pulses_that_belong_to_no_sweep_are_reported(data: bytes, used: int) -> None:
@@ -573,10 +644,11 @@ def raw_packets(flight: Any, rng: np.random.Generator) -> list[tuple[float, byte
         if len(seen) < 2:
             continue
         tick = np.rint(crossings["t"][seen] * DECK_HZ).astype(int)
-        reference = int(tick[1]) - PULSE_TICKS // 2
+        reference = int(tick[1])
         period = {1: 959_000, 2: 957_000, 3: 953_000}[channel] / 8
-        offset = round(crossings["fraction"][seen[1]] * period - PULSE_TICKS / 8)
-        delays = dict(zip(crossings["sensor"][seen].tolist(), tick - reference, strict=True))
+        offset = round(crossings["fraction"][seen[1]] * period)
+        delay = tick - reference + PULSE_TICKS // 2
+        delays = dict(zip(crossings["sensor"][seen].tolist(), delay, strict=True))
         bit = int(slow_bits[channel, turn])
         found.append((crossings["t"][seen].max(), passage(channel, bit, offset, reference, delays)))
     return packets_of(sorted(found))
