@@ -149,7 +149,7 @@ def test_times_ascend_and_wrap_with_the_clock_of_the_deck() -> None:
     ("delays", "half_width"),
     [
         ([-300, 145, 500, 900], 145),  # the second pulse has the offset
-        ([120, 145, 900, 990], 145),  # although the first one could have it, too
+        ([148, 185, 900, 990], 185),  # although the first one could have it, too
         ([-900, -800, 130, 900], 130),  # only the third one can
         ([-900, 20, 190, 400], 190),  # the one with the most typical delay
         ([160], 160),
