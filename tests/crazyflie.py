@@ -187,8 +187,10 @@ def deck_frames(
     }  # fmt: skip
 
 
-def firmware_angles(flight: Flight) -> list[tuple[float, int, int, int, float]]:
-    """(time of the event, sensor, station from 0, sweep, angle), of complete rotations.
+def firmware_angles(flight: Flight) -> list[tuple[float, int, int, int, float, float]]:
+    """(time of the event, sensor, station from 0, sweep, angle, time of the light).
+
+    Only complete rotations have angles.
 
     They are complete when the next pulse arrives that is 10,000 ticks later.
     """
@@ -210,7 +212,10 @@ def firmware_angles(flight: Flight) -> list[tuple[float, int, int, int, float]]:
                 zero = (2, 4)[plane] * np.pi / 3
                 count = np.rint(truth["fraction"][row] * 6e6 / ROTOR_HZ[int(channel)])
                 angle = 2 * np.pi * count / 6e6 * ROTOR_HZ[int(channel)] - zero
-                rows.append((time, int(truth["sensor"][row]), int(channel) - 1, plane, angle))
+                light = float(truth["t"][row])
+                rows.append(
+                    (time, int(truth["sensor"][row]), int(channel) - 1, plane, angle, light)
+                )
     return sorted(rows, key=lambda row: row[0])
 
 
@@ -306,7 +311,7 @@ def write_flight(
                 tick & 0xFFFFFF, tick & 0xFFFFFFFF, 3.9,
             )  # fmt: skip
     if angles or estimator:
-        for time_s, sensor, station, sweep, angle in firmware_angles(flight):
+        for time_s, sensor, station, sweep, angle, _ in firmware_angles(flight):
             at = float(stamp(time_s + 0.0006))
             if angles:
                 log.add(at, 12, sensor, station, sweep, angle, angle + 0.01)
@@ -323,3 +328,33 @@ def to_quaternion(matrix: Array) -> Array:
     y = (matrix[:, 0, 2] - matrix[:, 2, 0]) / (4 * w)
     z = (matrix[:, 1, 0] - matrix[:, 0, 1]) / (4 * w)
     return np.column_stack([x, y, z, w])
+
+
+def system_config(stations: list[FlightStation]) -> dict[str, object]:
+    """Content of the YAML file of cfclient."""
+    names = ("curve", "gibmag", "gibphase", "ogeemag", "ogeephase")
+    geometries = {
+        station.channel - 1: {
+            "origin": station.position.tolist(),
+            "rotation": station.rotation.tolist(),
+        }
+        for station in stations
+    }
+    calibrations = {
+        station.channel - 1: {
+            "uid": 1000 + station.channel,
+            "sweeps": [
+                {
+                    "phase": station.phase[plane],
+                    "tilt": station.tilt[plane],
+                    **dict.fromkeys(names, 0.0),
+                }
+                for plane in (0, 1)
+            ],
+        }
+        for station in stations
+    }
+    return {
+        "type": "lighthouse_system_configuration", "version": "1", "systemType": 2,
+        "geos": geometries, "calibs": calibrations,
+    }  # fmt: skip

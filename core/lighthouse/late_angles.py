@@ -33,16 +33,25 @@ MAX_DELAY_TURNS = 0.7
 """Longest time from the second sweep to the event [rotations]: with one station, the next light is
 the first sweep of the next rotation, after two thirds."""
 
+MIN_POSSIBLE_FRACTION = 0.9
+"""Fraction of the delays of a station that must be possible. The others follow a hidden pulse."""
+
+MAX_EQUAL_DIFFERENCE = 0.005
+"""Difference of such fractions that is insignificant."""
+
+DELAY_BINS = 100
+"""Resolution of delays, in parts of a rotation."""
+
 COARSE_SPAN_S = 60.0
 """Part of a recording in which the rate is searched [s]."""
 
 RATE_STEPS_PER_TURN = 20
 """Rates that are tried for each rotation by which they change the end of the recording."""
 
-MIN_SPAN_S = 10.0
-"""Shortest recording of several stations in which the smallest delay occurs [s]. It needs the light
-of another station soon after the second sweep, and two rotors take up to 9.6 s for all their
-relative phases (channels 1 and 2)."""
+MIN_SPAN_S = 20.0
+"""Shortest recording of several stations in which smallest delays occur at the beginning and at the
+end [s]. They need the light of another station soon after the second sweep, and two rotors take up
+to 9.6 s for all their relative phases (channels 1 and 2)."""
 
 MIN_EVENTS = 20
 """Events of a station that are needed to find the phase of its rotor."""
@@ -158,48 +167,71 @@ def _mean_counts(group: IntArray, plane: IntArray, count: Array) -> Array:
 def _most_regular_rate(
     stations: Sequence[tuple[Array, Array, float]], rates: Sequence[tuple[float, float]]
 ) -> float:
-    """Return the rate of the clock at which delays after the rotors' zeros are most alike.
+    """Return the rate of the clock at which the delays of all stations are possible.
 
     It is searched at the beginning of the recording, and then refined with more and more of it. The
-    least regular station decides: an event also occurs at the light of another station, so that at
-    a wrong rate, which makes up for the difference of their periods, one of them appears more
-    regular, and the other one less.
+    worst station decides: an event also occurs at the light of another station, so that at a wrong
+    rate, which makes up for the difference of their periods, one of them appears more regular, and
+    the other one less.
     """
     start_s = min(float(group_s[0]) for group_s, _, _ in stations)
-    end_s = max(float(group_s[-1]) for group_s, _, _ in stations)
+    duration_s = max(float(group_s[-1]) for group_s, _, _ in stations) - start_s
     span_s = COARSE_SPAN_S
     while True:
-        early = [
-            (group_s[group_s - start_s <= span_s] - start_s, second_s, period_s)
-            for group_s, second_s, period_s in stations
-        ]
-        span_s = min(span_s, max(end_s - start_s, 1.0))
-        step = min(period_s for _, _, period_s in early) / span_s / RATE_STEPS_PER_TURN
+        step = (
+            min(period_s for _, _, period_s in stations)
+            / max(min(span_s, duration_s), 1.0)
+            / RATE_STEPS_PER_TURN
+        )
         tried = np.concatenate(
             [np.linspace(low, high, 2 + int((high - low) / step)) for low, high in rates]
         )
-        regularity = np.ones(len(tried))
-        for group_s, second_s, period_s in early:
-            for k, rate in enumerate(tried if len(group_s) else ()):
-                turns = (group_s / rate - second_s[: len(group_s)]) / period_s
-                regularity[k] = min(regularity[k], abs(np.exp(2j * np.pi * turns).mean()))
-        best = float(tried[np.argmax(regularity)])
-        if span_s >= end_s - start_s:
+        possible = np.ones(len(tried))
+        for group_s, second_s, period_s in stations:
+            n = int(np.searchsorted(group_s, start_s + span_s, side="right"))
+            elapsed_s = group_s[:n] - start_s
+            for k, rate in enumerate(tried if n else ()):
+                turns = (elapsed_s / rate - second_s[:n]) / period_s
+                possible[k] = min(possible[k], _possible_fraction(turns)[0])
+        best = float(tried[_middle_of_maximum(possible)])
+        if span_s >= duration_s:
             return best
-        rates = [(best - 2 * step, best + 2 * step)]
+        rates = [(best - 5 * step, best + 5 * step)]
         span_s *= 4
 
 
+def _middle_of_maximum(values: Array) -> int:
+    """Return the middle of the range around the first maximum in which values are nearly equal."""
+    peak = int(np.argmax(values))
+    low = np.flatnonzero(values < values[peak] - MAX_EQUAL_DIFFERENCE)
+    before, after = low[low < peak], low[low > peak]
+    first = int(before[-1]) + 1 if len(before) else 0
+    last = int(after[0]) - 1 if len(after) else len(values) - 1
+    return (first + last) // 2
+
+
+def _possible_fraction(turns: Array) -> tuple[float, float]:
+    """Return the largest fraction of delays within :data:`MAX_DELAY_TURNS`, and their smallest one.
+
+    ``turns`` (n,) are delays with an unknown constant; whole rotations are ignored.
+    """
+    bins = np.bincount(
+        ((turns % 1) * DELAY_BINS).astype(np.int64) % DELAY_BINS, minlength=DELAY_BINS
+    )
+    sums = np.concatenate([[0], np.cumsum(np.tile(bins, 2))])
+    width = round(MAX_DELAY_TURNS * DELAY_BINS)
+    inside = sums[width : width + DELAY_BINS] - sums[:DELAY_BINS]
+    # Of equal arcs the middle one is taken: wrong delays are then on both sides of it.
+    best = np.exp(2j * np.pi * np.flatnonzero(inside == inside.max()) / DELAY_BINS)
+    first = round(float(np.angle(best.mean())) / (2 * np.pi) * DELAY_BINS) % DELAY_BINS
+    return float(inside[first] / len(turns)), first / DELAY_BINS
+
+
 def _number_turns(group_s: Array, second_s: Array, period_s: float, rate: float) -> IntArray | None:
-    """Return the rotation of each event; None if the delays are not below their largest value."""
+    """Return the rotation of each event; None if most delays are impossible."""
     turns = (group_s / rate - second_s) / period_s
-    fraction = np.sort(turns % 1)
-    # The delays are in an arc; the largest gap on the circle precedes the smallest delay. Few
-    # wrong angles in the gap do not matter to the arc that contains most events.
-    doubled = np.concatenate([fraction, fraction + 1])
-    inside = np.searchsorted(doubled, fraction + MAX_DELAY_TURNS) - np.arange(len(fraction))
-    first = float(fraction[np.argmax(inside)])
-    if inside.max() < 0.9 * len(fraction):
+    fraction, first = _possible_fraction(turns)
+    if fraction < MIN_POSSIBLE_FRACTION:
         return None
     margin = (1 - MAX_DELAY_TURNS) / 2
     return np.floor(turns - first + margin).astype(np.int64)

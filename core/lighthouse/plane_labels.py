@@ -159,6 +159,8 @@ def track_rotor(tick: IntArray, offset: IntArray, period: float) -> RotorTrack |
     RotorTrack or None
         None if the offsets do not agree with a rotor of this period.
     """
+    if not len(tick):
+        return None
     order = np.argsort(tick, kind="stable")
     time = tick[order].astype(float)
     zero = time - offset[order]

@@ -66,6 +66,9 @@ MIN_STEPS = (("s", 0.0), ("ms", 5.0), ("us", 5e3), ("ns", 5e6))
 """Units of time, and the smallest step of samples in them. The periods of log blocks are 10 ms to
 2.55 s (crazyflie-firmware ``log.c``)."""
 
+MAX_VALUE = 1e10
+"""Largest value of a variable; a packed quaternion is less than 2^32."""
+
 MAX_BACK_STEP_NS = 1_000_000_000
 """Largest step back of the times of packets; a larger one is a restart of the Crazyflie."""
 
@@ -217,7 +220,7 @@ def _wide_series(table: Table, time_name: str) -> tuple[dict[str, Array], tuple[
         if name is None or name in series:
             unused += [header] if header and header != time_name else []
             continue
-        series[name] = table.floats(header, allow_missing=True)
+        series[name] = table.floats(header, -MAX_VALUE, MAX_VALUE, allow_missing=True)
     return series, tuple(unused)
 
 
@@ -238,7 +241,7 @@ def _long_series(
         },
         table.lines,
     )
-    values = wanted.floats(value_name, allow_missing=True)
+    values = wanted.floats(value_name, -MAX_VALUE, MAX_VALUE, allow_missing=True)
     names, number = np.unique(cells, return_inverse=True)
     series = {
         _KNOWN[name]: np.where(number == k, values, np.nan)

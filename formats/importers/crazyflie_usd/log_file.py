@@ -18,7 +18,7 @@ from __future__ import annotations
 import re
 import zlib
 from array import array
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -80,10 +80,10 @@ class Event:
     def __len__(self) -> int:
         return len(self.time_s)
 
-    def take(self, chosen: NDArray[np.bool_]) -> Event:
-        """Return the selected events."""
-        columns = {name: values[chosen] for name, values in self.columns.items()}
-        return replace(self, time_s=self.time_s[chosen], columns=columns)
+    def floats(self, name: str) -> NDArray[np.float64]:
+        """Return the values of a variable (n,) as float64."""
+        with np.errstate(invalid="ignore"):  # A signalling nan becomes a quiet one.
+            return self.columns[name].astype(np.float64)
 
 
 @dataclass(frozen=True)

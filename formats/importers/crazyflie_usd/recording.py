@@ -31,7 +31,9 @@ from locatk.formats.artifacts.receiver import read_receiver
 from locatk.formats.importers.crazyflie import read_config
 from locatk.formats.importers.crazyflie_usd.log_file import UsdLog, read_usd_log
 from locatk.formats.importers.crazyflie_usd.sweeps import (
+    SWEEP_EVENTS,
     LoggedSweeps,
+    find_sources,
     read_angles,
     read_uart_frames,
 )
@@ -53,8 +55,8 @@ DECK_NAME = "deck"
 DEVICE = "crazyflie"
 """Default name of the device."""
 
-SWEEP_EVENTS = {"uart": "lhUartFrame", "lhangle": "lhAngle", "estimator": "estSweepAngle"}
-"""Events with sweeps by the names of their sources, the best first."""
+MAX_DURATION_S = 1e6
+"""Longest log [s], 12 days; a card of 32 GB is full after one."""
 
 NOMINAL_RATES = (0.999, 1.001)
 SLOW_RATES = (84 / 85 - 0.001, 84 / 85 + 0.001)
@@ -124,15 +126,24 @@ def read_crazyflie_usd(
         )
     path = Path(paths[0])
     log = read_usd_log(path)
+    times = [
+        limit for e in log.events.values() if len(e) for limit in (e.time_s.min(), e.time_s.max())
+    ]
+    if times and max(times) - min(times) > MAX_DURATION_S:
+        raise FormatError(
+            f"its events are {(max(times) - min(times)) / 86400:.0f} days apart",
+            file=path,
+            hint="The log is damaged",
+        )
     scene, warnings = read_scene(config, stations)
-    sources = [name for name, event in SWEEP_EVENTS.items() if len(log.events.get(event, ()))]
+    sources = find_sources(log.events)
     source = _choose_source(sources, sweeps, log, path)
     logged = _read_sweeps(log, source)
     if logged is None or not len(logged):
         problem = "" if logged is None else f": {describe_rejected(logged.rejected)}"
         raise InputError(
-            f"none of the {len(log.events[SWEEP_EVENTS[source]])} events "
-            f"{SWEEP_EVENTS[source]} is usable{problem}",
+            f"none of the {len(log.events[SWEEP_EVENTS[source][0]])} events "
+            f"{SWEEP_EVENTS[source][0]} is usable{problem}",
             file=path,
             hint="A recording needs a few seconds of light of a station",
         )
@@ -221,7 +232,7 @@ def _choose_source(sources: list[str], wanted: str | None, log: UsdLog, path: Pa
         return sources[0]
     if wanted not in sources:
         raise InputError(
-            f"no event {SWEEP_EVENTS[wanted]} in the log",
+            f"no event {SWEEP_EVENTS[wanted][0]} in the log",
             file=path,
             hint=f"Give --sweeps {' or '.join(sources)}",
         )
@@ -230,7 +241,7 @@ def _choose_source(sources: list[str], wanted: str | None, log: UsdLog, path: Pa
 
 def _read_sweeps(log: UsdLog, source: str) -> LoggedSweeps | None:
     """Return the sweeps of a source; None if none is usable."""
-    event = log.events[SWEEP_EVENTS[source]]
+    event = log.events[SWEEP_EVENTS[source][0]]
     if source == "uart":
         return read_uart_frames(event, log.resolution_s)
     return read_angles(event, clock_rates(log), log.resolution_s)
@@ -258,7 +269,7 @@ def _log_blocks(log: UsdLog, clock: ClockLine, start_s: float) -> tuple[list[Log
     for event in log.events.values():
         names = USED_VARIABLES & event.columns.keys()
         if names and len(event):
-            columns = {name: event.columns[name].astype(float) for name in names}
+            columns = {name: event.floats(name) for name in names}
             time_ns = _to_ns(clock.to_reference(event.time_s), start_s)
             block, count = LogBlock.ascending(time_ns, columns)
             blocks.append(block)
@@ -298,8 +309,8 @@ def describe_rejected(rejected: dict[str, int]) -> str:
 def _facts(
     path: Path, log: UsdLog, logged: LoggedSweeps, sources: list[str], source: str
 ) -> dict[str, str]:
-    event = SWEEP_EVENTS[source]
-    others = [SWEEP_EVENTS[name] for name in sources if name != source]
+    event = SWEEP_EVENTS[source][0]
+    others = [SWEEP_EVENTS[name][0] for name in sources if name != source]
     start_s = logged.clock.offset_s + logged.clock.rate * _start_s(log, logged)
     facts = {
         "format": f"crazyflie-usd, version {log.version}",

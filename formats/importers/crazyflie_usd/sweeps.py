@@ -14,7 +14,7 @@ Sources: crazyflie-firmware ``lighthouse_core.c``, ``estimator.c`` and ``usddeck
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,14 +37,14 @@ STATION_LIMITS = (2, 4, 16)
 """Numbers of stations for which firmware is built. A frame of an unknown channel has this number
 as its station (``pulse_processor.h``, ``lighthouse_core.c``)."""
 
-ANGLE_VARIABLES = (
-    ("sensor", "sensorid"),
-    ("basestation", "basestationid"),
-    ("sweep", "sweepid"),
-    ("angle", "sweepangle"),
-)
-"""Variables of ``lhAngle`` and of ``estSweepAngle``. The variable ``t`` of the latter is the
-nominal tilt of the plane, not a time."""
+SWEEP_EVENTS = {
+    "uart": ("lhUartFrame", ("sensor", "basestation", "offset", "timestampfpga"), ()),
+    "lhangle": ("lhAngle", ("sensor", "basestation", "sweep"), ("angle",)),
+    "estimator": ("estSweepAngle", ("sensorid", "basestationid", "sweepid"), ("sweepangle",)),
+}
+"""Events with sweeps by the names of their sources, the best first: name, variables that are
+integers, and variables that are numbers. The variable ``t`` of ``estSweepAngle`` is the nominal
+tilt of the plane, not a time."""
 
 MAX_TIME_ERROR_S = 1.0
 """Largest difference of the deck's counter from the Crazyflie's clock [s]. It is milliseconds."""
@@ -92,7 +92,8 @@ def read_uart_frames(event: Event, resolution_s: float) -> LoggedSweeps | None:
     columns = event.columns
     station, offset = columns["basestation"].astype(np.int64), columns["offset"].astype(np.int64)
     sensor = columns["sensor"].astype(np.int64)
-    bits, name = (32, "timestamp2fpga") if "timestamp2fpga" in columns else (24, "timestampfpga")
+    has_long_counter = "timestamp2fpga" in columns and columns["timestamp2fpga"].dtype.kind in "iu"
+    bits, name = (32, "timestamp2fpga") if has_long_counter else (24, "timestampfpga")
     tick = unwrap_counter(columns[name].astype(np.int64), event.time_s, PULSE_HZ, bits)
     clock = fit_clock_line(tick / PULSE_HZ, event.time_s, resolution_s=resolution_s)
     if clock is None:
@@ -101,7 +102,8 @@ def read_uart_frames(event: Event, resolution_s: float) -> LoggedSweeps | None:
     is_usable = (station >= 0) & (station < len(CHANNELS)) & (station != unknown_station(event))
     channel = np.where(is_usable, station + CHANNELS[0], UNKNOWN)
     delay_s = clock.to_reference(event.time_s) - tick / PULSE_HZ
-    is_timed = (np.abs(delay_s) <= MAX_TIME_ERROR_S) & (sensor < SENSOR_COUNT)
+    is_timed = np.abs(delay_s) <= MAX_TIME_ERROR_S
+    is_timed &= (sensor >= 0) & (sensor < SENSOR_COUNT)
     rows = np.flatnonzero(is_timed)
     labelled = label_pulses(tick[rows], sensor[rows], channel[rows], offset[rows])
     rejected = dict(labelled.rejected)
@@ -120,6 +122,19 @@ def read_uart_frames(event: Event, resolution_s: float) -> LoggedSweeps | None:
         "the Lighthouse deck's counter of 24 MHz",
         rejected,
     )
+
+
+def find_sources(events: Mapping[str, Event]) -> list[str]:
+    """Return the sources of sweeps in a log, the best first."""
+    sources = []
+    for source, (name, integers, numbers) in SWEEP_EVENTS.items():
+        event = events.get(name)
+        if event is not None and len(event):
+            kinds = {key: values.dtype.kind for key, values in event.columns.items()}
+            has_integers = all(kinds.get(key, "") in ("i", "u") for key in integers)
+            if has_integers and all(key in kinds for key in numbers):
+                sources.append(source)
+    return sources
 
 
 def unknown_station(event: Event) -> int:
@@ -141,13 +156,13 @@ def read_angles(
 
     ``rates`` are the possible rates of the Crazyflie's clock, ``resolution_s`` that of its stamps.
     """
-    columns = [
-        next(event.columns[name] for name in names if name in event.columns)
-        for names in ANGLE_VARIABLES
-    ]
-    sensor, station, plane = (values.astype(np.int64) for values in columns[:3])
-    angle = columns[3].astype(float)
-    is_usable = (sensor < SENSOR_COUNT) & (station < len(CHANNELS)) & (plane < 2)
+    _, integers, (angle_name,) = next(
+        each for each in SWEEP_EVENTS.values() if each[0] == event.name
+    )
+    sensor, station, plane = (event.columns[name].astype(np.int64) for name in integers)
+    angle = event.floats(angle_name)
+    is_usable = (sensor >= 0) & (sensor < SENSOR_COUNT) & (station >= 0) & (plane >= 0)
+    is_usable &= (station < len(CHANNELS)) & (plane < 2)
     channel = np.where(is_usable, station + CHANNELS[0], CHANNELS[0])
     turns = (angle - ROTOR_ZERO_RAD[np.clip(plane, 0, 1)]) / (2 * np.pi)
     is_usable &= (turns >= 0) & (turns < 1)

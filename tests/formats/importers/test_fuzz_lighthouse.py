@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import gzip
+import importlib.util
 import io
 import itertools
 import json
@@ -46,6 +47,8 @@ from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.descriptions.lighthouse import describe_recording
 from locatk.formats.exporters.crazyflie import dumps_config
 from locatk.formats.importers.crazyflie import read_config
+from locatk.formats.importers.crazyflie_csv import read_crazyflie_csv
+from locatk.formats.importers.crazyflie_usd.recording import read_crazyflie_usd
 from locatk.formats.importers.dotbot.log import read_dotbot_log
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.importers.libsurvive.device import read_stored_calibrations
@@ -240,6 +243,33 @@ LOGS = [
 ]
 
 
+def crazyflie_logs() -> list[bytes]:
+    """Logs of a Crazyflie's micro SD card of both versions, and with the firmware's angles."""
+    path = Path(__file__).parents[2] / "crazyflie.py"
+    spec = importlib.util.spec_from_file_location("crazyflie_of_the_fuzzer", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    flight = module.Flight(2.2)
+    ways = ({"version": 1}, {"quaternion": False}, {"frames": False, "angles": True})
+    rng = np.random.default_rng(1)
+    return [module.write_flight(flight, rng, **way).data() for way in ways]
+
+
+def crazyflie_tables() -> list[bytes]:
+    """Log variables of a Crazyflie as CSV, in columns and in rows."""
+    names = ["acc.x", "acc.y", "acc.z", "stateEstimate.x", "stateEstimate.y", "stateEstimate.z"]
+    names += [f"stateEstimate.{name}" for name in ("roll", "pitch", "yaw")]
+    names += [f"lighthouse.rawAngle0{axis}lh2" for axis in "xy"]
+    wide = [",".join(["Timestamp", *names])]
+    wide += [",".join([str(10 * k), *(f"{0.1 * j + k}" for j in range(11))]) for k in range(20)]
+    rows = ["time_s,name,value"]
+    rows += [f"{0.01 * k:.2f},{name},{0.1 * k}" for k in range(20) for name in names]
+    return ["\n".join([*lines, ""]).encode() for lines in (wide, rows)]
+
+
 FACTORY = ootx.decode_factory_data(payload()).calibration
 SCENE = Scene(
     stations=(Station(1, np.array([1.0, 2.0, 3.0]), np.eye(3), FACTORY, 0x4CC60647),),
@@ -330,13 +360,18 @@ def written(session: ImportedSession, path: Path) -> None:
         facts=session.facts,
         stations=session.stations,
         receivers=session.receivers,
+        imu=session.imu,
+        onboard=session.onboard,
         overwrite=True,
     )
     for text in (*session.warnings, session.lost or "", *session.facts.values()):
         assert "\n" not in text
     again = Session.open(path)
-    sweeps = observations.read_sweeps(again)
-    assert sorted(sweeps.count.tolist()) == sorted(session.sweeps.count.tolist())
+    if len(session.sweeps):
+        sweeps = observations.read_sweeps(again)
+        assert sorted(sweeps.count.tolist()) == sorted(session.sweeps.count.tolist())
+    assert sum(map(len, observations.read_imu(again))) == sum(map(len, session.imu))
+    assert sum(map(len, observations.read_onboard(again))) == sum(map(len, session.onboard))
     assert len(observations.read_station_reports(again)) == len(session.stations)
     assert observations.read_receivers(again).keys() == session.receivers.keys()
     observations.read_scene(again)
@@ -511,6 +546,16 @@ FILES: dict[str, tuple[str, Sequence[bytes], Callable[[Path, bool], Any]]] = {
     ),
     "libsurvive-stored": ("run.json", [STORED], lambda path, _: read_stored_calibrations(path)),
     "dotbot-log": ("pydotbot.log", LOGS, importer(lambda path: read_dotbot_log([path]))),
+    "crazyflie-usd": (
+        "log00",
+        crazyflie_logs(),
+        importer(lambda path: read_crazyflie_usd([path])),
+    ),
+    "crazyflie-csv": (
+        "log.csv",
+        crazyflie_tables(),
+        importer(lambda path: read_crazyflie_csv([path])),
+    ),
     "crazyflie": (
         "config.yaml",
         [dumps_config(SCENE).encode()],
