@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
+from locatk.cli.capture import text as capture_text
 from locatk.cli.command import Command, section
+from locatk.cli.signals import asked_to_stop
 from locatk.cli.solve.command import scene_option
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
     from locatk.core.lighthouse.results import FrameFacts
     from locatk.core.lighthouse.scene.setup import SceneSetup
+    from locatk.formats.capture.status import CaptureStatus
     from locatk.formats.pipeline import SolveReport
 
 MAX_COORDINATE_MM = 1e6
@@ -103,10 +107,35 @@ setup_options = section(
 )
 
 
+wizard_options = section(
+    "Wizard",
+    click.option(
+        "--wizard",
+        "port",
+        metavar="PORT",
+        help="Record SESSION from this port, as `locatk capture` does, and guide through it: the "
+        "origin, a point on the x axis, points on the floor, and a motion through the room. "
+        "SESSION is OUTPUT with the ending .mcap by default.",
+    ),
+    click.option(
+        "--port-device",
+        metavar="NAME",
+        help="Device at the port, as --device of `locatk capture`.  [default: auto]",
+    ),
+    click.option("--baud", type=click.IntRange(min=1), help="[default: that of the device]"),
+    click.option(
+        "--floor-points",
+        type=click.IntRange(0, 20),
+        help="Number of points on the floor besides the origin and the x axis.  [default: 2]",
+    ),
+)
+
+
 @click.command("scene", cls=Command, short_help="Estimate the poses of Lighthouse stations.")
-@options.input_argument("session")
+@click.argument("session", type=options.PATH, required=False)
 @options.output("Scene to write (.toml).", endings=(".toml",))
 @setup_options
+@wizard_options
 @click.option(
     "--method",
     type=click.Choice(("bundle", "paper")),
@@ -117,12 +146,16 @@ setup_options = section(
 @options.as_json
 @options.verbosity
 def command(
-    session: Path,
+    session: Path | None,
     output: Path,
     method: str | None,
     scene: str | None,
     overwrite: bool,
     as_json: bool,
+    port: str | None,
+    port_device: str | None,
+    baud: int | None,
+    floor_points: int | None,
     **points: Any,
 ) -> None:
     """Estimate the Lighthouse stations of SESSION and write them as a scene.
@@ -138,11 +171,93 @@ def command(
       locatk calibrate scene run.mcap -o scene.toml --floor --x-distance 1000
       locatk calibrate scene run.mcap -o scene.toml --marker a=0,0 --marker b=2000,0
           --marker c=2000,1500
+      locatk calibrate scene -o scene.toml --wizard /dev/ttyACM0 --x-distance 1000
       locatk solve later.mcap -o solved.mcap --artifact scene.toml
     """
     setup = scene_setup(**points)
-    options.guard_output(output, overwrite=overwrite, inputs=[session])
+    if port is not None:
+        session = session or output.with_suffix(".mcap")
+        setup = record_with_guide(
+            session,
+            output,
+            setup,
+            port=port,
+            device=port_device or "auto",
+            baud=baud,
+            floor_points=2 if floor_points is None else floor_points,
+            overwrite=overwrite,
+        )
+    else:
+        for option, value in (
+            ("--port-device", port_device),
+            ("--baud", baud),
+            ("--floor-points", floor_points),
+        ):
+            if value is not None:
+                raise click.UsageError(f"{option} needs --wizard.")
+        if session is None:
+            raise click.UsageError("Missing argument 'SESSION'.")
+        options.must_exist([session])
+        options.guard_output(output, overwrite=overwrite, inputs=[session])
     solve_scene(session, output, setup, method, scene, overwrite=overwrite, as_json=as_json)
+
+
+def record_with_guide(
+    session: Path,
+    output: Path,
+    setup: SceneSetup,
+    *,
+    port: str,
+    device: str,
+    baud: int | None,
+    floor_points: int,
+    overwrite: bool,
+) -> SceneSetup:
+    """Record a session while guiding through it, and return the setup of its scene.
+
+    Raises
+    ------
+    failures.Incomplete
+        The recording ended before all points were visited. It is kept.
+    """
+    from locatk.formats.capture.scene_guide import SceneGuide
+    from locatk.formats.capture.setup import CaptureRequest, record
+    from locatk.formats.sessions.observations import read_sweeps
+    from locatk.formats.sessions.reader import Session
+
+    if setup.markers or setup.origin or setup.x_axis or setup.ignored or setup.device:
+        raise click.UsageError("--wizard finds the points itself: leave out --marker and numbers.")
+    options.check_ending(session, (".mcap",))
+    options.guard_output(output, overwrite=overwrite)
+    guide = SceneGuide(floor_points, setup.x_distance_m)
+    stop = threading.Event()
+    with capture_text.live() as live, asked_to_stop(stop.set):
+
+        def show(status: CaptureStatus) -> None:
+            for line in guide.update(status.elapsed_s):
+                live.wipe()
+                console.say(line)
+            live.line(f"{capture_text.clock(status.elapsed_s)}  {guide.status}")
+            if guide.is_done:
+                stop.set()
+
+        request = CaptureRequest(port, device, session, baud=baud, overwrite=overwrite)
+        recorded = record(
+            request,
+            stop,
+            tell=live.tell,
+            show=show,
+            ready=live.ready,
+            waiting=live.waiting,
+            observe=guide.observe,
+        )
+    if not guide.can_finish:
+        raise failures.Incomplete(
+            f"{len(guide.accepted)} of {floor_points + 2} points were recorded ({recorded.ended}); "
+            f"the recording is kept in {session}, and no scene was written"
+        )
+    sweeps = read_sweeps(Session.open(session))
+    return guide.setup(sweeps, setup.x_distance_m, setup.height_m)
 
 
 def scene_setup(

@@ -49,9 +49,12 @@ class Live:
 
     def show(self, status: Any) -> None:
         """Show the status."""
+        self.line(status_line(status))
+
+    def line(self, text: str) -> None:
+        """Show a text in the place of the status line."""
         if not self._shown:
             return
-        text = status_line(status)
         if self._terminal:
             text = text[: shutil.get_terminal_size().columns - 1]
             console.control("\r" + text.ljust(self._width))

@@ -15,7 +15,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.clocks import HostClock
-from locatk.formats.capture.ingestion import Intake
+from locatk.formats.capture.ingestion import Intake, StampedMessage
 from locatk.formats.capture.reader_thread import (
     ConnectionLost,
     Event,
@@ -103,6 +103,8 @@ class Recorder:
         Takes messages for the user: gaps, silence, a disk that fills up.
     show : callable
         Takes a :class:`CaptureStatus` once per second.
+    observe : callable
+        Takes each message of the recording before it is written.
     """
 
     def __init__(
@@ -115,10 +117,11 @@ class Recorder:
         *,
         tell: Callable[[str], None],
         show: Callable[[CaptureStatus], None],
+        observe: Callable[[StampedMessage], None] | None = None,
     ) -> None:
         self._reader, self._intake, self._files = reader, intake, files
         self._clock, self._limits = clock, limits
-        self._tell, self._show = tell, show
+        self._tell, self._show, self._observe = tell, show, observe
         self._totals = CaptureStatistics()
         self._part_began = CaptureStatistics()
         self._disconnected_ns: int | None = None
@@ -258,7 +261,7 @@ class Recorder:
             else:
                 ended = event
         self._take(received)
-        self._files.write(self._intake.turn(self._clock.now()))
+        self._files.write(self._observed(self._intake.turn(self._clock.now())))
         self._files.system(self._intake.system)
         self._files.attach(self._intake.artifacts())
         for remark in self._intake.remarks():
@@ -268,7 +271,14 @@ class Recorder:
     def _take(self, received: Sequence[ReceivedData]) -> None:
         if received:
             self._rotate()  # Before the first byte of a part, so that none is empty.
-            self._files.write(self._intake.take(received))
+            self._files.write(self._observed(self._intake.take(received)))
+
+    def _observed(self, messages: Iterator[StampedMessage]) -> Iterator[StampedMessage]:
+        """Yield messages, which the observer takes first."""
+        for message in messages:
+            if self._observe is not None:
+                self._observe(message)
+            yield message
 
     def _close_gap(self, event: Reconnected) -> None:
         assert self._disconnected_ns is not None

@@ -16,7 +16,13 @@ from locatk.core.errors import InputError, LocatkError
 from locatk.formats.capture import ports, replay
 from locatk.formats.capture.attachments import attachments
 from locatk.formats.capture.clocks import HostClock
-from locatk.formats.capture.ingestion import AUTO, CameraIntake, Intake, SerialIntake
+from locatk.formats.capture.ingestion import (
+    AUTO,
+    CameraIntake,
+    Intake,
+    SerialIntake,
+    StampedMessage,
+)
 from locatk.formats.capture.links import Link, Port, SourceError
 from locatk.formats.capture.reader_thread import BACKOFF_S, PortReader
 from locatk.formats.capture.recorder import Limits, Recorder
@@ -77,6 +83,7 @@ def record(
     show: Callable[[CaptureStatus], None] = lambda status: None,
     ready: Callable[[str], None] = lambda port: None,
     waiting: Callable[[str], None] = lambda port: None,
+    observe: Callable[[StampedMessage], None] | None = None,
 ) -> RecordingResult:
     """Record until ``stop`` is set, a limit is reached or the source ends.
 
@@ -84,7 +91,7 @@ def record(
     ----------
     request : CaptureRequest
     stop : threading.Event
-    tell, show : callable
+    tell, show, observe : callable
         See :class:`.recorder.Recorder`.
     ready : callable
         Takes the name of the port once it is open.
@@ -122,7 +129,9 @@ def record(
         link.close()
         raise
     reader = PortReader(port, link, clock)
-    recorder = Recorder(reader, intake, files, clock, request.limits, tell=tell, show=show)
+    recorder = Recorder(
+        reader, intake, files, clock, request.limits, tell=tell, show=show, observe=observe
+    )
     return recorder.run(stop)
 
 

@@ -20,7 +20,7 @@ from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.scene.levelling import level_solution
+from locatk.core.lighthouse.scene.levelling import inertial_ups, level_solution
 from locatk.core.lighthouse.scene.setup import (
     AssignedStandstill,
     SceneSetup,
@@ -161,6 +161,7 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
         conflicts += warnings
     initial = station_reports.add_station_data(known, reports) or Scene()
     odometry = observations.read_odometry(session)
+    imus = observations.read_imu(session)
     receivers = _rigid_devices(sweeps, observations.read_receivers(session))
     more: dict[str, Any] = {"receivers": receivers} if receivers else {}
     options = _solver_options(lighthouse.SolveOptions, method=request.method, scene=request.scene)
@@ -172,13 +173,16 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     def solve() -> Solution:
         setup, prior = request.setup, initial
         rests: tuple[AssignedStandstill, ...] = ()
+        standstills = find_standstills(sweeps) if setup is not None or imus else []
         if setup is not None:
-            rests = assign_standstills(setup, find_standstills(sweeps))
+            rests = assign_standstills(setup, standstills)
             prior = add_to_prior(initial, setup, rests, is_rigid=bool(receivers))
         solution = lighthouse.solve(sweeps, prior, options, odometry=odometry, **more)
         if setup is not None and setup.has_floor:
-            solution = place_on_floor(solution, setup, rests, prior)
-        solution = level_solution(solution, prior)
+            ups = inertial_ups(imus, solution.trajectories, standstills)
+            solution = place_on_floor(solution, setup, rests, prior, ups)
+        ups = inertial_ups(imus, solution.trajectories, standstills)
+        solution = level_solution(solution, prior, ups)
         if rests:
             solution = with_standstills(solution, rests)
         return replace(solution, warnings=(*conflicts, *solution.warnings))

@@ -32,7 +32,13 @@ from locatk.formats.sessions import capture_record
 from locatk.formats.sessions.field_samples import read_halls, read_magnetometers
 from locatk.formats.sessions.frames import read_frames
 from locatk.formats.sessions.inertial import imu_streams, read_imu
-from locatk.formats.sessions.messages import MAX_BATCH_NS, SWEEPS, TimedMessage, batch_edges
+from locatk.formats.sessions.messages import (
+    MAX_BATCH_NS,
+    SWEEPS,
+    Batches,
+    TimedMessage,
+    batch_edges,
+)
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_solution, read_trajectories, write_solution
 from locatk.formats.sessions.station_reports import (
@@ -70,6 +76,7 @@ __all__ = [
     "read_trajectories",
     "read_truth",
     "sweep_messages",
+    "sweeps_of_batches",
     "write_session",
     "write_solution",
     "write_sweeps",
@@ -107,13 +114,19 @@ def read_sweeps(session: Session) -> Sweeps:
             file=session.path,
             hint=_describe_topics(session),
         )
-    batches = read_batches(session, topics, SWEEPS)
+    sweeps = sweeps_of_batches(read_batches(session, topics, SWEEPS))
+    _check_ranges(sweeps, session.path)
+    return sweeps
+
+
+def sweeps_of_batches(batches: Batches) -> Sweeps:
+    """Return the sweeps of unpacked messages, in their order."""
     names = batches.texts["device"]
     devices = tuple(dict.fromkeys(names))
     numbers = {name: number for number, name in enumerate(devices)}
     device = np.array([numbers[name] for name in names], np.int32).repeat(batches.counts)
     columns = batches.columns
-    sweeps = Sweeps(
+    return Sweeps(
         devices=devices,
         time_ns=columns["time_ns"],
         device=device,
@@ -123,8 +136,6 @@ def read_sweeps(session: Session) -> Sweeps:
         sweep=columns["sweep"],
         count=columns["count"],
     )
-    _check_ranges(sweeps, session.path)
-    return sweeps
 
 
 def _check_ranges(sweeps: Sweeps, path: str | None) -> None:

@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import Similarity, skew
+from locatk.core.geometry import Similarity, matrix_from_quaternion, skew
+from locatk.core.inertial import STANDARD_GRAVITY_M_S2, InertialSamples
 from locatk.core.lighthouse.results import FrameFacts, LighthouseFacts
 from locatk.core.lighthouse.scene.gravity import (
     MAX_UP_CHI2,
@@ -26,18 +27,74 @@ from locatk.core.lighthouse.scene.gravity import (
 )
 from locatk.core.lighthouse.scene.model import Marker, Scene
 from locatk.core.lighthouse.scene.reframing import rotation_between, transform_solution
+from locatk.core.lighthouse.scene.standstills import Standstill
 from locatk.core.solution import Solution, SolverWarning
+from locatk.core.trajectory import Trajectory, has_orientation
 
 Array = NDArray[np.float64]
 
 MARKER_SIGMA_M = 0.002
 """Standard deviation of a position measured by hand, along each axis [m]."""
 
+IMU_UP_SIGMA_RAD = float(np.deg2rad(1.0))
+"""Standard deviation of the direction of an IMU at rest, about each axis: offsets of 10 mg and the
+mounting on its device."""
+
+MAX_GRAVITY_ERROR_M_S2 = 0.5
+"""Largest difference of the mean specific force at rest from gravity [m/s^2]: offset and scale of
+common accelerometers. Beyond, the sensor is faulty or moves."""
+
 MIN_FORWARD_EXTENT = 0.2
 """Smallest horizontal part of a unit vector that gives the direction of the x axis: 12 degrees from
 the vertical. Below, a small error of the vertical turns it far."""
 
 VERTICAL = np.array([0.0, 0.0, 1.0])
+
+
+def inertial_ups(
+    imus: Sequence[InertialSamples],
+    trajectories: Sequence[Trajectory],
+    standstills: Sequence[Standstill],
+) -> list[UpMeasurement]:
+    """Return the direction against gravity that each device with an IMU measured at rest.
+
+    The direction is in the frame of the trajectories; it needs the orientation of the device, so
+    that single photodiodes have none. All rests of a device count as one measurement, because they
+    have the errors of its accelerometer and its mounting in common.
+    """
+    measurements = []
+    for samples in imus:
+        track = next((t for t in trajectories if t.device == samples.device), None)
+        if track is None:
+            continue
+        is_known = has_orientation(track)
+        directions = []
+        for rest in standstills:
+            if rest.device != samples.device:
+                continue
+            poses = np.flatnonzero(_is_within(track.time_ns, rest) & is_known)
+            rows = samples.acceleration[_is_within(samples.time_ns, rest)]
+            rows = rows[np.isfinite(rows).all(axis=1)]
+            if len(poses) == 0 or len(rows) == 0:
+                continue
+            force = rows.mean(axis=0)
+            strength = float(np.linalg.norm(force))
+            if abs(strength - STANDARD_GRAVITY_M_S2) > MAX_GRAVITY_ERROR_M_S2:
+                continue
+            middle = track.quaternion[poses[len(poses) // 2]]
+            directions.append(matrix_from_quaternion(middle) @ force / strength)
+        if directions:
+            mean = np.mean(directions, axis=0)
+            measurements.append(
+                UpMeasurement(
+                    f"the IMU of {samples.device}", mean / np.linalg.norm(mean), IMU_UP_SIGMA_RAD
+                )
+            )
+    return measurements
+
+
+def _is_within(time_ns: NDArray[np.int64], rest: Standstill) -> NDArray[np.bool_]:
+    return (time_ns >= rest.start_ns) & (time_ns <= rest.end_ns)
 
 
 def level_solution(
@@ -181,7 +238,7 @@ def _marker_misfit(facts: LighthouseFacts | None) -> float | None:
 def _contradiction_warning(up: UpEstimate) -> SolverWarning:
     return SolverWarning(
         "up_contradicts_others",
-        f"the accelerometers of {_join(up.contradicting)} contradict the others by more than three "
+        f"gravity from {_join(up.contradicting)} contradicts the others by more than three "
         "standard deviations: a station was tilted after the scene was estimated, or the "
         "arrangement of the stations is wrong",
     )
@@ -190,7 +247,7 @@ def _contradiction_warning(up: UpEstimate) -> SolverWarning:
 def _level_warning(scene: Scene, up: UpEstimate) -> SolverWarning:
     return SolverWarning(
         "level_by_gravity",
-        f"z is up by the accelerometers of {_join(up.used)}, level within "
+        f"z is up by gravity from {_join(up.used)}, level within "
         f"{np.degrees(up.sigma_rad):.1f} deg (one sigma). The origin is the station on channel "
         f"{scene.stations[0].channel}; its height above the floor is unknown",
     )

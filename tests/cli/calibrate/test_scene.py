@@ -123,7 +123,7 @@ def test_accelerometers_level_a_recording(locatk: Callable[..., Any], tmp_path: 
         assert solved.up == pytest.approx(station.rotation[2], abs=0.01)
         assert solved.rotation[2] == pytest.approx(station.rotation[2], abs=0.05)
     assert scene.frame == "station-1-level"
-    assert "z is up by the accelerometers of channel 1 and channel 2" in result.stderr
+    assert "z is up by gravity from channel 1 and channel 2" in result.stderr
 
 
 @pytest.mark.parametrize(

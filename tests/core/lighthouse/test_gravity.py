@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from locatk.core.geometry import Similarity, rotation_exp, umeyama
+from locatk.core.geometry import Similarity, quaternion_from_matrix, rotation_exp, umeyama
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.results import LighthouseFacts
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene, Station
 from locatk.core.lighthouse.scene.estimation import estimate_stations
@@ -18,8 +19,13 @@ from locatk.core.lighthouse.scene.gravity import (
     estimate_up,
     up_from_acceleration,
 )
-from locatk.core.lighthouse.scene.levelling import level_solution, marker_frame_sigmas
+from locatk.core.lighthouse.scene.levelling import (
+    inertial_ups,
+    level_solution,
+    marker_frame_sigmas,
+)
 from locatk.core.lighthouse.scene.reframing import transform_trajectory
+from locatk.core.lighthouse.scene.standstills import Standstill
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 
@@ -272,3 +278,44 @@ def test_the_frame_of_markers_is_as_certain_as_it_says() -> None:
     assert sigmas[2] == pytest.approx(worst[1], rel=0.3)
     assert sigmas[3] == pytest.approx(np.std(scales), rel=0.15)
     assert marker_frame_sigmas(markers[:2], None) == (None, None, None, None)
+
+
+# ---- devices with an IMU
+
+
+def test_an_imu_at_rest_levels_the_frame() -> None:
+    rng = np.random.default_rng(20)
+    truth = room(rng, 2, roll_rad=0.4)
+    solution, _ = solution_in_station_frame(rng, truth)
+    to_room = truth.stations[0].rotation
+    second = 10**9
+    # The device lies on its side, and rests in the middle of the recording.
+    in_room = rotation_exp([1.2, 0.3, 0.5])
+    time_ns = np.arange(0, 6 * second, second // 10)
+    count = len(time_ns)
+    track = Trajectory(
+        "cf",
+        "station-1",
+        time_ns,
+        np.zeros((count, 3)),
+        np.tile(quaternion_from_matrix(to_room.T @ in_room), (count, 1)),
+        np.tile(1e-6 * np.eye(6), (count, 1, 1)),
+    )
+    is_resting = (time_ns >= 2 * second) & (time_ns <= 4 * second)
+    force = np.where(is_resting[:, None], 9.7 * in_room.T @ UP, [5.0, 5.0, 5.0])
+    force[25] = np.nan
+    imu = InertialSamples("cf", time_ns, force, np.zeros((count, 3)))
+    rest = Standstill("cf", 2 * second, 4 * second)
+    (up,) = inertial_ups([imu], [track], [rest])
+    assert up.source == "the IMU of cf"
+    assert up.direction == pytest.approx(to_room.T @ UP)
+    levelled = level_solution(replace(solution, trajectories=(track,)), Scene(), [up])
+    first = levelled.artifact.stations[0]
+    assert first.rotation[2] == pytest.approx(truth.stations[0].rotation[2])
+    assert np.degrees(levelled.artifact.level_sigma_rad) == pytest.approx(1.0)
+    # Neither a moving device, nor one without orientation, nor another device says anything.
+    moving = Standstill("cf", 0, second)
+    assert inertial_ups([imu], [track], [moving]) == []
+    point = Trajectory.from_positions("cf", "f", time_ns, np.zeros((count, 3)))
+    assert inertial_ups([imu], [point], [rest]) == []
+    assert inertial_ups([imu], [replace(track, device="other")], [rest]) == []
