@@ -1,9 +1,9 @@
 """Estimation of a scene from the epochs of a recording.
 
-One station over a floor is resected on its markers. Two or more stations are estimated from the
-angles alone, up to scale: a two-view initialization of the best pair, registration of the other
-stations one at a time, and a bundle adjustment of all. One of five keyframes is held out, so that
-the scene can be verified on it. Markers, a distance or odometry then fix frame and scale.
+One station is resected on its markers, over a floor or in space. Two or more stations are estimated
+from the angles alone, up to scale: a two-view initialization of the best pair, registration of the
+other stations one at a time, and a bundle adjustment of all. One of five keyframes is held out, so
+that the scene can be verified on it. Markers, a distance or odometry then fix frame and scale.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
+from locatk.core.geometry import rotation_angle
 from locatk.core.lighthouse.calibration import (
     GENERIC_CALIBRATION,
     MODEL_SIGMA_RAD,
     Calibration,
     ideal_angles,
 )
+from locatk.core.lighthouse.devices.pnp import candidate_poses
 from locatk.core.lighthouse.epochs import Epochs, rotor_angles
 from locatk.core.lighthouse.light_planes import rays as rays_of
+from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.results import LighthouseFacts
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.bundle_adjustment import (
@@ -32,10 +35,12 @@ from locatk.core.lighthouse.scene.bundle_adjustment import (
     adjust_bundle,
 )
 from locatk.core.lighthouse.scene.frame import (
+    MAX_MARKER_MISFIT_M,
     FramedState,
     fix_gauge,
     marker_angles,
     marker_misfit,
+    marker_misfit_warning,
     unused_visits_warnings,
 )
 from locatk.core.lighthouse.scene.keyframes import (
@@ -44,6 +49,7 @@ from locatk.core.lighthouse.scene.keyframes import (
     spread_evenly,
 )
 from locatk.core.lighthouse.scene.registration import (
+    MAX_RELATIVE_SIGMA,
     StationRegistration,
     fit_floor_homography,
     resect_on_plane,
@@ -94,7 +100,17 @@ MIN_PLANE_FRACTION = 0.95
 """Smallest fraction of positions on the plane of a planar scene without a warning."""
 
 MIN_FLOOR_MARKERS = 4
-"""Fewest markers that determine the pose of a single station over a floor."""
+"""Fewest markers that determine the pose of a single station."""
+
+MAX_FLOOR_SLOPE = 0.05
+"""Largest difference of the heights of markers on one floor, relative to their distance."""
+
+MIN_POSE_LOG_ODDS = float(np.log(1000.0))
+"""Smallest logarithm of the odds of the best pose of a station against any other."""
+
+MIN_POSE_DIFFERENCE_RAD = 0.05
+"""Smallest angle between two poses of a station that are not the same; seen from the markers, for
+their positions."""
 
 
 @dataclass(frozen=True)
@@ -144,8 +160,10 @@ def use_given_scene(epochs: Epochs, scene: Scene) -> SceneEstimate:
             + ", ".join(str(c) for c in epochs.channels),
         )
     epochs, rejected = select_stations(epochs, columns, "station_not_in_scene")
-    warnings = tuple(SolverWarning("scene_assumption", note) for note in scene.notes)
-    return SceneEstimate(scene, epochs, warnings=warnings, rejected=rejected)
+    warnings = [SolverWarning("scene_assumption", note) for note in scene.notes]
+    if len(columns) == 1 and not scene.planar:
+        warnings.append(direction_only_warning(int(epochs.channels[0])))
+    return SceneEstimate(scene, epochs, warnings=tuple(warnings), rejected=rejected)
 
 
 def estimate_scene(
@@ -176,9 +194,10 @@ def estimate_scene(
     DegenerateError
         The recording does not determine the scene. The message states what is missing.
     """
+    decides_by_data = kind == "auto"
     kind = resolve_scene_kind(kind, prior, epochs)
     if kind == "one-planar":
-        return _estimate_one_station(epochs, prior)
+        return _estimate_one_station(epochs, prior, may_be_in_space=decides_by_data)
     require_two_stations(kind, epochs)
     return _estimate_several_stations(epochs, prior, kind, odometry, seed)
 
@@ -223,8 +242,8 @@ def select_stations(
 # ---- one station
 
 
-def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
-    """Resect the station with the most markers on a floor."""
+def _estimate_one_station(epochs: Epochs, prior: Scene, *, may_be_in_space: bool) -> SceneEstimate:
+    """Resect the station with the most markers, on a floor or in space."""
     marker_points, observed = marker_angles(prior.markers, epochs, rotor_angles(epochs))
     is_complete = np.all(np.isfinite(observed), axis=2)
     column = int(np.argmax(np.count_nonzero(is_complete, axis=0)))
@@ -238,6 +257,8 @@ def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
             hint="add [[markers]] with sightings to a scene.toml and give it by --artifact, "
             "or record with two stations",
         )
+    if may_be_in_space and (prior.planar is False or not is_on_floor(marker_points)):
+        return _resect_in_space(epochs, prior, marker_points, observed, rejected)
     floor_z = float(np.mean(marker_points[:, 2]))
     on_floor = marker_points - np.array([0.0, 0.0, floor_z])
     calibration = prior.calibrations.get(int(epochs.channels[0]), GENERIC_CALIBRATION)
@@ -266,6 +287,91 @@ def _estimate_one_station(epochs: Epochs, prior: Scene) -> SceneEstimate:
         planar=True, marker_residual_rad=float(np.sqrt(np.nanmean(adjustment.residuals**2)))
     )
     return SceneEstimate(replace(scene, stations=(station,)), epochs, facts, warnings, rejected)
+
+
+def is_on_floor(points: Array) -> bool:
+    """Return whether points (n, 3) have the same height, up to :data:`MAX_FLOOR_SLOPE`."""
+    extent, relief = np.ptp(points[:, :2], axis=0).max(), np.ptp(points[:, 2])
+    return bool(relief <= MAX_FLOOR_SLOPE * extent)
+
+
+def _resect_in_space(
+    epochs: Epochs, prior: Scene, marker_points: Array, observed: Array, rejected: dict[str, int]
+) -> SceneEstimate:
+    """Resect a station on markers (n, 3) in space.
+
+    The markers are like the photodiodes of a rigid device, whose candidate poses are those of the
+    station. They are refined on all markers. Photodiodes are on a floor only if the prior states
+    it; otherwise the station gives their directions, and no positions.
+    """
+    channel = int(epochs.channels[0])
+    calibration = prior.calibrations.get(channel, GENERIC_CALIBRATION)
+    adjustments = [
+        adjust_bundle(
+            observed,
+            BundleState(
+                (-rotation.T @ position)[None], rotation.T[None], (calibration,), marker_points
+            ),
+            sigma_rad=MODEL_SIGMA_RAD,
+            fixed_points=True,
+        )
+        for position, rotation in candidate_poses(
+            observed[:, 0], Receiver(marker_points), calibration
+        )
+    ]
+    hint = f"visit {MIN_FLOOR_MARKERS} or more markers at different heights, wide apart"
+    if not adjustments:
+        raise DegenerateError("the markers do not determine the pose of the station", hint=hint)
+    best = min(adjustments, key=lambda adjustment: adjustment.cost)
+    distance = float(np.median(np.linalg.norm(marker_points - best.state.positions[0], axis=1)))
+    agrees = np.all(np.abs(best.residuals[:, 0]) < INLIER_GATE_TAN, axis=1)
+    if np.count_nonzero(agrees) < MIN_FLOOR_MARKERS:
+        raise DegenerateError(
+            "fewer than four markers agree with each other",
+            hint="check the measured positions and the times of the visits",
+        )
+    is_rival = [
+        other.cost < best.cost + MIN_POSE_LOG_ODDS
+        and max(
+            float(rotation_angle(other.state.rotations[0], best.state.rotations[0])),
+            float(np.linalg.norm(other.state.positions - best.state.positions)) / distance,
+        )
+        > MIN_POSE_DIFFERENCE_RAD
+        for other in adjustments
+    ]
+    if any(is_rival):
+        raise DegenerateError(
+            "two poses of the station explain the markers equally well", hint=hint
+        )
+    sigma = float(np.sqrt(np.trace(best.station_covariance[0, :3, :3])))
+    if not sigma < MAX_RELATIVE_SIGMA * distance:
+        raise DegenerateError(
+            f"the markers determine the position of the station to {sigma:.2f} m only", hint=hint
+        )
+    residual_rad = float(np.sqrt(np.nanmean(best.residuals**2)))
+    warnings = [
+        *generic_calibration_warnings([channel], best.state.calibrations),
+        *unused_visits_warnings(prior.markers, len(marker_points)),
+    ]
+    if residual_rad * distance > MAX_MARKER_MISFIT_M:
+        warnings.append(marker_misfit_warning(residual_rad * distance))
+    planar = prior.planar is True
+    framed = FramedState(best.state, best.station_covariance, prior.floor_z, "markers", prior.frame)
+    scene = _build_scene(framed, planar, epochs, prior, warnings)
+    if not planar:
+        warnings.append(direction_only_warning(channel))
+    facts = LighthouseFacts(planar=planar, marker_residual_rad=residual_rad)
+    return SceneEstimate(scene, epochs, facts, tuple(warnings), rejected)
+
+
+def direction_only_warning(channel: int) -> SolverWarning:
+    """Return the warning for photodiodes in space under a single station."""
+    return SolverWarning(
+        "direction_only",
+        f"one station (channel {channel}) gives the direction of a photodiode in space, and no "
+        "position: state the floor in the scene (planar = true, floor_z_mm), add a station, or use "
+        "a device with four photodiodes",
+    )
 
 
 # ---- two stations or more

@@ -71,8 +71,10 @@ PLANE_COLUMNS = ("x", "y")
 MILLIMETRES_PER_METRE = 1000
 
 MAX_SLOT = 255
+"""Largest number of a slot; robots have two."""
+
 MAX_INDEX = 10**9
-"""Largest numbers of slots and rows."""
+"""Largest number of a row."""
 
 MAX_TRUTH_MM = 1e6
 """Largest coordinate of the truth, 1 km: larger ones are damaged or in another unit."""
@@ -100,6 +102,9 @@ ROTOR_TOLERANCE_US = 300.0
 clocks agree to 100 ppm over :data:`MAX_ROTOR_INTERVAL_US`, with some margin."""
 
 MAX_ROTOR_INTERVAL_US = 2_000_000
+
+MAX_BACKWARD_FRACTION = 0.01
+"""Largest fraction of rows that are earlier than the row before in a log in the order of time."""
 
 MAX_NEIGHBOUR_NS = 1_000_000_000
 """Longest time to the sweep of the other slot with which a sweep is compared. The planes are a
@@ -428,18 +433,17 @@ def find_new_counts(rows: CountRows) -> tuple[NDArray[np.bool_], Array]:
     """Find the counts that are not repeated from an earlier row, and their times.
 
     In a file with the clock of the robot, a row holds the last sweep of each plane. New are those
-    that differ from the row before in the order of the log. The last of them was received at
-    ``tick``, the others at most one rotation before: at the time at which the rotor of their
-    station, whose phase is known from rows with one new sweep, gives their count. (If the log is
-    not in the order of time, they may be a rotation later.) If nothing differs, the sweep whose
-    rotor agrees with ``tick`` is new.
+    that differ from the row before in the order of the log. The one that was logged last was
+    received at ``tick``, others at the time at which the rotor of their station, whose phase is
+    known from rows with one new sweep, gives their count (:func:`_choose_rotations`). If nothing
+    differs, the sweep whose rotor agrees with ``tick`` is new.
 
     Returns
     -------
     is_new : (n, k) bool ndarray
         All counts without ``tick``, and in files of which every row is a complete report.
     offset_us : (n, k) ndarray
-        Time of each new count relative to ``tick``, zero or negative; zero if it is unknown.
+        Time of each new count relative to ``tick``; zero if it is unknown.
     """
     is_new, offset_us = np.ones(rows.count.shape, bool), np.zeros(rows.count.shape)
     if rows.tick is None or rows.count.shape[1] < 2:
@@ -466,8 +470,50 @@ def find_new_counts(rows: CountRows) -> tuple[NDArray[np.bool_], Array]:
         is_unchanged = ~changed.any(axis=1)
         is_new[index] = np.where(is_unchanged[:, None], agrees, changed)
         is_dated = changed & ~is_single[:, None] & np.isfinite(age_us)
-        offset_us[index] = -np.where(is_dated, np.maximum(age_us, 0.0), 0.0)
+        tick = rows.tick[index]
+        is_by_station = np.mean(np.diff(tick) < 0) > MAX_BACKWARD_FRACTION
+        for column in range(count.shape[1]):
+            new = np.flatnonzero(is_new[index, column])
+            time_us = _choose_rotations(
+                tick[new].tolist(),
+                np.where(is_dated[new, column], age_us[new, column], np.nan).tolist(),
+                (period_ticks(rows.channel[index[new], column]) * MICROSECONDS_PER_TICK).tolist(),
+                is_by_station=is_by_station,
+            )
+            offset_us[index[new], column] = time_us - tick[new]
     return is_new, offset_us
+
+
+def _choose_rotations(
+    tick: list[int], age_us: list[float], period_us: list[float], *, is_by_station: bool
+) -> Array:
+    """Return the times (n,) of the sweeps of one plane, in the order of the log.
+
+    Parameters
+    ----------
+    tick : list of int
+        Times of the sweeps that were logged last.
+    age_us : list of float
+        Times since the last passage of the plane before ``tick``; ``nan`` for sweeps that were
+        received at ``tick``.
+    period_us : list of float
+    is_by_station : bool
+        The log is in the order of stations and not of time, so that a sweep may be later than
+        ``tick``. The nearest passage is chosen, unless a neighbour is of the same rotation.
+    """
+    time_us = np.array(tick, float)
+    for k, (last, age, period) in enumerate(zip(tick, age_us, period_us, strict=True)):
+        if np.isnan(age):
+            continue
+        passages = [last - max(age, 0.0)]
+        if is_by_station:
+            passages.insert(int(age < period / 2), last - age + period)
+        taken = [time_us[k - 1]] if k else []
+        if k + 1 < len(tick) and np.isnan(age_us[k + 1]):
+            taken.append(tick[k + 1])
+        free = [p for p in passages if all(abs(p - other) > period / 2 for other in taken)]
+        time_us[k] = free[0] if free else passages[0]
+    return time_us
 
 
 def _ages_by_rotors(
@@ -525,13 +571,14 @@ def find_planes(sweeps: Sweeps, slot: NDArray[np.int64]) -> NDArray[np.int32]:
     sweeps : Sweeps
         Ascending in time.
     slot : (n,) int64 ndarray
+        ``UNKNOWN`` if the source does not report it.
     """
     plane = np.full(len(sweeps), UNKNOWN, np.int32)
     source = sweeps.device.astype(np.int64) * (POLYNOMIAL_COUNT + 1) + sweeps.channel
     for code in np.unique(source):
         index = np.flatnonzero(source == code)
         slots = np.unique(slot[index])
-        if len(slots) != 2:
+        if len(slots) != 2 or slots[0] == UNKNOWN:
             continue
         is_second_slot = slot[index] == slots[1]
         to_other = _differences_to_other_slot(

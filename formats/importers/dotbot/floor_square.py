@@ -119,13 +119,19 @@ def find_calibration(
     for recording in recordings:
         folders += [Path(recording).parent, Path(recording).parent.parent / "ground_truth"]
     candidates = [folder / FILE_NAME for folder in folders]
-    candidates += [
-        above
-        for path in recordings
-        if (above := Path(path).parent.parent / FILE_NAME).is_file()
-        and Path(path).resolve().parent.name in _read_entries(above)
-    ]
+    for recording in recordings:
+        folder = Path(recording).resolve().parent
+        if _has_entry(folder.parent / FILE_NAME, folder.name):
+            candidates.append(folder.parent / FILE_NAME)
     return next((file for file in candidates if file.is_file()), None)
+
+
+def _has_entry(path: Path, name: str) -> bool:
+    """Return whether a file is a calibration with an entry ``name``."""
+    try:
+        return path.is_file() and name in _read_entries(path)
+    except FormatError:
+        return False  # The folder above may hold a file of another program.
 
 
 def read_calibration(

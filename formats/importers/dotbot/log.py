@@ -6,8 +6,9 @@ configure it to write JSON. Records are recognised by their keys, not by the nam
 ====================================  ==================================================
 keys                                  record
 ====================================  ==================================================
-poly, lfsr_index, [db_time]           a sweep that the robot decoded, 2024; db_time is the
-                                      robot's clock in us when it received the light
+poly, lfsr_index, [db_time, sweep]    a sweep that the robot decoded, 2024; db_time is the
+                                      robot's clock in us when it received the light, sweep
+                                      the slot of its memory
 sweep_0_poly, _off, _bits, sweep_1_   windows of 64 bits, 2023: the count is the LFSR index of
                                       the 17 bits after the first ``off``, less ``off``
 c0, c1                                two counts of one station, 2023, without its polynomial:
@@ -16,8 +17,8 @@ c0, c1                                two counts of one station, 2023, without i
 
 ``source`` (or ``address``) names the device. A polynomial above 31, an index beyond the
 sequence and bits that are all zero mark an error of the robot: there is no sweep, and nothing
-is lost. ``sweep`` numbers a robot's memory, not the planes of the rotor: it is not used.
-Lines of other events are skipped.
+is lost. Slots give the planes of sweeps (:func:`.count_rows.find_planes`). Lines of other events
+are skipped.
 
 Log lines are late by tens of milliseconds, longer than the time between two sweeps. If records
 contain db_time, it dates the sweeps (:mod:`locatk.core.clock_sync`).
@@ -31,7 +32,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -44,6 +45,7 @@ from locatk.core.lighthouse import lfsr
 from locatk.core.lighthouse.channels import POLYNOMIAL_COUNT, channel_of
 from locatk.core.lighthouse.recording import UNKNOWN, StationReport, Sweeps
 from locatk.formats.files import check_regular, open_binary
+from locatk.formats.importers.dotbot.count_rows import MAX_SLOT, find_planes
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.tables.timestamps import parse_iso_time
 
@@ -93,11 +95,12 @@ LOG_HINT = "Give the file that PyDotBot wrote (pydotbot.log), at log level info"
 
 SWEEP_DTYPE = np.dtype(
     {
-        "names": ["time_ns", "device", "polynomial", "count", "tick", "bits", "offset"],
-        "formats": ["i8", "i4", "i4", "i8", "i8", "u8", "i8"],
+        "names": ["time_ns", "device", "polynomial", "count", "tick", "bits", "offset", "slot"],
+        "formats": ["i8", "i4", "i4", "i8", "i8", "u8", "i4", "i4"],
     }
 )
-"""Sweep of a log; ``tick`` is -1 without a time of the robot, ``offset`` -1 without bits."""
+"""Sweep of a log; ``tick`` is -1 without a time of the robot, ``offset`` -1 without bits, ``slot``
+-1 without a slot."""
 
 
 @dataclass
@@ -318,7 +321,10 @@ def _add_processed(log: _Log, fields: _Fields, time_ns: int) -> None:
     if not (0 <= polynomial < POLYNOMIAL_COUNT and 0 <= count < lfsr.SEQUENCE_LENGTH):
         log.without_sweep += 1
         return
-    log.add(time_ns, device, polynomial, count, tick, 0, UNKNOWN)
+    slot = _number(fields, b"sweep") if b"sweep" in fields else UNKNOWN
+    if b"sweep" in fields and not 0 <= slot <= MAX_SLOT:
+        raise _Damaged(f"sweep is {slot}")
+    log.add(time_ns, device, polynomial, count, tick, 0, UNKNOWN, slot)
 
 
 def _add_counts(log: _Log, fields: _Fields, time_ns: int) -> None:
@@ -327,7 +333,7 @@ def _add_counts(log: _Log, fields: _Fields, time_ns: int) -> None:
     device = _device(log, fields)
     for count in counts:
         if 0 <= count < lfsr.SEQUENCE_LENGTH:
-            log.add(time_ns, device, UNKNOWN, count, UNKNOWN, 0, UNKNOWN)
+            log.add(time_ns, device, UNKNOWN, count, UNKNOWN, 0, UNKNOWN, UNKNOWN)
         else:
             log.without_sweep += 1
 
@@ -346,7 +352,7 @@ def _add_windows(log: _Log, fields: _Fields, time_ns: int) -> None:
             raise _Damaged("the bits are not a 64-bit number")
         max_offset = WINDOW_BITS - lfsr.REGISTER_BITS
         if 0 <= polynomial < POLYNOMIAL_COUNT and 0 <= offset <= max_offset:
-            log.add(time_ns, device, polynomial, 0, UNKNOWN, bits, offset)
+            log.add(time_ns, device, polynomial, 0, UNKNOWN, bits, offset, UNKNOWN)
         else:
             log.without_sweep += 1
 
@@ -426,9 +432,10 @@ def _date(rows: Rows, devices: Mapping[str, int], warnings: list[str]) -> str:
 
 
 def _sweeps(rows: Rows, devices: tuple[str, ...]) -> Sweeps:
+    rows = rows[np.argsort(rows["time_ns"], kind="stable")]
     n, polynomial = len(rows), rows["polynomial"].astype(np.int32)
     channel = np.where(polynomial >= 0, channel_of(polynomial), ASSUMED_CHANNEL)
-    return Sweeps(
+    sweeps = Sweeps(
         devices=devices,
         time_ns=rows["time_ns"].astype(np.int64),
         device=rows["device"].astype(np.int32),
@@ -438,3 +445,4 @@ def _sweeps(rows: Rows, devices: tuple[str, ...]) -> Sweeps:
         sweep=np.full(n, UNKNOWN, np.int32),
         count=rows["count"].astype(np.float64),
     )
+    return replace(sweeps, sweep=find_planes(sweeps, rows["slot"].astype(np.int64)))

@@ -13,12 +13,14 @@ import pytest
 from locatk.core.errors import InputError, OutputExistsError
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, IDEAL_CALIBRATION, Calibration
 from locatk.core.lighthouse.scene import Marker, Scene, Station
+from locatk.core.lighthouse.solver import solve
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.dotbot_calibration import (
     build_calibration,
     dumps_calibration,
     write_calibration,
 )
+from locatk.formats.importers.dotbot.recording import read_dotbot
 
 PERIODS = [959000, 957000, 953000, 949000, 947000, 943000, 941000, 939000]
 
@@ -85,7 +87,7 @@ SCENE = Scene(
     floor_z=0.03,
     scale="markers",
 )
-POINTS = np.random.default_rng(5).uniform([0.0, 0.0], [1.2, 1.2], size=(200, 2))
+POINTS = np.random.default_rng(5).uniform([0.0, 0.0], [1.2, 1.2], size=(600, 2))
 
 
 def drive(positions: np.ndarray, frame: str = "floor", z: float = 0.03) -> Trajectory:
@@ -97,7 +99,7 @@ def firmware_errors(scene: Scene, content: bytes, origin_mm: np.ndarray) -> dict
     homographies = load(content)
     errors: dict[int, list[float]] = {}
     for station in scene.stations:
-        for x, y in POINTS:
+        for x, y in POINTS[::3]:
             local = station.rotation.T @ (np.array([x, y, scene.floor_z]) - station.position)
             counts = sweep_counts(local, station.channel, station.calibration.sweeps)
             # The robot stores the sweeps in any order.
@@ -115,9 +117,9 @@ def test_the_firmware_locates_robots() -> None:
     assert calibration.hidden_channels == ()
     errors = firmware_errors(SCENE, dumps_calibration(calibration), calibration.origin_mm)
     for station in calibration.stations:
-        # The figures that are reported are those that the robots have: the area has a margin.
+        # The figures that are reported are those that the robots have.
         assert np.sqrt(np.mean(errors[station.channel] ** 2)) < 1.1 * station.rms_mm < 8
-        assert errors[station.channel].max() < 1.1 * station.max_mm < 30
+        assert errors[station.channel].max() < 1.3 * station.max_mm < 30
         # The integers are used fully, so that rounding costs nothing.
         assert np.abs(station.matrix).max() == 2**31 - 1
 
@@ -135,7 +137,7 @@ def test_axes_and_origin_of_the_robots() -> None:
     # The origin of the scene stays the origin if the floor is on that side of it.
     shifted = drive(POINTS - [-0.3, 1.5])
     assert build_calibration(SCENE, [shifted], area_mm=None).origin_mm.tolist() == [0, 0]
-    assert build_calibration(SCENE, [drive(POINTS)]).origin_mm.tolist() == [-200, 1400]
+    assert build_calibration(SCENE, [drive(POINTS)]).origin_mm.tolist() == [-100, 1300]
 
 
 def test_channels_without_a_station_are_discarded_by_the_robot() -> None:
@@ -153,15 +155,19 @@ def test_channels_without_a_station_are_discarded_by_the_robot() -> None:
 def test_the_floor_comes_from_poses_and_markers() -> None:
     markers = tuple(Marker(f"{x}{y}", np.array([x, y, 0.03])) for x in (0.2, 1) for y in (0.2, 1))
     by_markers = build_calibration(replace(SCENE, markers=markers))
-    np.testing.assert_allclose(by_markers.area_mm, [0, 0, 1200, 1200])
+    np.testing.assert_allclose(by_markers.area_mm, [150, 150, 1050, 1050])
     # Poses in another frame do not count, single outliers neither.
-    elsewhere = drive(POINTS + 9, frame="mocap")
+    elsewhere = drive(POINTS - 0.3, frame="mocap")
     assert np.array_equal(
         build_calibration(replace(SCENE, markers=markers), [elsewhere]).area_mm, by_markers.area_mm
     )
-    spoiled = np.repeat(POINTS, 5, axis=0)
-    spoiled[0] = [9, 9]
-    assert build_calibration(SCENE, [drive(spoiled)]).area_mm.max() < 1500
+    spoiled = np.concatenate([POINTS, [[9, 9], [9, 9.01], [-3, 0]]])
+    assert np.abs(build_calibration(SCENE, [drive(spoiled)]).area_mm).max() < 1300
+    # A robot that stands still, and one that drove a line.
+    for few in (POINTS[:1], np.linspace([0, 0], [1, 1], 50)):
+        unknown = np.full((3, 2), np.nan)
+        calibration = build_calibration(SCENE, [drive(np.concatenate([few, unknown]))])
+        assert all(station.max_mm < 30 for station in calibration.stations)
 
 
 def test_a_floor_in_a_scene_in_space() -> None:
@@ -208,3 +214,31 @@ def test_a_file_is_not_replaced(tmp_path: Path) -> None:
     write_calibration(tmp_path / "calibration.out", calibration)
     with pytest.raises(OutputExistsError):
         write_calibration(tmp_path / "calibration.out", calibration)
+
+
+def test_the_published_recording_of_one_station(data: Path) -> None:
+    """Counts of a real robot, located by the firmware with our file, against the camera.
+
+    The authors' own calibration on four corners gives 7.0 mm (figure_8.py), locatk 3.3 mm.
+    """
+    folder = data / "lighthouse" / "oneLH-2D_scene" / "dataset"
+    recordings = [folder / "lighthouse" / f"{k}_lh2.csv" for k in range(1, 6)]
+    tracks = [folder / "ground_truth" / f"{k}_blender.csv" for k in range(1, 6)]
+    session = read_dotbot(recordings, tracks)
+    solution = solve(session.sweeps, session.scene)
+    calibration = build_calibration(solution.artifact, solution.trajectories)
+    assert calibration.origin_mm.tolist() == [0, 0]
+    homographies = load(dumps_calibration(calibration))
+    counts = session.sweeps.count.reshape(-1, 2)
+    [truth] = session.truth
+    # Camera and robot have different clocks (fitted in the benchmark: 0.24 to 0.25 s).
+    camera_s = (truth.time_ns - truth.time_ns[0]) / 1e9 + 0.245
+    at_s = (session.sweeps.time_ns[::2] - truth.time_ns[0]) / 1e9
+    gap_s = np.abs(at_s[:, None] - camera_s).min(axis=1)
+    errors = []
+    for pair, second in zip(counts[gap_s < 0.05].astype(int), at_s[gap_s < 0.05], strict=True):
+        x, y = firmware_position(homographies, *pair.tolist(), 0)
+        true = [1e3 * np.interp(second, camera_s, truth.position[:, k]) for k in (0, 1)]
+        errors.append(math.hypot(x - true[0], -y - true[1]))
+    assert len(errors) > 800
+    assert np.mean(errors) < 3.8

@@ -530,9 +530,13 @@ def test_scenes_of_one_calibration(write: Write, tmp_path: Path) -> None:
     other_day = LABELLED.replace("2024-12-11", "2024-12-20")
     with pytest.raises(FormatError, match="of which none belong to the recording"):
         read_dotbot([write(other_day, "run.csv")])
+    named = read_dotbot([write(other_day, "scene_2/lh_data.csv")])
+    assert "no device reported" in named.warnings[0]
     # A file of the folder above that does not name the folder is of something else.
     (tmp_path / "scene_3").mkdir()
     assert read_dotbot([write(LABELLED, "scene_3/lh_data.csv")]).scene is None
+    write("not JSON", "calibration.json")
+    assert read_dotbot([write(LABELLED, "scene_2/lh_data.csv")]).scene is None
 
 
 def test_corners_at_different_heights_stay(write: Write) -> None:
@@ -690,17 +694,15 @@ def test_held_counts_are_left_out(write: Write, stations: int, max_age_us: int) 
 
 
 def test_rows_are_in_the_order_of_their_numbers(write: Write) -> None:
-    """The published tables are sorted by time after they were filled in the order of the log."""
-    events = received(8, 2)
-    rng = np.random.default_rng(6)
-    late_s = [0.012 * (rng.uniform() < 0.1) for _ in events]
-    late = [events[k] for k in np.argsort([e.time_s for e in events] + np.array(late_s))]
-    header, *rows = held_table(late, 2, max_age_us=25_000).splitlines()
+    """A robot reports station by station; the published tables were sorted by time afterwards."""
+    events = [e for e in received(8, 2) if e.time_s % 0.1 > 0.03]
+    logged = sorted(events, key=lambda e: (e.time_s // 0.02, e.polynomial // 2, e.time_s))
+    header, *rows = held_table(logged, 2, max_age_us=25_000).splitlines()
     rows.sort(key=lambda row: row.split(",")[1])
-    # If several sweeps are new, one may be later than the sweep that was logged last.
     sweeps = read_dotbot([write("\n".join([header, *rows]) + "\n")]).sweeps
     numbered = np.mean(np.abs(time_errors_us(sweeps, events)) < 15)
-    assert numbered > 0.87
+    # The rest is a rotation off: nothing tells which of two the robot received.
+    assert numbered > 0.8
     unnumbered = [row.split(",", 1)[1] for row in (header, *rows)]
     sweeps = read_dotbot([write("\n".join(unnumbered) + "\n")]).sweeps
     assert np.mean(np.abs(time_errors_us(sweeps, events)) < 15) < numbered - 0.03
@@ -739,7 +741,7 @@ def test_a_clock_corrects_the_times_of_a_log(write: Write) -> None:
 def test_planes_of_single_sweeps(write: Write) -> None:
     """The slot of station 1 is the other plane, that of station 2 the plane."""
     events = received(6, 2)
-    gap = [e for e in events if not (3 < e.time_s < 4.5 and (e.slot == 0 or e.polynomial > 1))]
+    gap = [e for e in events if not (2 < e.time_s < 5 and (e.slot == 0 or e.polynomial > 1))]
     lines = ["sweep,source,lfsr_index,timestamp,poly"]
     for e in gap:
         stamp = np.datetime64(T0 + round(e.time_s * 1e9), "ns")

@@ -317,3 +317,18 @@ def test_damaged_logs_give_an_error_or_sweeps(
     assert np.all((found.sweeps.count >= 0) & (found.sweeps.count < lfsr.SEQUENCE_LENGTH))
     assert np.all((found.sweeps.channel >= 1) & (found.sweeps.channel <= 16))
     assert np.all(np.diff(found.sweeps.time_ns) >= 0)
+
+
+def test_slots_give_planes(read) -> None:
+    """Slot 1 holds the first plane; a lone sweep in it is one of the first plane, too."""
+    lines = []
+    for k in range(20):
+        for slot, count in ((1, 36560 + k), (0, 77623 + k)):
+            if slot or k < 15:
+                second = f"{1 + 0.1 * k + 0.007 * (1 - slot):.6f}"
+                lines.append(processed(second, 0, count).rstrip() + f" sweep={slot}\n")
+    sweeps = read("".join(lines)).sweeps
+    assert sweeps.sweep.tolist() == [0, 1] * 15 + [0] * 5
+    damaged = read("".join(lines) + lines[0].replace("sweep=1", "sweep=999"))
+    assert any("sweep is 999" in warning for warning in damaged.warnings)
+    assert damaged.lost is not None
