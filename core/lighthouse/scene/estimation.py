@@ -356,7 +356,14 @@ def _resect_in_space(
     if residual_rad * distance > MAX_MARKER_MISFIT_M:
         warnings.append(marker_misfit_warning(residual_rad * distance))
     planar = prior.planar is True
-    framed = FramedState(best.state, best.station_covariance, prior.floor_z, "markers", prior.frame)
+    framed = FramedState(
+        best.state,
+        best.station_covariance,
+        prior.floor_z,
+        scale="markers",
+        frame=prior.frame,
+        frame_source="markers",
+    )
     scene = _build_scene(framed, planar, epochs, prior, warnings)
     if not planar:
         warnings.append(direction_only_warning(channel))
