@@ -53,7 +53,7 @@ class FloorVisit(_TOOLS["Flight"]):  # type: ignore[misc]
         return len(FLOOR_M) * (REST_S + MOVE_S) - MOVE_S
 
 
-def write_log(path: Path, *, seconds: float = 45.0, seed: int = 1) -> None:
+def write_log(path: Path, *, seconds: float = 30.0, seed: int = 1) -> None:
     """Write the log of a micro SD card."""
     log = _TOOLS["write_flight"](FloorVisit(seconds=seconds), np.random.default_rng(seed))
     path.write_bytes(log.data())

@@ -14,7 +14,6 @@ from click.testing import Result
 
 from locatk.core.lighthouse.demodulation import ootx, sweep_reports
 from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
-from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
 from locatk.formats.artifacts.scene import read_scene
@@ -175,9 +174,7 @@ def test_real_stations_as_decoded_from_syncs_and_light(
 def test_a_solution_uses_the_factory_data_in_its_recording(
     tmp_path: Path, locatk: Callable[..., Result]
 ) -> None:
-    simulated = simulate(
-        SimulationOptions(planar=False, receiver=DECK, report_hz=50, duration_s=36, seed=3)
-    )
+    simulated = simulate(SimulationOptions(report_hz=50, duration_s=36, seed=3))
     sweeps = simulated.sweeps
     polynomial = sweeps.polynomial.copy()
     for channel in (1, 2):
@@ -188,7 +185,7 @@ def test_a_solution_uses_the_factory_data_in_its_recording(
         polynomial[rows] = 2 * (channel - 1) + bits[rotation]
     run, scene = tmp_path / "run.mcap", tmp_path / "scene.toml"
     sweeps = replace(sweeps, polynomial=polynomial)
-    write_session(run, system="lighthouse", sweeps=sweeps, receivers={"robot-1": DECK})
+    write_session(run, system="lighthouse", sweeps=sweeps, scene=simulated.scene)
     result = locatk("solve", run, "-o", tmp_path / "solved.mcap", "--save-scene", scene)
     assert result.exit_code == 0, result.output
     assert "no factory calibration" not in result.output
