@@ -249,7 +249,8 @@ def _find_events(
             break
         time = int.from_bytes(body[position + 2 : position + time_end], "little")
         if last is not None and not -max_back_step <= time - last <= max_step:
-            is_reset = time < last and time <= max_step
+            # Zeros behind the end of a log are no event: the clock has microseconds.
+            is_reset = 0 < time < last and time <= max_step and version > 1
             if check_times and not is_reset:
                 break
             if time < last:

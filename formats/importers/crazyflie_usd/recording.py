@@ -69,6 +69,10 @@ CYCLE_EVENT = "fixedFrequency"
 MAX_CYCLE_S = 0.04
 """Longest cycle that distinguishes the two rates: 1.2 % of it is less than half a millisecond."""
 
+MAX_USUAL_REJECTIONS = 0.1
+"""Fraction of the events with light that may be rejected without a warning. In a flight under two
+stations 1 to 5 % have no known channel."""
+
 REJECTIONS = {
     "channel_unknown": "of an unknown channel",
     "rotor_unknown": "of a station whose rotor is not regular",
@@ -155,6 +159,9 @@ def read_crazyflie_usd(
             "the log is too short to determine the rate of the Crazyflie's clock: times are off by "
             "milliseconds, or by up to 1.2 % of the duration"
         )
+    unused = sum(logged.rejected.values())
+    if unused > MAX_USUAL_REJECTIONS * (len(logged) + unused):
+        warnings.append(f"sweeps are missing: {describe_rejected(logged.rejected)}")
     if repeated:
         warnings.append(f"{repeated} samples repeat the time of another one and are left out")
     lost = [] if log.damage is None else [log.damage]
@@ -328,6 +335,14 @@ def _facts(
     }
     if logged.rejected:
         facts["rejected"] = describe_rejected(logged.rejected)
+    unused = {
+        name
+        for each in log.events.values()
+        for name in each.columns
+        if "." in name and len(each) and name not in USED_VARIABLES
+    }
+    if unused:
+        facts["not_used"] = list_names(unused, len(unused))
     if logged.repeated:
         facts["repeated"] = f"{logged.repeated} events {event} repeat the value before them"
     return facts

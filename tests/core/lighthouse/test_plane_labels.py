@@ -213,6 +213,13 @@ def test_a_lone_passage_is_labelled_near_the_axis_only() -> None:
     assert planes == [0, 0, -1, -1, 1, 1]
 
 
+def test_a_lone_passage_beside_its_neighbours_is_ambiguous() -> None:
+    """A reflection near the axis, in a rotation without direct light."""
+    rotation = np.append(np.repeat(np.arange(10), 2), 10)
+    phase = np.append(np.tile([0.35, 0.68], 10), 0.2)
+    assert label_planes(rotation, phase)[-1] == -1
+
+
 def test_three_passages_without_neighbours_are_ambiguous() -> None:
     rotation = np.zeros(3, np.int64)
     assert label_planes(rotation, np.array([0.3, 0.5, 0.7])).tolist() == [-1, -1, -1]

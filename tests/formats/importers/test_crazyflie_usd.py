@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
+import subprocess
 import zlib
 from pathlib import Path
 from types import ModuleType
@@ -133,6 +135,17 @@ def test_the_part_behind_a_damaged_time_is_not_read(crazyflie: ModuleType) -> No
     assert len(read.events["estDistance"]) <= 4
 
 
+def test_zeros_behind_a_log_are_no_events(crazyflie: ModuleType) -> None:
+    """A file system may have reserved space; 0 is also the number of an event."""
+    log = small_log(crazyflie)
+    log.event_type(0, "estGyroscope", "")
+    read = parse_usd_log(log.data(crc=False) + bytes(400), PATH)
+    assert sum(map(len, read.events.values())) == 12
+    assert read.omitted == 0
+    assert read.damage is not None
+    assert "400 bytes" in read.damage
+
+
 def test_the_longer_part_is_read_if_the_clock_was_set_to_zero(crazyflie: ModuleType) -> None:
     log = crazyflie.UsdWriter()
     log.event_type(65535, "fixedFrequency", "acc.x:f")
@@ -153,6 +166,7 @@ def test_other_files_are_refused(crazyflie: ModuleType) -> None:
         (third + struct.pack("<I", zlib.crc32(third)), "version 3"),
         (whole.replace(b"acc.x(f)", b"acc.x(q)"), "unknown type"),
         (whole.replace(b"acc.x(f)", b"acc.x[f]"), "unknown type"),
+        (whole.replace(b"range.zrange(H)", b"Acc.X(H)"), "two variables 'Acc.X'"),
         (whole.replace(b"\4\0estDistance", b"\x09\0estDistance"), "same name or number"),
         (whole.replace(b"estFlow", b"estF\xffow"), "damaged"),
     ):
@@ -222,8 +236,9 @@ def test_a_flight_becomes_a_session(
     session = read_crazyflie_usd([write(log, tmp_path)])
     assert session.lost is None
     assert session.warnings == []
+    assert session.facts["not_used"] == "pm.vbat, range.zrange"
     assert len(session.sweeps) > 0.95 * sum(event[1] == 11 for event in log.events)
-    check_sweeps(session, flight, tolerance_s=1e-3)
+    check_sweeps(session, flight, tolerance_s=1e-4 if version == 2 else 1e-3)
     assert f"ran at {rate:.4f}"[:-1] in session.facts["clock"]
     np.testing.assert_array_equal(session.receivers["crazyflie"].position_m, DECK.position_m)
 
@@ -363,8 +378,20 @@ def test_clock_rates_follow_from_the_cycle(crazyflie: ModuleType) -> None:
         [(low, high)] = clock_rates(parse_usd_log(log.data(), PATH))
         assert low < expected < high
     log.events = []
+    assert len(clock_rates(parse_usd_log(log.data(), PATH))) == 1
     log.version = 2
     assert len(clock_rates(parse_usd_log(log.data(), PATH))) == 2
+
+
+def test_many_rejected_frames_are_reported(crazyflie: ModuleType, tmp_path: Path) -> None:
+    stations = crazyflie.stations(3)
+    stations[2].channel = 2  # two stations on one channel
+    flight = crazyflie.Flight(3.0, stations=stations)
+    log = crazyflie.write_flight(flight, np.random.default_rng(5))
+    session = read_crazyflie_usd([write(log, tmp_path)])
+    assert set(session.sweeps.channel.tolist()) == {1}
+    [warning] = session.warnings
+    assert "of a station whose rotor is not regular" in warning
 
 
 def test_a_torn_log_is_imported_with_its_loss(crazyflie: ModuleType, tmp_path: Path) -> None:
@@ -405,6 +432,34 @@ def test_calibrations_come_from_the_configuration(crazyflie: ModuleType, tmp_pat
     assert [station.channel for station in scene.stations] == [1, 2]
     with pytest.raises(InputError, match="no configuration"):
         read_crazyflie_usd([path], stations=True)
+
+
+def test_a_configuration_of_cflib_is_read(crazyflie: ModuleType, tmp_path: Path) -> None:
+    """Written by cflib (GPL), as a program in an environment of its own."""
+    python = os.environ.get("LOCATK_CFLIB_PYTHON")
+    if not python:
+        pytest.skip("LOCATK_CFLIB_PYTHON does not name a Python with cflib")
+    program = """
+import sys
+from cflib.crazyflie.mem.lighthouse_memory import LighthouseBsCalibration, LighthouseBsGeometry
+from cflib.localization import LighthouseConfigFileManager
+geometry, calibration = LighthouseBsGeometry(), LighthouseBsCalibration()
+geometry.origin, geometry.valid = [1.0, 2.0, 3.0], True
+geometry.rotation_matrix = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+calibration.uid, calibration.valid = 1234, True
+calibration.sweeps[1].tilt, calibration.sweeps[1].gibmag = 0.046, 0.005
+LighthouseConfigFileManager.write(sys.argv[1], {1: geometry}, {1: calibration}, 2)
+"""
+    config = tmp_path / "system.yaml"
+    subprocess.run([python, "-c", program, str(config)], check=True)
+    path = write(crazyflie.write_flight(crazyflie.Flight(2.5), np.random.default_rng(6)), tmp_path)
+    scene = read_crazyflie_usd([path], config=config, stations=True).scene
+    assert scene is not None
+    [station] = scene.stations
+    assert (station.channel, station.id) == (2, 1234)
+    np.testing.assert_array_equal(station.position, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(station.rotation @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    assert station.calibration.source == "factory"
 
 
 def test_a_receiver_has_a_place_on_its_device(crazyflie: ModuleType, tmp_path: Path) -> None:
