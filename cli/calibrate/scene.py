@@ -169,8 +169,8 @@ def command(
       locatk calibrate scene run.mcap -o scene.toml
       locatk calibrate scene run.mcap -o scene.toml --scene two-3d
       locatk calibrate scene run.mcap -o scene.toml --floor --x-distance 1000
-      locatk calibrate scene run.mcap -o scene.toml --marker a=0,0 --marker b=2000,0
-          --marker c=2000,1500
+      locatk calibrate scene run.mcap -o scene.toml
+          --marker a=0,0 --marker b=2000,0 --marker c=2000,1500
       locatk calibrate scene -o scene.toml --wizard /dev/ttyACM0 --x-distance 1000
       locatk solve later.mcap -o solved.mcap --artifact scene.toml
     """
