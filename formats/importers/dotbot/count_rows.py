@@ -471,7 +471,7 @@ def find_new_counts(rows: CountRows) -> tuple[NDArray[np.bool_], Array]:
         is_new[index] = np.where(is_unchanged[:, None], agrees, changed)
         is_dated = changed & ~is_single[:, None] & np.isfinite(age_us)
         tick = rows.tick[index]
-        is_by_station = np.mean(np.diff(tick) < 0) > MAX_BACKWARD_FRACTION
+        is_by_station = bool(np.mean(np.diff(tick) < 0) > MAX_BACKWARD_FRACTION)
         for column in range(count.shape[1]):
             new = np.flatnonzero(is_new[index, column])
             time_us = _choose_rotations(
