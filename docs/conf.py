@@ -29,7 +29,7 @@ html_show_sphinx = False
 html_show_search_summary = False
 
 MENU = {
-    "First hour": ["first-hour-*"],
+    "First hour": ["first-hour-*", "crazyflie"],
     "Systems": ["lighthouse", "light", "lighthouse-signal", "dots", "polaris", "landmarks"],
     "From port to viewer": ["capture", "batch", "viewers"],
     "Reference": [

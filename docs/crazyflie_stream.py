@@ -9,7 +9,8 @@ and in another terminal, on the same computer::
     locatk capture socket://127.0.0.1:19860 -o flight.mcap
 
 End the capture first, then this script, both with Ctrl-C. The Crazyflie needs a Lighthouse deck,
-and firmware of September 2020 or later.
+and firmware of after July 2021 (crazyflie-firmware, pull request 807); this script needs Python
+3.10 or later.
 
 A Crazyradio serves one program at a time. To record while your own program flies the Crazyflie, put
 this file beside it and stream from there::
@@ -301,12 +302,11 @@ class CrazyflieStream:
         try:
             # cflib takes packets of all channels of this port for those of one of them, and would
             # decode raw sweeps as angles.
-            misreading = getattr(crazyflie.loc, "_incoming", None)
-            if misreading is not None:
-                crazyflie.remove_port_callback(CRTPPort.LOCALIZATION, misreading)
-                crazyflie.add_header_callback(
-                    misreading, CRTPPort.LOCALIZATION, LOCALIZATION_CHANNEL
-                )
+            if misreading := getattr(crazyflie.loc, "_incoming", None):
+                port = CRTPPort.LOCALIZATION
+                crazyflie.remove_port_callback(port, misreading)
+                crazyflie.remove_header_callback(misreading, port, LOCALIZATION_CHANNEL)
+                crazyflie.add_header_callback(misreading, port, LOCALIZATION_CHANNEL)
             crazyflie.add_header_callback(self._take_passages, CRTPPort.LOCALIZATION, RAW_CHANNEL)
             for block, take in ((self.imu, self._take_imu), (self.poses, self._take_pose)):
                 config = LogConfig(block.name, block.period_ms)
@@ -346,11 +346,14 @@ class CrazyflieStream:
     def status(self) -> str:
         """Return what was received so far, in a line."""
         channels = ", ".join(map(str, sorted(self.channels))) or "none"
-        lost = "; ".join(self._losses(block) for block in (self.imu, self.poses) if block.lost)
-        return (
-            f"{self.passages} sweeps (channels: {channels}), {self.imu.received} imu, "
-            f"{self.poses.received} poses" + (f"; {lost}" if lost else "")
+        counts = (
+            f"{self.passages} passages of light (channels: {channels}), {self.imu.received} imu, "
+            f"{self.poses.received} poses"
         )
+        faults = [self._losses(block) for block in (self.imu, self.poses) if block.lost]
+        if self.invalid_packets:
+            faults.append(f"{self.invalid_packets} packets of sweeps of another length")
+        return "; ".join([counts, *faults])
 
     def _losses(self, block: LogBlock) -> str:
         sent = block.lost + block.received

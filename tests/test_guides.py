@@ -35,6 +35,7 @@ import functools
 import itertools
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -213,6 +214,12 @@ def _drive_csv(folder: Path, words: list[str]) -> None:
     np.savetxt(folder / "drive.csv", table, "%.4f", ",", header=header, comments="")
 
 
+def _crazyflie_log(folder: Path, words: list[str]) -> None:
+    """A log of a Crazyflie that rested on four points of the floor."""
+    tools = runpy.run_path(str(ROOT / "tests" / "data" / "crazyflie_visit.py"))
+    tools["write_log"](folder / "log00")
+
+
 def _published(place: str) -> Callable[[Path, list[str]], None]:
     """A link to published data."""
 
@@ -230,6 +237,7 @@ def _published(place: str) -> Callable[[Path, list[str]], None]:
 FILES: Mapping[str, Callable[[Path, list[str]], None]] = {
     "frames": _frames,
     "drive.csv": _drive_csv,
+    "log00": _crazyflie_log,
     "map.toml": lambda folder, _: _made(folder, "map", "design", "4x4", "-o", "map.toml"),
     "tag.toml": lambda folder, _: _made(folder, "tag", "design", "-o", "tag.toml"),
     "halls.toml": lambda folder, _: _write(folder / "halls.toml", _toml_of_formats("halls.toml")),

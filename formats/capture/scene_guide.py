@@ -245,13 +245,12 @@ class SceneGuide:
                 self._moved_s += elapsed_s - self._updated_s
                 self.is_done = self._moved_s >= self._motion_s
             return ["Done."] if self.is_done else []
-        is_old = bool(self.accepted) and self._rest.start_ns <= self.accepted[-1].time_ns
-        if self.can_finish or is_old or self._rest.duration_s < REST_S:
+        if self.can_finish or self._rest.duration_s < REST_S:
             return []
         angles = _angles_at(sweeps, self._rest)
         for point, known in zip(self.accepted, self._angles, strict=True):
             if _is_same_position(angles, known):
-                # It may also be the rest that was accepted, of which only the end is recent.
+                # It may also be the rest that was just accepted and lasts.
                 lines = [f"This is the position of the {point.role}. {self._prompt()}"]
                 lines, self._has_moved = lines if self._has_moved else [], False
                 return lines

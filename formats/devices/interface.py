@@ -130,6 +130,16 @@ class Batch:
     def __len__(self) -> int:
         return len(self.end)
 
+    def take(self, rows: NDArray[np.int64]) -> Batch:
+        """Return the selected records."""
+        return Batch(
+            self.stream,
+            self.end[rows],
+            {name: column[rows] for name, column in self.columns.items()},
+            None if self.tick is None else self.tick[rows],
+            None if self.sequence is None else self.sequence[rows],
+        )
+
 
 @dataclass
 class Counts:

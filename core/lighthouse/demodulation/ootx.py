@@ -77,10 +77,12 @@ WORD_BITS = 16
 FRAME_BITS = SYNC_BITS + (1 + (PAYLOAD_BYTES + 1) // 2 + 2) * (WORD_BITS + 1)
 """Length of a frame, with its sync pattern."""
 
+FIXED_BITS = 67
+"""Number of bits that are equal in all frames."""
+
 MIN_FIXED_BITS = 36
-"""Of the 67 bits that are equal in all frames, at least this number must be received, and all of
-those must be right: as many as the sync, the length and its stuffing bit have. Noise passes with a
-probability of 2^-36."""
+"""At least this number of the fixed bits must be received, and all of those must be right: as many
+as the sync, the length and its stuffing bit have. Noise passes with a probability of 2^-36."""
 
 MAX_SOLVED_BITS = 8
 """Largest number of missing bits for which all values are tried. 24 of the checksum's 32 bits

@@ -78,8 +78,7 @@ def find_standstills(
     Returns
     -------
     list of Standstill
-        Two rests at one position without motion between them, as when the light is interrupted,
-        are one standstill.
+        An interruption of the light at rest does not divide it.
     """
     epochs = group_epochs(sweeps)
     angles = rotor_angles(epochs).reshape(len(epochs), 2 * len(epochs.channels))
@@ -115,10 +114,8 @@ def _device_standstills(
     if len(windows) == 0:
         return []
     max_spread_rad = _max_spread(window, epochs.device[rows], angles[rows])
-    rests = _split_rests(medians, max_spread_rad)
-    rests = _merge_rests(medians, rests, max_spread_rad)
     standstills = []
-    for first, last in rests:
+    for first, last in _split_rests(medians, max_spread_rad):
         # Up to half of the first and the last window may be of the motion.
         start_ns = first_ns + int(windows[first]) * window_ns + window_ns // 2
         end_ns = first_ns + int(windows[last]) * window_ns + window_ns // 2
@@ -195,27 +192,3 @@ def _is_still(spread: Array, max_spread_rad: float) -> bool:
     if len(spread) < 2:
         return False
     return bool(np.quantile(spread, STILL_QUANTILE, method="lower") <= max_spread_rad)
-
-
-def _merge_rests(
-    medians: Array, rests: list[tuple[int, int]], max_spread_rad: float
-) -> list[tuple[int, int]]:
-    """Merge neighbouring rests at one position, if there is no motion between them."""
-    merged: list[tuple[int, int]] = []
-    for first, last in rests:
-        if merged and first == merged[-1][1] + 1:
-            previous = medians[merged[-1][0] : merged[-1][1] + 1]
-            change = np.abs(_row_median(previous) - _row_median(medians[first : last + 1]))
-            if _is_still(change[np.isfinite(change)], max_spread_rad):
-                merged[-1] = (merged[-1][0], last)
-                continue
-        merged.append((first, last))
-    return merged
-
-
-def _row_median(medians: Array) -> Array:
-    """Return the median of each column, ``nan`` if it has no value."""
-    result = np.full(medians.shape[1], np.nan)
-    is_known = np.isfinite(medians).any(axis=0)
-    result[is_known] = np.nanmedian(medians[:, is_known], axis=0)
-    return result

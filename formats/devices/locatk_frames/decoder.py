@@ -313,24 +313,24 @@ def _split(
     batches = []
     for index in np.unique(sources.of[frames[block.valid]]).tolist():
         number, ticks = sources.known[index]
-        is_chosen = (block.valid & (sources.of[frames] == index))[:, None]
-        if block.is_present is not None:
-            is_chosen = is_chosen & block.is_present
-        frame, record = np.nonzero(np.broadcast_to(is_chosen, block.tick.shape))
-        if not len(frame):
-            continue
-        stream_ticks = block.ticks or ticks
-        batches.append(
-            Batch(
-                Stream(
-                    block.kind, str(number) if number else "", block.sensors, ticks=stream_ticks
-                ),
-                contents.end[frames[frame]],
-                {name: column[frame, record] for name, column in block.columns.items()},
-                block.tick[frame, record],
-                heads["sequence"][frames[frame]].astype(np.int64),
-            )
+        which = np.flatnonzero(block.valid & (sources.of[frames] == index))
+        each = block.tick.shape[1]
+        batch = Batch(
+            Stream(
+                block.kind, str(number) if number else "", block.sensors, ticks=block.ticks or ticks
+            ),
+            np.repeat(contents.end[frames[which]], each),
+            {
+                name: column[which].reshape(-1, *column.shape[2:])
+                for name, column in block.columns.items()
+            },
+            block.tick[which].ravel(),
+            np.repeat(heads["sequence"][frames[which]].astype(np.int64), each),
         )
+        if block.is_present is not None:
+            batch = batch.take(np.flatnonzero(block.is_present[which]))
+        if len(batch):
+            batches.append(batch)
     return batches
 
 

@@ -53,6 +53,11 @@ the rotor turns by 7.5 degrees. Later pulses are of another passage (crazyflie-f
 ``pulse_processor_v2.c`` separates passages by the same limit; ``lighthouse_transmit.c``, which
 sends them, does not)."""
 
+HALF_WIDTH_TICKS, MIN_HALF_WIDTH_TICKS, MAX_HALF_WIDTH_TICKS = 150, 40, 500
+"""Half of the width of a pulse on the Lighthouse deck: typical, shortest and longest. Published
+frames of a deck have widths of 272 to 327 ticks (lighthouse-fpga, readme); near a station, pulses
+are longer in proportion."""
+
 MAX_QUATERNION_ERROR = 0.01
 """Largest deviation of the length of a quaternion from 1, for values of half precision."""
 
@@ -422,9 +427,10 @@ def _read_sweeps(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
 def _read_deck(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     """Read passages of light planes over the Lighthouse deck, as a Crazyflie sends them.
 
-    The reference time is the start of the pulse whose offset was found, or of the first pulse if
-    none was; delays are those of the middles of the pulses after it. So offset and delay add up to
-    the rotation at the middle of each pulse.
+    The reference is the start of the pulse whose offset was found, and delays are those of the
+    middles of all pulses. Sweeps refer to the starts of pulses, as in the frames of the deck and in
+    the Crazyflie, so that their scenes agree: half of the width of the reference pulse is
+    subtracted.
     """
     passages = _read_records(payloads, _DECK_PASSAGE)
     if passages is None:
@@ -435,9 +441,10 @@ def _read_deck(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
     # In the order of the pulses, because times of a stream must ascend.
     sensor = np.argsort(passages["delay"], axis=2, kind="stable")
     delay = np.take_along_axis(passages["delay"], sensor, axis=2).astype(np.int64)
-    offset = (head & 0x1FFFF)[..., None]
-    count = offset + delay / _TICKS_PER_COUNT
     is_received = delay != _ABSENT_DELAY
+    offset = (head & 0x1FFFF)[..., None]
+    start = delay - _reference_half_width(delay)[..., None]
+    count = offset + start / _TICKS_PER_COUNT
     is_present = is_received & (np.abs(delay) <= MAX_DECK_DELAY_TICKS) & (offset > 0) & (count >= 0)
     valid = np.logical_and.reduce(head & 0xC0000 == 0, axis=1)
     polynomial = (head >> 20 << 1 | head >> 17 & 1).astype(np.int32)[..., None]
@@ -456,12 +463,31 @@ def _read_deck(payloads: Bytes, tick: NDArray[np.int64]) -> Block | None:
         "lighthouse",
         DECK_SENSORS,
         valid,
-        ((reference[..., None] + delay) & (1 << DECK_TICKS.bits) - 1).reshape(size),
+        ((reference[..., None] + start) & (1 << DECK_TICKS.bits) - 1).reshape(size),
         columns,
         DECK_TICKS,
         is_present.reshape(size),
         int(np.count_nonzero(is_received[valid] & ~is_present[valid])),
     )
+
+
+def _reference_half_width(delay: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return half of the width (n, m) of the pulses with the offsets, in ticks.
+
+    It is the delay of that pulse. Which one it is was not sent. The deck identifies a station from
+    two pulses, and then finds the offset: it is the second pulse if that has a possible delay,
+    otherwise the one with the most typical delay.
+
+    Parameters
+    ----------
+    delay : (n, m, 4) ndarray
+        Ascending along the last axis.
+    """
+    is_possible = (delay >= MIN_HALF_WIDTH_TICKS) & (delay <= MAX_HALF_WIDTH_TICKS)
+    distance = np.where(is_possible, np.abs(delay - HALF_WIDTH_TICKS), np.iinfo(np.int64).max)
+    pulse = np.where(is_possible[..., 1], 1, np.argmin(distance, axis=2))[..., None]
+    half_width = np.take_along_axis(delay, pulse, axis=2)[..., 0]
+    return np.where(is_possible.any(axis=2), half_width, HALF_WIDTH_TICKS)
 
 
 def _in_range(values: NDArray[Any], low: int, high: int) -> NDArray[np.bool_]:

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from locatk.core.lighthouse.demodulation import ootx
+from locatk.core.lighthouse.demodulation import ootx, sweep_reports
 from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
-from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
 from locatk.formats.artifacts.scene import read_scene
@@ -87,6 +86,16 @@ def test_times_may_be_wrong_by_milliseconds_and_sweeps_missing() -> None:
 
 def test_a_recording_shorter_than_a_frame_has_none() -> None:
     assert report_stations(sweeps_of({1: 1}, 400)) == ((), ())
+
+
+def test_devices_that_report_few_rotations_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gateway reports one rotation of five: no frame can be found, and none is searched."""
+    sweeps = sweeps_of({1: 1}, 5000)
+    rotation = np.rint((sweeps.time_ns - sweeps.time_ns[0]) * 1e-9 / PERIODS[1]).astype(int)
+    few = sweeps.take(rotation % 5 == 0)
+    assert ootx.decode_frames(np.where(np.arange(5000) % 5, -1, 1)) == []
+    monkeypatch.setattr(sweep_reports, "decode_frames", pytest.fail)
+    assert report_stations(few) == ((), ())
 
 
 def test_slow_bits_of_chance_are_no_factory_data() -> None:
@@ -165,9 +174,7 @@ def test_real_stations_as_decoded_from_syncs_and_light(
 def test_a_solution_uses_the_factory_data_in_its_recording(
     tmp_path: Path, locatk: Callable[..., Result]
 ) -> None:
-    simulated = simulate(
-        SimulationOptions(planar=False, receiver=DECK, report_hz=50, duration_s=36, seed=3)
-    )
+    simulated = simulate(SimulationOptions(report_hz=50, duration_s=36, seed=3))
     sweeps = simulated.sweeps
     polynomial = sweeps.polynomial.copy()
     for channel in (1, 2):
@@ -178,7 +185,7 @@ def test_a_solution_uses_the_factory_data_in_its_recording(
         polynomial[rows] = 2 * (channel - 1) + bits[rotation]
     run, scene = tmp_path / "run.mcap", tmp_path / "scene.toml"
     sweeps = replace(sweeps, polynomial=polynomial)
-    write_session(run, system="lighthouse", sweeps=sweeps, receivers={"robot-1": DECK})
+    write_session(run, system="lighthouse", sweeps=sweeps, scene=simulated.scene)
     result = locatk("solve", run, "-o", tmp_path / "solved.mcap", "--save-scene", scene)
     assert result.exit_code == 0, result.output
     assert "no factory calibration" not in result.output

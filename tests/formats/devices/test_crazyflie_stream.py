@@ -22,18 +22,25 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import Result
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+from locatk.formats.artifacts.receiver import RECEIVER_FILE, dumps_receiver
+from locatk.formats.capture.ingestion import SerialIntake
+from locatk.formats.capture.reader_thread import ReceivedData
+from locatk.formats.devices import find_device
 from locatk.formats.devices.interface import Options, Stream, Ticks
 from locatk.formats.devices.locatk_frames.decoder import FrameDecoder
 from locatk.formats.devices.locatk_frames.framing import encode_frame
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.observations import read_imu, read_onboard, read_sweeps
 from locatk.formats.sessions.reader import Session
+from locatk.formats.sessions.writer import SessionWriter
 
 LIMIT_S = 30.0
 
@@ -75,20 +82,20 @@ def passage(
 def passages_of(sweeps: Sweeps, start_ns: int) -> list[tuple[float, bytes]]:
     """Times in s and records of a deck; the second pulse of a passage has the offset."""
     time_s = (sweeps.time_ns - start_ns) * 1e-9
-    middle = np.rint(time_s * DECK_HZ).astype(np.int64) + 16_000_000
+    start = np.rint(time_s * DECK_HZ).astype(np.int64) + 16_000_000
     found = []
     for polynomial in np.unique(sweeps.polynomial):
         rows = np.flatnonzero(sweeps.polynomial == polynomial)
-        for group in np.split(rows, np.flatnonzero(np.diff(middle[rows]) > 10_000) + 1):
+        for group in np.split(rows, np.flatnonzero(np.diff(start[rows]) > 10_000) + 1):
             first = group[min(1, len(group) - 1)]
-            reference = int(middle[first]) - PULSE_TICKS // 2
-            # The middles agree with the counts, to a tick.
+            reference = int(start[first])
+            # The starts agree with the counts, to a tick.
             steps = np.rint(4 * (sweeps.count[group] - sweeps.count[first])).astype(int)
             delays = {
                 int(s): int(d) + PULSE_TICKS // 2
                 for s, d in zip(sweeps.sensor[group], steps, strict=True)
             }
-            offset = round(sweeps.count[first] - PULSE_TICKS / 8)
+            offset = round(sweeps.count[first])
             number = int(polynomial)
             data = passage(number // 2 + 1, number % 2, offset, reference, delays)
             found.append((float(time_s[group].max()), data))
@@ -122,20 +129,91 @@ def decoded(*payloads: bytes) -> tuple[dict[str, NDArray[Any]], FrameDecoder]:
 
 def test_a_passage_over_four_photodiodes() -> None:
     # The reference is the start of the pulse of sensor 1; delays include half of each width.
-    columns, decoder = decoded(passage(3, 1, 40_000, 100, {1: 145, 0: -55, 3: 1200, 2: 1100}))
+    columns, decoder = decoded(passage(3, 1, 40_000, 1000, {1: 145, 0: -55, 3: 1200, 2: 1100}))
     assert columns["sensor"].tolist() == [0, 1, 2, 3]
     assert set(columns["channel"]) == {3}
     assert set(columns["polynomial"]) == {5}
     assert set(columns["sweep"]) == {-1}
-    assert columns["count"].tolist() == [40_000 + d / 4 for d in (-55, 145, 1100, 1200)]
-    assert columns["tick"].tolist() == [45, 245, 1200, 1300]
+    assert columns["count"].tolist() == [40_000 + d / 4 for d in (-200, 0, 955, 1055)]
+    assert columns["tick"].tolist() == [800, 1000, 1955, 2055]
     assert (decoder.counts.frames, decoder.counts.bad, decoder.remarks) == (2, 0, [])
 
 
 def test_times_ascend_and_wrap_with_the_clock_of_the_deck() -> None:
-    columns, _ = decoded(passage(1, 0, 30_000, 0xFFFFF0, {3: 10, 0: 20, 1: 4000, 2: -100}))
+    columns, _ = decoded(passage(1, 0, 30_000, 0xFFFFF0, {3: 160, 0: 170, 1: 4000, 2: -100}))
     assert columns["sensor"].tolist() == [2, 3, 0, 1]
-    assert columns["tick"].tolist() == [0xFFFF8C, 0xFFFFFA, 4, 3984]
+    assert columns["tick"].tolist() == [0xFFFFF0 - 260, 0xFFFFF0, 0xFFFFFA, 3840 - 16]
+
+
+@pytest.mark.parametrize(
+    ("delays", "half_width"),
+    [
+        ([-300, 145, 500, 900], 145),  # the second pulse has the offset
+        ([148, 185, 900, 990], 185),  # although the first one could have it, too
+        ([-900, -800, 130, 900], 130),  # only the third one can
+        ([-900, 20, 190, 400], 190),  # the one with the most typical delay
+        ([160], 160),
+        ([-900, -800, -700, 2000], 150),  # its pulse was replaced by a later one
+        ([-900, 900], 150),
+    ],
+)
+def test_sweeps_refer_to_the_starts_of_pulses(delays: list[int], half_width: int) -> None:
+    columns, _ = decoded(passage(1, 0, 40_000, 50_000, dict(enumerate(delays))))
+    assert columns["count"].tolist() == [40_000 + (d - half_width) / 4 for d in delays]
+
+
+PUBLISHED_FRAMES = """
+    1 5431ed 13d None     0 128aa
+    0 543291 141    0 28992 1a639
+    3 5436c4 147    0     0 1f5dc
+    2 543769 140    0     0 026f3
+    0 56bcd9 120 None     0 1b903
+    1 56be78 110    0 70714 175a5
+    2 56c094 113    0     0 05879
+    3 56c21a 12a    0     0 1c094
+    1 5b82f5 13f None     0 0debe
+    0 5b8395 144    1 28992 11c42
+    3 5b87c8 146    1     0 194c5
+    2 5b8870 144    1     0 19e30
+    0 5e0dcf 118 None     0 19864
+    1 5e0f71 119    1 70711 1511f
+    2 5e1189 113    1     0 0d239
+    3 5e1314 127    1     0 08c31
+"""
+"""Sensor, time, width, polynomial, offset and beam word of frames that a deck sent: readme of
+bitcraze/lighthouse-fpga."""
+
+
+def test_published_frames_give_the_same_sweeps_by_wire_and_by_radio() -> None:
+    wire, packets = b"\xff" * 12, []
+    delays: dict[int, tuple[int, int]] = {}
+    channel, reference, offset = -1, 0, 0
+    for line in PUBLISHED_FRAMES.split("\n")[1:-1]:
+        sensor, tick, width, polynomial, position, word = line.split()
+        number = None if polynomial == "None" else int(polynomial)
+        head = 0xFC if number is None else number << 2
+        fields = ((head | int(sensor), 1), (int(width, 16), 2), (int(position), 3))
+        fields = (*fields, (int(word, 16), 3), (int(tick, 16), 3))
+        wire += b"".join(value.to_bytes(size, "little") for value, size in fields)
+        # As lighthouse_transmit.c: a record when all four photodiodes were lit.
+        delays[int(sensor)] = int(tick, 16), int(width, 16) // 2
+        if number is not None and channel < 0:
+            channel, reference = number, int(tick, 16)
+        if int(position):
+            reference, offset = int(tick, 16), int(position)
+        if len(delays) == 4:
+            sent = {key: start + half - reference for key, (start, half) in delays.items()}
+            packets.append(passage(channel // 2 + 1, channel % 2, offset, reference, sent))
+            delays, channel, offset = {}, -1, 0
+    by_radio, _ = decoded(packets[0] + packets[1], packets[2] + packets[3])
+    deck = find_device("lighthouse-deck").create_decoder(Options())
+    batches = [*deck.feed(wire), *deck.finish()]
+    for name in ("sensor", "channel", "polynomial", "count"):
+        by_wire = np.concatenate([batch.columns[name] for batch in batches])
+        # Widths of the pulses of a passage differ by 29 ticks at most, counts by an eighth of it.
+        tolerance = 29 / 8 if name == "count" else 0
+        np.testing.assert_allclose(by_radio[name], by_wire, atol=tolerance, rtol=0)
+    assert len(by_radio["count"]) == 16
 
 
 def test_photodiodes_without_light_give_no_sweep() -> None:
@@ -150,7 +228,7 @@ def test_photodiodes_without_light_give_no_sweep() -> None:
     [
         (passage(1, 0, 0, 0, {0: 100, 1: 200}), 0),  # no offset
         (passage(1, 0, 30_000, 0, {0: 100, 1: 10_001, 2: -10_001}), 1),  # another passage
-        (passage(1, 0, 30, 0, {0: 100, 1: -121}), 1),  # before the rotor's zero
+        (passage(1, 0, 30, 0, {0: 100, 1: -21}), 1),  # before the rotor's zero
     ],
 )
 def test_pulses_that_belong_to_no_sweep_are_reported(data: bytes, used: int) -> None:
@@ -161,6 +239,14 @@ def test_pulses_that_belong_to_no_sweep_are_reported(data: bytes, used: int) -> 
         f"{total - used - 1} of {total} pulses of the Lighthouse deck are in no sweep: their "
         "passage has no offset, or they are of another one"
     ]
+
+
+def test_only_a_deck_has_its_photodiodes() -> None:
+    device = find_device("locatk")
+    deck = Stream("lighthouse", sensors=4)
+    assert device.default_artifacts(deck) == {RECEIVER_FILE: dumps_receiver(DECK)}
+    for stream in (Stream("lighthouse"), Stream("halls", sensors=4), Stream("imu")):
+        assert device.default_artifacts(stream) == {}
 
 
 @pytest.mark.parametrize(
@@ -185,36 +271,27 @@ def stand_in(root: Path) -> Path:
     return root / "tests" / "data" / "cflib_stand_in"
 
 
-@pytest.fixture
-def module(script: Path, stand_in: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+@pytest.fixture(scope="module")
+def module(script: Path, stand_in: Path) -> Iterator[ModuleType]:
     """The script as a program of a user imports it."""
-    monkeypatch.syspath_prepend(str(stand_in))
-    for name in [name for name in sys.modules if name.partition(".")[0] == "cflib"]:
-        monkeypatch.delitem(sys.modules, name)
-    spec = importlib.util.spec_from_file_location("crazyflie_stream", script)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    # A dataclass or the like would look the module up.
-    monkeypatch.setitem(sys.modules, "crazyflie_stream", module)
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(stand_in))
+        for name in [name for name in sys.modules if name.partition(".")[0] == "cflib"]:
+            patch.delitem(sys.modules, name)
+        spec = importlib.util.spec_from_file_location("crazyflie_stream", script)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        yield module
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [b"", bytes(28), bytes(range(256))[1:], b"\1" * 253, b"\1" * 300 + b"\0", b"\0" + b"\2" * 600],
-)
-def test_frames_are_those_of_the_protocol(module: ModuleType, payload: bytes) -> None:
-    content = struct.pack("<BBHI", 10, 0, 7, 9) + payload
-    if len(content) > 256:
-        pytest.skip("longer frames have another CRC, and are not sent")
-    decoder = FrameDecoder(Options())
-    decoder.feed(module.encode_frame(10, 7, 9, payload))
-    assert decoder.counts.skipped in (0, len(module.encode_frame(10, 7, 9, payload)))
-    assert module.encode_frame(2, 7, 9, b"\2" + payload[:100]) == encode_frame(
-        struct.pack("<BBHI", 2, 0, 7, 9) + b"\2" + payload[:100]
-    )
+@given(st.binary(max_size=240), st.integers(0, 1 << 20), st.integers(0, 1 << 40))
+def test_frames_are_those_of_the_protocol(
+    module: ModuleType, payload: bytes, sequence: int, tick: int
+) -> None:
+    content = struct.pack("<BBHI", 10, 0, sequence & 0xFFFF, tick & 0xFFFFFFFF) + payload
+    assert module.encode_frame(10, sequence, tick, payload) == encode_frame(content)
 
 
 def test_attitude_has_its_pitch_reversed(module: ModuleType) -> None:
@@ -549,3 +626,76 @@ def test_cflib_understands_what_the_script_asks(
     assert crazyflie.asked[0] == start[0]
     assert set(crazyflie.asked[:3]) == {*start, "lighthouse.enLhRawStream=1"}
     assert {*stop, "stop stateEstimate.x", "lighthouse.enLhRawStream=0"} == set(crazyflie.asked[3:])
+
+
+# ---- to poses
+
+
+def raw_packets(flight: Any, rng: np.random.Generator) -> list[tuple[float, bytes]]:
+    """Times in s and packets of a deck whose clock is 7 ppm slow."""
+    found = []
+    crossings = flight.crossings()
+    key = crossings["channel"] * 10_000_000 + crossings["turn"] * 2 + crossings["plane"]
+    slow_bits = rng.integers(0, 2, (17, int(crossings["turn"].max()) + 1))
+    for number in np.unique(key):
+        rows = np.flatnonzero(key == number)
+        channel, turn = int(crossings["channel"][rows[0]]), int(crossings["turn"][rows[0]])
+        seen = rows[rng.random(len(rows)) < 0.97]
+        if len(seen) < 2:
+            continue
+        tick = np.rint(crossings["t"][seen] * DECK_HZ).astype(int)
+        reference = int(tick[1])
+        period = {1: 959_000, 2: 957_000, 3: 953_000}[channel] / 8
+        offset = round(crossings["fraction"][seen[1]] * period)
+        delay = tick - reference + PULSE_TICKS // 2
+        delays = dict(zip(crossings["sensor"][seen].tolist(), delay, strict=True))
+        bit = int(slow_bits[channel, turn])
+        found.append((crossings["t"][seen].max(), passage(channel, bit, offset, reference, delays)))
+    return packets_of(sorted(found))
+
+
+@pytest.mark.slow
+def test_the_stream_of_a_flight_is_solved(
+    crazyflie: ModuleType, module: ModuleType, tmp_path: Path, locatk: Callable[..., Result]
+) -> None:
+    """Frames of the script, delayed by the radio, of a flight that another simulator made."""
+    rng = np.random.default_rng(4)
+    flight = crazyflie.Flight(seconds=10.0)
+    start_ns = 1_800_000_000_000_000_000
+    packets = [
+        (time_s, module.LIGHTHOUSE_DECK, 0, data) for time_s, data in raw_packets(flight, rng)
+    ]
+    time_s = np.arange(0.0, flight.seconds, 0.02)
+    quaternion = Rotation.from_matrix(flight.rotation(time_s)).as_quat()
+    for t, position, q in zip(time_s, flight.position(time_s), quaternion, strict=True):
+        packets.append((t, module.POSE, round(1000 * t), module.encode_series((*position, *q))))
+    arrivals = np.array([packet[0] for packet in packets]) + 0.002
+    arrivals += rng.exponential(0.004, len(packets))
+    order = np.argsort(arrivals, kind="stable")
+    intake = SerialIntake("crazyflie", "socket://here:1", "locatk")
+    run = tmp_path / "run.mcap"
+    with SessionWriter(run, system="lighthouse") as writer:
+        writer.attach_toml(RECEIVER_FILE, dumps_receiver(DECK))
+        stamped = []
+        hello = struct.pack("<B3xI", 1, 1000)
+        data = module.encode_frame(module.HELLO, 0, 0, hello)
+        for sequence, index in enumerate(order.tolist(), 1):
+            _, kind, tick, payload = packets[index]
+            data += module.encode_frame(kind, sequence, tick, payload)
+            received = ReceivedData(start_ns + int(arrivals[index] * 1e9), data, len(data))
+            stamped += intake.take([received])
+            data = b""
+        for each in [*stamped, *intake.finish()]:
+            writer.write(each.topic, each.message, each.time_ns, each.publish_ns)
+    assert intake.remarks() == []
+    solved = tmp_path / "solved.mcap"
+    assert locatk("solve", run, "-o", solved).exit_code == 0
+    # What the Crazyflie sends as its own estimate is the truth here. It has another clock, which
+    # is synchronized after some seconds.
+    result = locatk("eval", run, "--onboard", "--truth", solved, "--align", "se3", "--json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["n"] > 450
+    assert figures["median_m"] < 0.003
+    assert figures["p95_m"] < 0.008
+    assert figures["ape"]["rotation_deg"]["median"] < 0.3
