@@ -248,8 +248,9 @@ class Layout:
 
 def _default_values(column: Column, entries: int) -> bytes:
     dtype = np.dtype(column.dtype)
-    value = np.nan if dtype.kind == "f" else 0
-    return np.full(entries * column.width, value, dtype).tobytes()
+    if dtype.kind != "f":
+        return bytes(entries * column.width * dtype.itemsize)
+    return np.full(entries * column.width, np.nan, dtype).tobytes()
 
 
 MAX_BATCH_NS = 500_000_000
