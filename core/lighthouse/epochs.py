@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
 from locatk.core.lighthouse.light_planes import counts_to_angles
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
@@ -122,16 +123,7 @@ def group_epochs(sweeps: Sweeps) -> Epochs:
     rejected: dict[str, int] = {}
     valid = _select_valid(sweeps, rejected)
     photodiode, names = _photodiodes(sweeps)
-    order = valid[
-        np.lexsort(
-            (
-                sweeps.count[valid],
-                sweeps.time_ns[valid],
-                sweeps.channel[valid],
-                photodiode[valid],
-            )
-        )
-    ]
+    order = _sort(photodiode, sweeps, valid)
     photodiode, time_ns, channel = photodiode[order], sweeps.time_ns[order], sweeps.channel[order]
     count, reported_plane = sweeps.count[order], sweeps.sweep[order]
     unique = _differs_from_previous(photodiode, channel, time_ns, count, reported_plane)
@@ -146,13 +138,14 @@ def group_epochs(sweeps: Sweeps) -> Epochs:
     epoch = _split_epochs(photodiode, time_ns, station, plane, pair)
     # Flat index into `counts`; if a plane occurs twice in an epoch, its first sweep is used.
     slot = (epoch * len(channels) + station) * 2 + plane
-    has_plane = plane != UNKNOWN
-    _, used = np.unique(np.where(has_plane, slot, -1), return_index=True)
-    used = used[has_plane[used]]
-    _add_rejected(rejected, "repeated_in_rotation", np.count_nonzero(has_plane) - len(used))
-
+    has_plane = np.flatnonzero(plane != UNKNOWN)
     m = int(epoch.max()) + 1 if len(epoch) else 0
     shape = (m, len(channels), 2)
+    first_sweep = np.full(m * len(channels) * 2, -1)
+    first_sweep[slot[has_plane[::-1]]] = has_plane[::-1]
+    used = first_sweep[first_sweep >= 0]
+    _add_rejected(rejected, "repeated_in_rotation", len(has_plane) - len(used))
+
     counts = np.full(shape, np.nan)
     counts.ravel()[slot[used]] = count[used]
     epoch_photodiode = np.zeros(m, np.int64)
@@ -203,6 +196,22 @@ def _photodiodes(sweeps: Sweeps) -> tuple[NDArray[np.int64], list[str]]:
         sweeps.device.astype(np.int64) * sensors + sweeps.sensor, return_inverse=True
     )
     return photodiode, [f"{sweeps.devices[k // sensors]}/{k % sensors}" for k in codes]
+
+
+def _sort(
+    photodiode: NDArray[np.int64], sweeps: Sweeps, rows: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the indices ``rows`` sorted by photodiode, channel, time and count."""
+    source = photodiode[rows] * (max(CHANNELS) + 1) + sweeps.channel[rows]
+    if len(source) and source.max() < 1 << 16:
+        # Numpy sorts 16 bits in linear time. Most sources send their sweeps in the order of time.
+        order = rows[np.argsort(source.astype(np.uint16), kind="stable")]
+        same_source = ~_differs_from_previous(photodiode[order], sweeps.channel[order])[1:]
+        elapsed_ns = np.diff(sweeps.time_ns[order])
+        is_ascending = (elapsed_ns > 0) | (elapsed_ns == 0) & (np.diff(sweeps.count[order]) >= 0)
+        if np.all(is_ascending | ~same_source):
+            return order
+    return rows[np.lexsort((sweeps.count[rows], sweeps.time_ns[rows], source))]
 
 
 def _differs_from_previous(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:
@@ -295,7 +304,31 @@ def _split_epochs(
     after_silence = np.r_[
         True, (np.diff(pair_ns) > MAX_SILENCE_NS) | (np.diff(pair_photodiode) != 0)
     ]
-    # The end of an epoch depends on its beginning, which cannot be vectorised.
+    pair_epoch = np.empty(len(order), np.int64)
+    pair_epoch[order] = _number_epochs(after_silence, pair_ns, pair_planes)
+    return pair_epoch[pair]
+
+
+def _number_epochs(
+    after_silence: NDArray[np.bool_], pair_ns: NDArray[np.float64], pair_planes: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the epoch (n,) of each pair, given its time and the bits of its planes."""
+    if kernels is None:
+        return number_epochs_python(after_silence, pair_ns, pair_planes)
+    epoch = np.empty(len(pair_ns), np.int64)
+    kernels.light_epochs(
+        after_silence, pair_ns, pair_planes, len(pair_ns), float(MAX_EPOCH_NS), epoch
+    )
+    return epoch
+
+
+def number_epochs_python(
+    after_silence: NDArray[np.bool_], pair_ns: NDArray[np.float64], pair_planes: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Number epochs without the compiled kernel.
+
+    The end of an epoch depends on its beginning, which cannot be vectorised.
+    """
     labels = []
     epoch, epoch_planes, epoch_start_ns = -1, 0, 0.0
     for is_new, now_ns, planes in zip(
@@ -305,9 +338,7 @@ def _split_epochs(
             epoch, epoch_planes, epoch_start_ns = epoch + 1, 0, now_ns
         epoch_planes |= planes
         labels.append(epoch)
-    pair_epoch = np.empty(len(order), np.int64)
-    pair_epoch[order] = labels
-    return pair_epoch[pair]
+    return np.array(labels, np.int64)
 
 
 def _mean_times(

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse import epochs as limits
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.epochs import Epochs, group_epochs
@@ -51,6 +52,27 @@ def test_a_report_is_an_epoch(report: Any) -> None:
     np.testing.assert_array_equal(epochs.channels, [2, 5])
     assert epochs.rejected == {}
     assert epochs.labelled
+
+
+@pytest.mark.skipif(kernels is None, reason="the compiled kernels were not built")
+def test_the_kernel_equals_its_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Silences, long epochs and planes that occur again."""
+    rng = np.random.default_rng(4)
+    n = 5000
+    sweeps = Sweeps(
+        devices=("a", "b"),
+        time_ns=np.cumsum(rng.choice([0, 1, 5_000_000, 25_000_000], n)),
+        device=rng.integers(0, 2, n, np.int32),
+        sensor=np.zeros(n, np.int32),
+        channel=rng.integers(1, 6, n, np.int32),
+        polynomial=np.full(n, -1, np.int32),
+        sweep=rng.integers(-1, 2, n, np.int32),
+        count=rng.uniform(0, 1e5, n),
+    )
+    compiled = group_epochs(sweeps)
+    monkeypatch.setattr(limits, "kernels", None)
+    assert_same(compiled, group_epochs(sweeps))
+    assert len(compiled) > 500
 
 
 @settings(max_examples=20, deadline=None)
