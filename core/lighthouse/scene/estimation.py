@@ -280,7 +280,7 @@ def _estimate_several_stations(
     planar = {"two-planar": True, "two-3d": False}.get(kind)
     angles = rotor_angles(epochs)
     keyframes, _ = average_standstills(angles, epochs.device)
-    is_observed = np.isfinite(keyframes).all(axis=2)
+    is_observed = np.asarray(np.isfinite(keyframes).all(axis=2))
     keyframes = keyframes[spread_evenly(is_observed, np.arange(len(keyframes)), MAX_KEYFRAMES)]
 
     def misfit_of_markers(state: BundleState, columns: tuple[int, int]) -> float:
