@@ -47,7 +47,7 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets, cell_positions, vertices
 from locatk.core.trajectory import Trajectory
 from locatk.formats.sessions.mcap_file import MAX_TIME_NS
-from locatk.formats.sessions.messages import MAX_BATCH_SAMPLES, MessageBatch, timestamp
+from locatk.formats.sessions.messages import MessageBatch, timestamp
 from locatk.formats.sessions.protobuf_rows import (
     Rows,
     double_fields,
@@ -60,6 +60,9 @@ from locatk.formats.sessions.reader import Session, time_error
 
 MAX_PATH_POINTS = 5000
 """Number of points of a path that is drawn as one line; longer paths are thinned evenly."""
+
+POSES_PER_BLOCK = 4096
+"""Number of poses that are encoded at once: few enough for the cache of a processor."""
 
 POINTS_PER_LINE = 400
 """Number of points of an outline in a point cloud."""
@@ -107,37 +110,39 @@ _POINT_FIELDS = [
 
 def poses(topic: str, trajectory: Trajectory) -> Iterator[MessageBatch]:
     """Yield one ``PoseInFrame`` per pose."""
-    for each in _blocks(trajectory):
+    for time_ns, position, quaternion in _blocks(trajectory):
         rows = encode_message(
             [
-                timestamp_field(1, each.time_ns),
-                text_field(2, each.frame, len(each)),
-                message_field(3, _pose_fields(each.position, each.quaternion)),
+                timestamp_field(1, time_ns),
+                text_field(2, trajectory.frame, len(time_ns)),
+                message_field(3, _pose_fields(position, quaternion)),
             ]
         )
-        yield MessageBatch(topic, PoseInFrame, each.time_ns, rows.split())
+        yield MessageBatch(topic, PoseInFrame, time_ns, rows.split())
 
 
 def transforms(topic: str, trajectory: Trajectory) -> Iterator[MessageBatch]:
     """Yield one ``FrameTransform`` per pose, from the trajectory's frame to the device's."""
-    for each in _blocks(trajectory):
+    for time_ns, position, quaternion in _blocks(trajectory):
         rows = encode_message(
             [
-                timestamp_field(1, each.time_ns),
-                text_field(2, each.frame, len(each)),
-                text_field(3, child_frame(each), len(each)),
-                message_field(4, [double_fields(1, each.position)]),
-                message_field(5, [double_fields(1, each.quaternion)]),
+                timestamp_field(1, time_ns),
+                text_field(2, trajectory.frame, len(time_ns)),
+                text_field(3, child_frame(trajectory), len(time_ns)),
+                message_field(4, [double_fields(1, position)]),
+                message_field(5, [double_fields(1, quaternion)]),
             ]
         )
-        yield MessageBatch(topic, FrameTransform, each.time_ns, rows.split())
+        yield MessageBatch(topic, FrameTransform, time_ns, rows.split())
 
 
-def _blocks(trajectory: Trajectory) -> Iterator[Trajectory]:
-    """Divide a trajectory into parts that are encoded at once."""
-    for start in range(0, len(trajectory), MAX_BATCH_SAMPLES):
-        stop = min(start + MAX_BATCH_SAMPLES, len(trajectory))
-        yield trajectory.select(np.arange(start, stop))
+def _blocks(
+    trajectory: Trajectory,
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield times, positions and quaternions of the poses that are encoded at once."""
+    for start in range(0, len(trajectory), POSES_PER_BLOCK):
+        part = slice(start, start + POSES_PER_BLOCK)
+        yield trajectory.time_ns[part], trajectory.position[part], trajectory.quaternion[part]
 
 
 def _pose_fields(position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> list[Rows]:

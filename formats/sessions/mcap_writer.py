@@ -302,10 +302,9 @@ def _encode(record: records.McapRecord) -> bytes:
 def _group(values: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
     """Yield each distinct value with its ascending indices, in the order of first occurrence."""
     order = np.argsort(values, kind="stable")
-    distinct, first = np.unique(values[order], return_index=True)
-    groups = np.split(order, first[1:])
-    for k in np.argsort(order[first]).tolist():
-        yield int(distinct[k]), groups[k]
+    groups = np.split(order, np.flatnonzero(np.diff(values[order])) + 1)
+    for rows in sorted(groups, key=lambda rows: int(rows[0])):
+        yield int(values[rows[0]]), rows
 
 
 def _rows(table: NDArray[np.void]) -> list[bytes]:

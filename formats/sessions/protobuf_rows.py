@@ -27,21 +27,24 @@ class Rows(NamedTuple):
 
     Attributes
     ----------
-    data : (n, width) uint8 ndarray
-    is_used : (n, width) bool ndarray
+    parts : tuple of (data, is_used)
+        (n, width) uint8 and bool ndarrays, side by side.
+    size : (n,) int64 ndarray
+        Number of bytes of each row.
     """
 
-    data: NDArray[np.uint8]
-    is_used: NDArray[np.bool_]
+    parts: tuple[tuple[NDArray[np.uint8], NDArray[np.bool_]], ...]
+    size: NDArray[np.int64]
 
     def joined(self) -> bytes:
         """Return the bytes of all rows, one after the other."""
-        return self.data[self.is_used].tobytes()
+        data, is_used = (np.concatenate(tables, axis=1) for tables in zip(*self.parts, strict=True))
+        return data[is_used].tobytes()
 
     def split(self) -> list[bytes]:
         """Return the bytes of each row."""
         data = self.joined()
-        edges = np.append(0, np.cumsum(np.count_nonzero(self.is_used, axis=1)))
+        edges = np.append(0, np.cumsum(self.size))
         return [data[start:stop] for start, stop in pairwise(edges.tolist())]
 
 
@@ -56,18 +59,18 @@ def length_delimited(number: int, content: bytes) -> bytes:
 
 def encode_message(fields: Sequence[Rows]) -> Rows:
     """Join the fields of messages, which must be in the order of their numbers."""
-    return Rows(*(np.concatenate(parts, axis=1) for parts in zip(*fields, strict=True)))
+    size = np.sum([field.size for field in fields], axis=0)
+    return Rows(tuple(part for field in fields for part in field.parts), size)
 
 
 def message_field(number: int, fields: Sequence[Rows]) -> Rows:
     """Encode a field that is a message of the given fields; each has at most 127 bytes."""
     content = encode_message(fields)
-    length = np.count_nonzero(content.is_used, axis=1)
-    if np.any(length > MAX_ONE_BYTE_LENGTH):
+    if np.any(content.size > MAX_ONE_BYTE_LENGTH):
         raise ValueError(f"field {number} has more than {MAX_ONE_BYTE_LENGTH} bytes")
-    head = np.empty((len(length), 2), np.uint8)
-    head[:, 0], head[:, 1] = number << 3 | LENGTH_DELIMITED, length
-    return encode_message([Rows(head, np.ones(head.shape, bool)), content])
+    head = np.empty((len(content.size), 2), np.uint8)
+    head[:, 0], head[:, 1] = number << 3 | LENGTH_DELIMITED, content.size
+    return Rows(((head, np.ones(head.shape, bool)), *content.parts), content.size + 2)
 
 
 def double_fields(first_number: int, values: NDArray[np.float64]) -> Rows:
@@ -78,7 +81,8 @@ def double_fields(first_number: int, values: NDArray[np.float64]) -> Rows:
     table["value"] = values
     # Left out is +0.0 only.
     is_used = np.ascontiguousarray(values, "<f8").view("<u8") != 0
-    return Rows(table.view(np.uint8).reshape(n, 9 * k), np.repeat(is_used, 9, axis=1))
+    part = table.view(np.uint8).reshape(n, 9 * k), np.repeat(is_used, 9, axis=1)
+    return Rows((part,), 9 * np.count_nonzero(is_used, axis=1))
 
 
 def integer_field(number: int, values: ArrayLike) -> Rows:
@@ -91,7 +95,7 @@ def integer_field(number: int, values: ArrayLike) -> Rows:
     data[:, 1:] = rest & 127
     data[:, 1:-1] |= np.where(rest[:, 1:] != 0, 128, 0).astype(np.uint8)
     is_used = np.concatenate([value != 0, rest != 0], axis=1)
-    return Rows(data, is_used)
+    return Rows(((data, is_used),), np.count_nonzero(is_used, axis=1))
 
 
 def text_field(number: int, text: str, n: int) -> Rows:
@@ -99,7 +103,7 @@ def text_field(number: int, text: str, n: int) -> Rows:
     content = text.encode()
     field = length_delimited(number, content) if content else b""
     data = np.broadcast_to(np.frombuffer(field, np.uint8), (n, len(field)))
-    return Rows(data, np.ones(data.shape, bool))
+    return Rows(((data, np.ones(data.shape, bool)),), np.full(n, len(field)))
 
 
 def timestamp_field(number: int, time_ns: NDArray[np.int64]) -> Rows:
