@@ -41,8 +41,12 @@ class FailingStream(io.BytesIO):
 
 
 @pytest.mark.parametrize("at_once", [1, 7, 10_000])
-def test_bytes_are_those_of_the_library(at_once: int) -> None:
-    """Chunks end at the same messages, however many are given at a time."""
+@pytest.mark.parametrize("sizes", [(0, 4000), (993, 994)])
+def test_bytes_are_those_of_the_library(at_once: int, sizes: tuple[int, int]) -> None:
+    """Chunks end at the same messages, however many are given at a time.
+
+    Messages of 993 bytes fill a chunk exactly.
+    """
     rng = np.random.default_rng(0)
     ours, theirs = io.BytesIO(), io.BytesIO()
     library = Writer(theirs, compression=CompressionType.ZSTD)
@@ -54,10 +58,10 @@ def test_bytes_are_those_of_the_library(at_once: int) -> None:
             each.register_channel(topic, "protobuf", 1)
     library.add_metadata("m", {"k": "v"})
     writer.add_metadata("m", {"k": "v"})
-    count = 2000
+    count = 4000
     channel = rng.integers(1, 4, count)
     time_ns = np.sort(rng.integers(0, 10**18, count))
-    payloads = [rng.bytes(size) for size in rng.integers(0, 4000, count).tolist()]
+    payloads = [rng.bytes(size) for size in rng.integers(*sizes, count).tolist()]
     assert sum(map(len, payloads)) > 3 * MAX_CHUNK_BYTES
     sequence = {1: 0, 2: 0, 3: 0}
     for number, time, payload in zip(channel.tolist(), time_ns.tolist(), payloads, strict=True):
