@@ -61,7 +61,7 @@ from locatk.formats.sessions.reader import Session, time_error
 MAX_PATH_POINTS = 5000
 """Number of points of a path that is drawn as one line; longer paths are thinned evenly."""
 
-POSES_PER_BLOCK = 4096
+POSES_PER_BLOCK = 2048
 """Number of poses that are encoded at once: few enough for the cache of a processor."""
 
 POINTS_PER_LINE = 400

@@ -196,8 +196,9 @@ class Layout:
                 text.append(str(values[1 + k], "utf-8", "replace"))
             counts.append(entries)
         columns = {}
-        for column, part in zip(self.columns, parts, strict=True):
-            array = np.frombuffer(b"".join(part), column.dtype)
+        for column in self.columns:
+            # The parts of a column are released before those of the next one are joined.
+            array = np.frombuffer(b"".join(parts.pop(0)), column.dtype)
             columns[column.name] = array if column.width == 1 else array.reshape(-1, column.width)
         return Batches(
             dict(zip(self.texts, texts, strict=True)), np.array(counts, np.int64), columns

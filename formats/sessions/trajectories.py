@@ -29,7 +29,7 @@ from locatk.formats.sessions.messages import (
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
-MAX_BUFFERED_BYTES = 16 << 20
+MAX_BUFFERED_BYTES = 8 << 20
 """Size of the messages that are taken from streams before they are sorted and written: large
 compared with the overhead of sorting, small compared with the memory of a computer."""
 
