@@ -54,21 +54,33 @@ def test_a_report_is_an_epoch(report: Any) -> None:
     assert epochs.labelled
 
 
-@pytest.mark.skipif(kernels is None, reason="the compiled kernels were not built")
-def test_the_kernel_equals_its_twin(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Silences, long epochs and planes that occur again."""
+def random_sweeps(n: int) -> Sweeps:
+    """Return sweeps with silences, long epochs, planes that occur again, and invalid counts."""
     rng = np.random.default_rng(4)
-    n = 5000
-    sweeps = Sweeps(
-        devices=("a", "b"),
+    return Sweeps(
+        devices=("a", "b", "c", "d"),
         time_ns=np.cumsum(rng.choice([0, 1, 5_000_000, 25_000_000], n)),
-        device=rng.integers(0, 2, n, np.int32),
-        sensor=np.zeros(n, np.int32),
+        device=rng.choice([0, 1, 3], n).astype(np.int32),
+        sensor=rng.integers(0, 3, n, np.int32),
         channel=rng.integers(1, 6, n, np.int32),
         polynomial=np.full(n, -1, np.int32),
         sweep=rng.integers(-1, 2, n, np.int32),
-        count=rng.uniform(0, 1e5, n),
+        count=rng.uniform(-1e3, 1.3e5, n),
     )
+
+
+@pytest.mark.parametrize("size", [1, 700, 2500])
+def test_blocks_do_not_change_the_epochs(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweeps = random_sweeps(5000)
+    at_once = group_epochs(sweeps)
+    monkeypatch.setattr(limits, "SWEEPS_PER_BLOCK", size)
+    assert_same(at_once, group_epochs(sweeps))
+    assert len(at_once.devices) == 9
+
+
+@pytest.mark.skipif(kernels is None, reason="the compiled kernels were not built")
+def test_the_kernel_equals_its_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweeps = random_sweeps(5000)
     compiled = group_epochs(sweeps)
     monkeypatch.setattr(limits, "kernels", None)
     assert_same(compiled, group_epochs(sweeps))
