@@ -2776,6 +2776,15 @@ static PyMethodDef methods[] = {
      " search_range, match, miss, unknown, rows, /)\n--\n\n"
      "Score expected polynomials and indices of bursts; twin of expect_numpy in"
      " locatk.core.lighthouse.demodulation."},
+    {"light_epochs", light_epochs, METH_VARARGS,
+     "light_epochs($module, starts, time_ns, planes, n, max_epoch_ns, epoch, /)\n--\n\n"
+     "Number the epochs of pairs of sweeps; twin of"
+     " locatk.core.lighthouse.epochs.number_epochs_python."},
+    {"light_positions", light_positions, METH_VARARGS,
+     "light_positions($module, angle, m, s, stations, floor_z, passes, position, information,"
+     " residual, redundancy, /)\n--\n\n"
+     "Intersect the light planes of epochs; twin of"
+     " locatk.core.lighthouse.localization.positions.intersect_planes_numpy."},
     {NULL, NULL, 0, NULL},
 };
 

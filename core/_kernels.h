@@ -111,5 +111,7 @@ PyObject *window_edges(PyObject *self, PyObject *args);
 PyObject *light_bits(PyObject *self, PyObject *args);
 PyObject *light_places(PyObject *self, PyObject *args);
 PyObject *light_expected(PyObject *self, PyObject *args);
+PyObject *light_epochs(PyObject *self, PyObject *args);
+PyObject *light_positions(PyObject *self, PyObject *args);
 
 #endif

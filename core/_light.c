@@ -1,6 +1,6 @@
-/* Hot loops of core/lighthouse: edges of sampled light, soft bits of bursts, and the
- * identification of their sequences. The numpy twins in locatk.core.lighthouse.demodulation
- * document the methods.
+/* Hot loops of core/lighthouse: edges of sampled light, soft bits of bursts, the identification of
+ * their sequences, epochs, and positions. The numpy twins in locatk.core.lighthouse document the
+ * methods.
  */
 #include "_kernels.h"
 #include <math.h>
@@ -657,4 +657,209 @@ PyObject *light_expected(PyObject *self, PyObject *args)
     }
     free(expected);
     return finish_call(&call, expected != NULL);
+}
+
+/* ---- Epochs of sweeps --------------------------------------------------------------------- */
+
+/* Number the epochs of pairs of sweeps, which are sorted by photodiode and time. */
+PyObject *light_epochs(PyObject *self, PyObject *args)
+{
+    (void)self;
+    Call call = {0};
+    PyObject *starts_array, *time_array, *planes_array, *epoch_array;
+    long long n;
+    double max_epoch_ns;
+    if (!parse_arguments(args, "OOOLdO:light_epochs", &starts_array, &time_array, &planes_array,
+                         &n, &max_epoch_ns, &epoch_array))
+        return NULL;
+    check_range(&call, "n", n, 0, INT_MAX);
+    check_positive(&call, "max_epoch_ns", max_epoch_ns);
+    const uint8_t *starts = input(&call, starts_array, "starts", ITEM_FLAG, ITEMS(n));
+    const double *time_ns = input(&call, time_array, "time_ns", ITEM_FLOAT64, ITEMS(n));
+    const int64_t *planes = input(&call, planes_array, "planes", ITEM_INT64, ITEMS(n));
+    int64_t *epoch = output(&call, epoch_array, "epoch", ITEM_INT64, ITEMS(n));
+    if (call.failed) return finish_call(&call, 1);
+    int64_t number = -1, epoch_planes = 0;
+    double epoch_start_ns = 0;
+    for (long long k = 0; k < n; k++) {
+        if (k == 0 || starts[k] || epoch_planes & planes[k]
+            || time_ns[k] - epoch_start_ns > max_epoch_ns) {
+            number++;
+            epoch_planes = 0;
+            epoch_start_ns = time_ns[k];
+        }
+        epoch_planes |= planes[k];
+        epoch[k] = number;
+    }
+    return finish_call(&call, 1);
+}
+
+/* ---- Positions of photodiodes ------------------------------------------------------------- */
+
+/* Position, rotation to the frame (row by row) and tangents of both tilts of one station. */
+enum { STATION_NUMBERS = 14 };
+enum { MAX_STATIONS = 1 << 10, MAX_PASSES = 100 };
+
+/* Light plane of one sweep: its normal in the frame, its product with the position of its station,
+ * and the distance of the photodiode from the axis on which it rotates. */
+typedef struct {
+    double normal[3], offset, lever_arm;
+    int station, plane;
+} LightPlane;
+
+static inline double dot(const double *a, const double *b)
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/* Write the light planes of the angles (s, 2) of one epoch; return their number. */
+static int observed_planes(const double *angle, const double *stations, int s, LightPlane *planes)
+{
+    int count = 0;
+    for (int k = 0; k < 2 * s; k++) {
+        if (!isfinite(angle[k])) continue;
+        const double *station = stations + STATION_NUMBERS * (k / 2), *rotation = station + 3;
+        const double local[3] = {-sin(angle[k]), cos(angle[k]), -station[12 + k % 2]};
+        LightPlane *plane = planes + count++;
+        for (int i = 0; i < 3; i++) plane->normal[i] = dot(rotation + 3 * i, local);
+        plane->offset = dot(plane->normal, station);
+        plane->lever_arm = 1;
+        plane->station = k / 2;
+        plane->plane = k % 2;
+    }
+    return count;
+}
+
+/* Solve a symmetric system of `dims` unknowns by cofactors. The solution is nan if the matrix is
+ * singular to rounding. */
+static void solve_symmetric(const double matrix[3][3], const double *right, int dims,
+                            double *solution)
+{
+    const double(*m)[3] = matrix;
+    double inverse[3][3] = {{0}}, determinant, size = m[0][0] + m[1][1], limit;
+    if (dims == 2) {
+        inverse[0][0] = m[1][1];
+        inverse[0][1] = inverse[1][0] = -m[0][1];
+        inverse[1][1] = m[0][0];
+        determinant = m[0][0] * m[1][1] - m[0][1] * m[0][1];
+        limit = 1e-12 * size * size;
+    } else {
+        for (int i = 0; i < 3; i++)
+            for (int j = 0; j < 3; j++) {
+                const int a = (i + 1) % 3, b = (i + 2) % 3, c = (j + 1) % 3, d = (j + 2) % 3;
+                inverse[i][j] = m[a][c] * m[b][d] - m[a][d] * m[b][c];
+            }
+        determinant = dot(m[0], inverse[0]);
+        size += m[2][2];
+        limit = 1e-12 * size * size * size;
+    }
+    for (int i = 0; i < dims; i++)
+        solution[i] = fabs(determinant) <= limit ? NAN : dot(inverse[i], right) / determinant;
+}
+
+/* Distance of a point from the rotor of a station's plane, across that plane. */
+static double lever_arm(const double *point, const double *station, int plane)
+{
+    const double *rotation = station + 3;
+    const double offset[3] = {point[0] - station[0], point[1] - station[1], point[2] - station[2]};
+    const double height =
+        offset[0] * rotation[2] + offset[1] * rotation[5] + offset[2] * rotation[8];
+    const double radius_squared = dot(offset, offset) - height * height;
+    const double slope = station[12 + plane] * height;
+    const double squared = radius_squared - slope * slope;
+    const double floor = 1e-12 * (radius_squared > 1e-30 ? radius_squared : 1e-30);
+    return sqrt(squared > floor ? squared : floor);
+}
+
+/* Return whether the point is in front of all stations of the planes. */
+static int is_in_front(const LightPlane *planes, int count, const double *stations,
+                       const double *point)
+{
+    for (int k = 0; k < count; k++) {
+        const double *station = stations + STATION_NUMBERS * planes[k].station;
+        const double *rotation = station + 3;
+        const double depth = (point[0] - station[0]) * rotation[0]
+                             + (point[1] - station[1]) * rotation[3]
+                             + (point[2] - station[2]) * rotation[6];
+        if (!(depth > 0)) return 0;
+    }
+    return 1;
+}
+
+/* Intersect the light planes of one epoch. `point` and `information` receive the result. */
+static void intersect_planes(LightPlane *planes, int count, const double *stations, int has_floor,
+                             int passes, double *point, double *information)
+{
+    const int dims = has_floor ? 2 : 3;
+    for (int pass = 0; pass < passes; pass++) {
+        double matrix[3][3] = {{0}}, right[3] = {0};
+        for (int k = 0; k < count; k++) {
+            const LightPlane *plane = planes + k;
+            const double target =
+                has_floor ? plane->offset - plane->normal[2] * point[2] : plane->offset;
+            double row[3] = {0};
+            for (int i = 0; i < dims; i++) row[i] = plane->normal[i] / plane->lever_arm;
+            for (int i = 0; i < dims; i++) {
+                right[i] += row[i] * (target / plane->lever_arm);
+                for (int j = i; j < dims; j++) matrix[i][j] += row[i] * row[j];
+            }
+        }
+        for (int i = 1; i < 3; i++)
+            for (int j = 0; j < i; j++) matrix[i][j] = matrix[j][i];
+        memcpy(information, matrix, sizeof matrix);
+        solve_symmetric((const double(*)[3])matrix, right, dims, point);
+        if (isnan(point[0])) {
+            for (int i = 0; i < 9; i++) information[i] = NAN;
+            return;
+        }
+        for (int k = 0; k < count; k++)
+            planes[k].lever_arm = lever_arm(
+                point, stations + STATION_NUMBERS * planes[k].station, planes[k].plane);
+    }
+}
+
+PyObject *light_positions(PyObject *self, PyObject *args)
+{
+    (void)self;
+    Call call = {0};
+    PyObject *angle_array, *stations_array, *position_array, *information_array, *residual_array,
+        *redundancy_array;
+    long long m, s, passes;
+    double floor_z;
+    if (!parse_arguments(args, "OLLOdLOOOO:light_positions", &angle_array, &m, &s, &stations_array,
+                         &floor_z, &passes, &position_array, &information_array, &residual_array,
+                         &redundancy_array))
+        return NULL;
+    check_range(&call, "m", m, 0, INT_MAX);
+    check_range(&call, "s", s, 1, MAX_STATIONS);
+    check_range(&call, "passes", passes, 1, MAX_PASSES);
+    const double *angle = input(&call, angle_array, "angle", ITEM_FLOAT64, ITEMS(m, s, 2));
+    const double *stations =
+        input(&call, stations_array, "stations", ITEM_FLOAT64, ITEMS(s, STATION_NUMBERS));
+    double *position = output(&call, position_array, "position", ITEM_FLOAT64, ITEMS(m, 3));
+    double *information =
+        output(&call, information_array, "information", ITEM_FLOAT64, ITEMS(m, 3, 3));
+    double *residual = output(&call, residual_array, "residual", ITEM_FLOAT64, ITEMS(m, s, 2));
+    int64_t *redundancy = output(&call, redundancy_array, "redundancy", ITEM_INT64, ITEMS(m));
+    if (call.failed) return finish_call(&call, 1);
+    const int has_floor = isfinite(floor_z);
+    LightPlane *planes = malloc((size_t)(2 * s + 1) * sizeof *planes);
+    for (long long e = 0; planes && e < m; e++) {
+        double *point = position + 3 * e;
+        point[0] = point[1] = 0;
+        point[2] = has_floor ? floor_z : 0;
+        const int count = observed_planes(angle + 2 * s * e, stations, (int)s, planes);
+        intersect_planes(planes, count, stations, has_floor, (int)passes, point,
+                         information + 9 * e);
+        for (long long k = 0; k < 2 * s; k++) residual[2 * s * e + k] = NAN;
+        for (int k = 0; k < count; k++)
+            residual[2 * s * e + 2 * planes[k].station + planes[k].plane] =
+                (dot(planes[k].normal, point) - planes[k].offset) / planes[k].lever_arm;
+        redundancy[e] = count - (has_floor ? 2 : 3);
+        const int is_finite = isfinite(point[0]) && isfinite(point[1]) && isfinite(point[2]);
+        if (redundancy[e] < 0 || !is_finite || !is_in_front(planes, count, stations, point))
+            point[0] = point[1] = point[2] = NAN;
+    }
+    free(planes);
+    return finish_call(&call, planes != NULL);
 }

@@ -62,7 +62,6 @@ def _device_table(report: SolveReport) -> str:
     The probability of the least probable pose follows if the system estimates it.
     """
     from locatk.core.natural_order import natural_key
-    from locatk.formats.report.detections import format_probability
 
     if not report.devices:
         return ""
@@ -86,19 +85,26 @@ def _device_table(report: SolveReport) -> str:
                 "-" if math.isnan(sigma) else f"{factor * sigma:#.3g}"
                 for sigma, factor in zip(device.median_sigma, factors, strict=True)
             ),
-            *([format_probability(device.min_probability)] if has_probability else []),
+            *([_format_probability(device.min_probability)] if has_probability else []),
         )
         for device in sorted(report.devices, key=lambda device: natural_key(device.device))
     ]
     return console.table(header, rows)
 
 
+def _format_probability(probability: float) -> str:
+    # Imported when it is needed, because it takes 0.1 s.
+    from locatk.formats.report.detections import format_probability
+
+    return format_probability(probability)
+
+
 def _detection_table(report: SolveReport) -> str:
     """Format the detected tags or landmarks; empty for the other systems."""
-    from locatk.formats.report.detections import landmark_table, tag_table
-
     if report.system not in ("polaris", "landmarks") or not report.detections:
         return ""
+    from locatk.formats.report.detections import landmark_table, tag_table
+
     if report.system == "polaris":
         detected = tag_table(report.detections, compact=True)
     else:

@@ -159,8 +159,8 @@ def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, floa
     evidence = np.zeros(2)
     rows = np.flatnonzero((sweeps.channel == channel) & np.isfinite(sweeps.count))
     period_s = float(period_ticks(channel)) / TICK_HZ
-    for device in np.unique(sweeps.device[rows]).tolist():
-        own = rows[sweeps.device[rows] == device]
+    rows = rows[np.argsort(sweeps.device[rows], kind="stable")]
+    for own in np.split(rows, np.flatnonzero(np.diff(sweeps.device[rows])) + 1):
         own = own[np.argsort(sweeps.time_ns[own], kind="stable")]
         time_s = (sweeps.time_ns[own] - sweeps.time_ns[own[0]]) * 1e-9
         count_s = sweeps.count[own] * (TICKS_PER_COUNT / TICK_HZ)
@@ -186,6 +186,8 @@ def _is_paired(time_s: Array, zero_s: Array, period_s: float) -> Mask:
     is_paired = np.zeros(len(time_s), bool)
     for lag in range(1, min(2 * NEIGHBOURS, len(time_s) - 1) + 1):
         interval_s = time_s[lag:] - time_s[:-lag]
+        if np.min(interval_s) >= period_s:
+            break  # Sweeps further apart are of different rotations, too.
         is_pair = (interval_s > MIN_PLANE_DELAY_TURNS * period_s) & (interval_s < period_s)
         is_pair &= np.abs(zero_s[lag:] - zero_s[:-lag]) < MAX_PAIR_ERROR_S
         is_paired[lag:] |= is_pair
@@ -235,9 +237,11 @@ def count_phase_conflicts(time_s: Array, zero_s: Array, period_s: float) -> tupl
     differs_before = ~agrees(before, zero_s[:, None])
     differs_after = ~agrees(zero_s[:, None], after)
     is_conflict = np.zeros(len(zero_s), bool)
+    rows = np.flatnonzero(differs_before.any(axis=1) & differs_after.any(axis=1))
+    before, after = before[rows], after[rows]
     for k in range(NEIGHBOURS):
-        differs = differs_before[:, k, None] & differs_after
-        is_conflict |= np.any(agrees(before[:, k, None], after) & differs, axis=1)
+        differs = differs_before[rows, k, None] & differs_after[rows]
+        is_conflict[rows] |= np.any(agrees(before[:, k, None], after) & differs, axis=1)
     return int(size[is_conflict].sum()), paired
 
 

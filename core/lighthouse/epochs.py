@@ -12,11 +12,13 @@ such a partner is rejected (``plane_unknown``).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse.channels import CHANNELS, period_counts
 from locatk.core.lighthouse.light_planes import counts_to_angles
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
@@ -44,6 +46,10 @@ silence means that the report of the device is complete."""
 MAX_RATE_INTERVAL_S = 0.5
 """Longest time between two counts of a plane from which its rate of change is estimated [s]. Over
 longer times the motion of a robot is not linear."""
+
+SWEEPS_PER_BLOCK = 1 << 18
+"""Number of sweeps that are grouped at a time, photodiode by photodiode. It bounds the memory, and
+the arrays fit the cache of a processor."""
 
 SPIKE_RAD = np.deg2rad(2.0)
 """Smallest change of a rotor angle for a single epoch that is a demodulation error [rad]: such
@@ -122,18 +128,46 @@ def group_epochs(sweeps: Sweeps) -> Epochs:
     rejected: dict[str, int] = {}
     valid = _select_valid(sweeps, rejected)
     photodiode, names = _photodiodes(sweeps)
-    order = valid[
-        np.lexsort(
-            (
-                sweeps.count[valid],
-                sweeps.time_ns[valid],
-                sweeps.channel[valid],
-                photodiode[valid],
-            )
-        )
+    channels = np.unique(sweeps.channel[valid])
+    start_ns = sweeps.time_ns[valid].min(initial=np.iinfo(np.int64).max)
+    blocks = [
+        _group_block(sweeps, rows, photodiode[rows], channels, start_ns, rejected)
+        for rows in _sorted_blocks(photodiode, sweeps, valid)
     ]
-    photodiode, time_ns, channel = photodiode[order], sweeps.time_ns[order], sweeps.channel[order]
-    count, reported_plane = sweeps.count[order], sweeps.sweep[order]
+    mean_ns, device, counts, is_labelled = (list(parts) for parts in zip(*blocks, strict=True))
+    epochs = Epochs(
+        tuple(names),
+        start_ns + np.concatenate(mean_ns),
+        np.concatenate(device),
+        channels.astype(np.int64),
+        np.concatenate(counts),
+        all(is_labelled) and len(valid) > 0,
+        rejected,
+    )
+    _reject_spikes(epochs)
+    return epochs
+
+
+def _group_block(
+    sweeps: Sweeps,
+    rows: NDArray[np.int64],
+    photodiode: NDArray[np.int64],
+    channels: NDArray[np.int32],
+    start_ns: np.int64,
+    rejected: dict[str, int],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], bool]:
+    """Group the sweeps ``rows`` of some photodiodes, sorted as by :func:`_sorted_blocks`.
+
+    Returns
+    -------
+    mean_ns, device : (m,) ndarray
+        Mean times since ``start_ns``, and photodiodes, of the epochs.
+    counts : (m, s, 2) ndarray
+    is_labelled : bool
+    """
+    time_ns, channel = sweeps.time_ns[rows], sweeps.channel[rows]
+    count, reported_plane = sweeps.count[rows], sweeps.sweep[rows]
+    is_labelled = bool(np.all(sweeps.polynomial[rows] != UNKNOWN))
     unique = _differs_from_previous(photodiode, channel, time_ns, count, reported_plane)
     _add_rejected(rejected, "repeated_in_rotation", np.count_nonzero(~unique))
     photodiode, time_ns, channel = photodiode[unique], time_ns[unique], channel[unique]
@@ -141,38 +175,28 @@ def group_epochs(sweeps: Sweeps) -> Epochs:
     pair, plane = _pair_planes(photodiode, channel, time_ns, count, reported_plane)
     _add_rejected(rejected, "plane_unknown", np.count_nonzero(plane == UNKNOWN))
 
-    channels = np.unique(channel)
     station = np.searchsorted(channels, channel)
     epoch = _split_epochs(photodiode, time_ns, station, plane, pair)
     # Flat index into `counts`; if a plane occurs twice in an epoch, its first sweep is used.
     slot = (epoch * len(channels) + station) * 2 + plane
-    has_plane = plane != UNKNOWN
-    _, used = np.unique(np.where(has_plane, slot, -1), return_index=True)
-    used = used[has_plane[used]]
-    _add_rejected(rejected, "repeated_in_rotation", np.count_nonzero(has_plane) - len(used))
-
+    has_plane = np.flatnonzero(plane != UNKNOWN)
     m = int(epoch.max()) + 1 if len(epoch) else 0
     shape = (m, len(channels), 2)
+    first_sweep = np.full(m * len(channels) * 2, -1)
+    first_sweep[slot[has_plane[::-1]]] = has_plane[::-1]
+    used = first_sweep[first_sweep >= 0]
+    _add_rejected(rejected, "repeated_in_rotation", len(has_plane) - len(used))
+
     counts = np.full(shape, np.nan)
     counts.ravel()[slot[used]] = count[used]
     epoch_photodiode = np.zeros(m, np.int64)
     epoch_photodiode[epoch] = photodiode
-    start_ns, mean_ns, offset_s = _mean_times(epoch, time_ns, m)
+    mean_ns, offset_s = _mean_times(epoch, time_ns, start_ns, m)
     if np.any(offset_s):
         offsets_s = np.full(shape, np.nan)
         offsets_s.ravel()[slot[used]] = offset_s[used]
         _interpolate_to_mean_time(counts, offsets_s, mean_ns, epoch_photodiode)
-    epochs = Epochs(
-        tuple(names),
-        start_ns + mean_ns,
-        epoch_photodiode,
-        channels.astype(np.int64),
-        counts,
-        bool(np.all(sweeps.polynomial[order] != UNKNOWN)) and len(order) > 0,
-        rejected,
-    )
-    _reject_spikes(epochs)
-    return epochs
+    return mean_ns, epoch_photodiode, counts, is_labelled
 
 
 def rotor_angles(epochs: Epochs) -> NDArray[np.float64]:
@@ -185,13 +209,18 @@ def rotor_angles(epochs: Epochs) -> NDArray[np.float64]:
 
 def _select_valid(sweeps: Sweeps, rejected: dict[str, int]) -> NDArray[np.int64]:
     """Return the indices of sweeps with a known channel and a count within one rotation."""
-    is_known = np.isin(sweeps.channel, CHANNELS)
-    _add_rejected(rejected, "unknown_channel", np.count_nonzero(~is_known))
-    period = period_counts(np.where(is_known, sweeps.channel, 1))
-    with np.errstate(invalid="ignore"):
-        is_in_rotation = (sweeps.count >= 0) & (sweeps.count < period)
-    _add_rejected(rejected, "count_above_period", np.count_nonzero(is_known & ~is_in_rotation))
-    return np.flatnonzero(is_known & is_in_rotation)
+    valid = [np.zeros(0, np.int64)]
+    for start in range(0, len(sweeps), SWEEPS_PER_BLOCK):
+        block = slice(start, start + SWEEPS_PER_BLOCK)
+        channel, count = sweeps.channel[block], sweeps.count[block]
+        is_known = np.isin(channel, CHANNELS)
+        _add_rejected(rejected, "unknown_channel", np.count_nonzero(~is_known))
+        period = period_counts(np.where(is_known, channel, 1))
+        with np.errstate(invalid="ignore"):
+            is_in_rotation = (count >= 0) & (count < period)
+        _add_rejected(rejected, "count_above_period", np.count_nonzero(is_known & ~is_in_rotation))
+        valid.append(start + np.flatnonzero(is_known & is_in_rotation))
+    return np.concatenate(valid)
 
 
 def _photodiodes(sweeps: Sweeps) -> tuple[NDArray[np.int64], list[str]]:
@@ -203,6 +232,45 @@ def _photodiodes(sweeps: Sweeps) -> tuple[NDArray[np.int64], list[str]]:
         sweeps.device.astype(np.int64) * sensors + sweeps.sensor, return_inverse=True
     )
     return photodiode, [f"{sweeps.devices[k // sensors]}/{k % sensors}" for k in codes]
+
+
+def _sorted_blocks(
+    photodiode: NDArray[np.int64], sweeps: Sweeps, rows: NDArray[np.int64]
+) -> Iterator[NDArray[np.int64]]:
+    """Yield the indices ``rows`` sorted by photodiode, channel, time and count.
+
+    Each block has all sweeps of some photodiodes; there is at least one, which may be empty.
+    """
+    source = photodiode[rows] * (max(CHANNELS) + 1) + sweeps.channel[rows]
+    if len(source) and source.max() < 1 << 16:
+        # Numpy sorts 16 bits in linear time.
+        source = source.astype(np.uint16)
+    order = rows[np.argsort(source, kind="stable")]
+    edges = np.flatnonzero(np.diff(photodiode[order])) + 1
+    start = 0
+    for stop in [*edges.tolist(), len(order)]:
+        if stop - start >= SWEEPS_PER_BLOCK or stop == len(order):
+            block = order[start:stop]
+            keys = sweeps.count[block], sweeps.time_ns[block], sweeps.channel[block]
+            yield block[_sort_within(*keys, photodiode[block])]
+            start = stop
+
+
+def _sort_within(
+    count: NDArray[np.float64],
+    time_ns: NDArray[np.int64],
+    channel: NDArray[np.int32],
+    photodiode: NDArray[np.int64],
+) -> NDArray[np.int64] | slice:
+    """Return the order of sweeps (n,) that are sorted by photodiode and channel.
+
+    Most sources send the sweeps in the order of time, so that they are sorted already.
+    """
+    elapsed_ns = np.diff(time_ns)
+    is_ascending = (elapsed_ns > 0) | (elapsed_ns == 0) & (np.diff(count) >= 0)
+    if np.all(is_ascending | (np.diff(channel) != 0) | (np.diff(photodiode) != 0)):
+        return slice(None)
+    return np.lexsort((count, time_ns, channel, photodiode))
 
 
 def _differs_from_previous(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:
@@ -295,7 +363,31 @@ def _split_epochs(
     after_silence = np.r_[
         True, (np.diff(pair_ns) > MAX_SILENCE_NS) | (np.diff(pair_photodiode) != 0)
     ]
-    # The end of an epoch depends on its beginning, which cannot be vectorised.
+    pair_epoch = np.empty(len(order), np.int64)
+    pair_epoch[order] = _number_epochs(after_silence, pair_ns, pair_planes)
+    return pair_epoch[pair]
+
+
+def _number_epochs(
+    after_silence: NDArray[np.bool_], pair_ns: NDArray[np.float64], pair_planes: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the epoch (n,) of each pair, given its time and the bits of its planes."""
+    if kernels is None:
+        return number_epochs_python(after_silence, pair_ns, pair_planes)
+    epoch = np.empty(len(pair_ns), np.int64)
+    kernels.light_epochs(
+        after_silence, pair_ns, pair_planes, len(pair_ns), float(MAX_EPOCH_NS), epoch
+    )
+    return epoch
+
+
+def number_epochs_python(
+    after_silence: NDArray[np.bool_], pair_ns: NDArray[np.float64], pair_planes: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Number epochs without the compiled kernel.
+
+    The end of an epoch depends on its beginning, which cannot be vectorised.
+    """
     labels = []
     epoch, epoch_planes, epoch_start_ns = -1, 0, 0.0
     for is_new, now_ns, planes in zip(
@@ -305,32 +397,25 @@ def _split_epochs(
             epoch, epoch_planes, epoch_start_ns = epoch + 1, 0, now_ns
         epoch_planes |= planes
         labels.append(epoch)
-    pair_epoch = np.empty(len(order), np.int64)
-    pair_epoch[order] = labels
-    return pair_epoch[pair]
+    return np.array(labels, np.int64)
 
 
 def _mean_times(
-    epoch: NDArray[np.int64], time_ns: NDArray[np.int64], m: int
-) -> tuple[np.int64, NDArray[np.int64], NDArray[np.float64]]:
+    epoch: NDArray[np.int64], time_ns: NDArray[np.int64], start_ns: np.int64, m: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the mean times of epochs, and the times of sweeps relative to them.
 
     Returns
     -------
-    start_ns : int
-        Time of the first sweep of all.
     mean_ns : (m,) int64 ndarray
         Mean time of each epoch since ``start_ns``.
     offset_s : (n,) ndarray
         Time of each sweep after the mean of its epoch, in seconds.
     """
-    if not m:
-        return np.int64(0), np.zeros(0, np.int64), np.zeros(0)
-    start_ns = time_ns.min()
     elapsed_ns = (time_ns - start_ns).astype(np.float64)
     total_ns = np.bincount(epoch, elapsed_ns, m)
     mean_ns = np.rint(total_ns / np.bincount(epoch, minlength=m)).astype(np.int64)
-    return start_ns, mean_ns, (elapsed_ns - mean_ns[epoch]) * 1e-9
+    return mean_ns, (elapsed_ns - mean_ns[epoch]) * 1e-9
 
 
 def _interpolate_to_mean_time(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Generic, TypedDict, TypeVar, Unpack
 
 import numpy as np
@@ -25,7 +24,7 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import maps as map_files
 from locatk.formats.artifacts import tags as tag_files
 from locatk.formats.sessions import messages
-from locatk.formats.sessions.messages import BatchError, Layout, TimedMessage, batch_edges
+from locatk.formats.sessions.messages import BatchError, Layout, MessageBatch, batch_edges
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import (
     reference_streams,
@@ -303,7 +302,7 @@ def _write(
 
 def _messages(
     kind: SensorKind[Geometry], samples: DeviceSamples[Geometry]
-) -> Iterator[TimedMessage]:
+) -> Iterator[MessageBatch]:
     n, sensors = samples.field_t.shape[:2]
     layout = kind.layout(sensors)
     fields = {"device": samples.device, "frame_id": samples.device, "sensors": sensors}
@@ -311,10 +310,8 @@ def _messages(
         "time_ns": samples.time_ns,
         "b_tesla": samples.field_t.reshape(n, -1).astype(np.float32),
     }
-    edges = batch_edges(samples.time_ns, np.zeros(n, np.int64)).tolist()
-    for start, stop in pairwise(edges):
-        message = layout.pack(fields, {key: column[start:stop] for key, column in columns.items()})
-        yield int(samples.time_ns[start]), f"{kind.topic}{samples.device}", message
+    edges = batch_edges(samples.time_ns, np.zeros(n, np.int64))
+    return layout.batches(f"{kind.topic}{samples.device}", fields, columns, edges)
 
 
 def _read(session: Session, kind: SensorKind[Geometry]) -> list[DeviceSamples[Geometry]]:

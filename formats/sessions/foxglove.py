@@ -47,11 +47,22 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.tag import PlanarPose, Tags, as_built_magnets, cell_positions, vertices
 from locatk.core.trajectory import Trajectory
 from locatk.formats.sessions.mcap_file import MAX_TIME_NS
-from locatk.formats.sessions.messages import TimedMessage, timestamp
+from locatk.formats.sessions.messages import MessageBatch, timestamp
+from locatk.formats.sessions.protobuf_rows import (
+    Rows,
+    double_fields,
+    encode_message,
+    message_field,
+    text_field,
+    timestamp_field,
+)
 from locatk.formats.sessions.reader import Session, time_error
 
 MAX_PATH_POINTS = 5000
 """Number of points of a path that is drawn as one line; longer paths are thinned evenly."""
+
+POSES_PER_BLOCK = 2048
+"""Number of poses that are encoded at once: few enough for the cache of a processor."""
 
 POINTS_PER_LINE = 400
 """Number of points of an outline in a point cloud."""
@@ -97,24 +108,49 @@ _POINT_FIELDS = [
 # ---- poses
 
 
-def poses(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
+def poses(topic: str, trajectory: Trajectory) -> Iterator[MessageBatch]:
     """Yield one ``PoseInFrame`` per pose."""
-    for time_ns, pose in _stamped(trajectory):
-        message = PoseInFrame(timestamp=timestamp(time_ns), frame_id=trajectory.frame, pose=pose)
-        yield time_ns, topic, message
-
-
-def transforms(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
-    """Yield one ``FrameTransform`` per pose, from the trajectory's frame to the device's."""
-    for time_ns, pose in _stamped(trajectory):
-        message = FrameTransform(
-            timestamp=timestamp(time_ns),
-            parent_frame_id=trajectory.frame,
-            child_frame_id=child_frame(trajectory),
-            translation=_vector(pose.position.x, pose.position.y, pose.position.z),
-            rotation=pose.orientation,
+    for time_ns, position, quaternion in _blocks(trajectory):
+        rows = encode_message(
+            [
+                timestamp_field(1, time_ns),
+                text_field(2, trajectory.frame, len(time_ns)),
+                message_field(3, _pose_fields(position, quaternion)),
+            ]
         )
-        yield time_ns, topic, message
+        yield MessageBatch(topic, PoseInFrame, time_ns, rows.split())
+
+
+def transforms(topic: str, trajectory: Trajectory) -> Iterator[MessageBatch]:
+    """Yield one ``FrameTransform`` per pose, from the trajectory's frame to the device's."""
+    for time_ns, position, quaternion in _blocks(trajectory):
+        rows = encode_message(
+            [
+                timestamp_field(1, time_ns),
+                text_field(2, trajectory.frame, len(time_ns)),
+                text_field(3, child_frame(trajectory), len(time_ns)),
+                message_field(4, [double_fields(1, position)]),
+                message_field(5, [double_fields(1, quaternion)]),
+            ]
+        )
+        yield MessageBatch(topic, FrameTransform, time_ns, rows.split())
+
+
+def _blocks(
+    trajectory: Trajectory,
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield times, positions and quaternions of the poses that are encoded at once."""
+    for start in range(0, len(trajectory), POSES_PER_BLOCK):
+        part = slice(start, start + POSES_PER_BLOCK)
+        yield trajectory.time_ns[part], trajectory.position[part], trajectory.quaternion[part]
+
+
+def _pose_fields(position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> list[Rows]:
+    """Return the fields of a ``Pose``."""
+    return [
+        message_field(1, [double_fields(1, position)]),
+        message_field(2, [double_fields(1, quaternion)]),
+    ]
 
 
 def child_frame(trajectory: Trajectory) -> str:
@@ -125,18 +161,11 @@ def child_frame(trajectory: Trajectory) -> str:
 def path(trajectory: Trajectory, time_ns: int) -> PosesInFrame:
     """Return the path in one message, thinned to :data:`MAX_PATH_POINTS` poses."""
     keep = _thinned_indices(len(trajectory))
-    return PosesInFrame(
-        timestamp=timestamp(time_ns),
-        frame_id=trajectory.frame,
-        poses=[
-            _pose(p, q)
-            for p, q in zip(
-                trajectory.position[keep].tolist(),
-                trajectory.quaternion[keep].tolist(),
-                strict=True,
-            )
-        ],
-    )
+    fields = _pose_fields(trajectory.position[keep], trajectory.quaternion[keep])
+    message = PosesInFrame.FromString(message_field(3, fields).joined())
+    message.timestamp.CopyFrom(timestamp(time_ns))
+    message.frame_id = trajectory.frame
+    return message
 
 
 def log(message: str, time_ns: int, *, warning: bool = False) -> Log:
@@ -217,17 +246,6 @@ def read_trajectory(session: Session, topic: str, device: str) -> Trajectory:
         table[order, 3:],
         np.full((len(times), 6, 6), np.nan),
     )
-
-
-def _stamped(trajectory: Trajectory) -> Iterator[tuple[int, Pose]]:
-    rows = zip(
-        trajectory.time_ns.tolist(),
-        trajectory.position.tolist(),
-        trajectory.quaternion.tolist(),
-        strict=True,
-    )
-    for time_ns, position, quaternion in rows:
-        yield time_ns, _pose(position, quaternion)
 
 
 def _pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose:
@@ -405,22 +423,23 @@ def _loop(corners: NDArray[np.float64], color: Color, thickness: float) -> LineP
 
 
 def _line(trajectory: Trajectory, color: Color, time_ns: int) -> SceneEntity:
-    points = trajectory.position[_thinned_indices(len(trajectory))].tolist()
+    points = trajectory.position[_thinned_indices(len(trajectory))]
+    line = LinePrimitive.FromString(message_field(5, [double_fields(1, points)]).joined())
+    line.MergeFrom(
+        LinePrimitive(
+            type=LinePrimitive.LINE_STRIP,
+            pose=_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
+            thickness=2.0,
+            scale_invariant=True,
+            color=color,
+        )
+    )
     return SceneEntity(
         timestamp=timestamp(time_ns),
         frame_id=trajectory.frame,
         id=f"{_PATH_PREFIX}{trajectory.device}",
         metadata=_pairs({"device": trajectory.device, "poses": str(len(trajectory))}),
-        lines=[
-            LinePrimitive(
-                type=LinePrimitive.LINE_STRIP,
-                pose=_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
-                thickness=2.0,
-                scale_invariant=True,
-                points=[Point3(x=x, y=y, z=z) for x, y, z in points],
-                color=color,
-            )
-        ],
+        lines=[line],
     )
 
 

@@ -30,7 +30,7 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats import images
 from locatk.formats.artifacts import sheets
 from locatk.formats.sessions.mcap_file import MessagePosition
-from locatk.formats.sessions.messages import TimedMessage, timestamp
+from locatk.formats.sessions.messages import MessageBatch, timestamp
 from locatk.formats.sessions.reader import RandomAccess, Session
 from locatk.formats.sessions.trajectories import (
     check_devices,
@@ -307,19 +307,20 @@ def write_shots(
 
 def _frame_messages(
     device: str, shots: Iterable[Shot], camera: Camera | None, names: list[str]
-) -> Iterator[TimedMessage]:
+) -> Iterator[MessageBatch]:
     """Yield the messages of one camera; append the names of its frames to ``names``."""
     previous_ns: int | None = None
     for shot in shots:
         if previous_ns is None and camera is not None:
             calibration = _calibration(camera, device, shot.time_ns)
             if calibration is not None:
-                yield shot.time_ns, f"/calibration/{device}", calibration
+                yield MessageBatch.single(shot.time_ns, f"/calibration/{device}", calibration)
         if previous_ns is not None and shot.time_ns < previous_ns:
             raise InputError(f"frame {shot.name} of {device} is older than the one before it")
         previous_ns = shot.time_ns
         names.append(shot.name)
-        yield shot.time_ns, f"{TOPIC}{device}", _image_message(shot, device)
+        message = _image_message(shot, device)
+        yield MessageBatch.single(shot.time_ns, f"{TOPIC}{device}", message)
 
 
 def _image_message(shot: Shot, device: str) -> CompressedImage | RawImage:

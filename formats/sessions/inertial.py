@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.inertial import InertialSamples
-from locatk.formats.sessions.messages import IMU, TimedMessage, batch_edges
+from locatk.formats.sessions.messages import IMU, MessageBatch, batch_edges
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import read_batches
 
@@ -19,7 +18,7 @@ IMU_TOPIC_PREFIX = "/imu/"
 """Topic of the samples of a device, without its name."""
 
 
-def imu_messages(samples: InertialSamples) -> Iterator[TimedMessage]:
+def imu_messages(samples: InertialSamples) -> Iterator[MessageBatch]:
     """Yield batches of the samples of one device.
 
     Raises
@@ -32,19 +31,17 @@ def imu_messages(samples: InertialSamples) -> Iterator[TimedMessage]:
     return _batches(samples)
 
 
-def _batches(samples: InertialSamples) -> Iterator[TimedMessage]:
+def _batches(samples: InertialSamples) -> Iterator[MessageBatch]:
     columns: dict[str, NDArray[Any]] = {"time_ns": samples.time_ns}
     for name, values in _columns(samples).items():
         if not np.isnan(values).all():
             columns[name] = values
-    edges = batch_edges(samples.time_ns, np.zeros(len(samples), np.int64)).tolist()
-    for start, stop in pairwise(edges):
-        part = {name: values[start:stop] for name, values in columns.items()}
-        message = IMU.pack({"device": samples.device}, part)
-        yield int(samples.time_ns[start]), IMU_TOPIC_PREFIX + samples.device, message
+    edges = batch_edges(samples.time_ns, np.zeros(len(samples), np.int64))
+    topic = IMU_TOPIC_PREFIX + samples.device
+    return IMU.batches(topic, {"device": samples.device}, columns, edges)
 
 
-def imu_streams(imu: Sequence[InertialSamples]) -> list[Iterator[TimedMessage]]:
+def imu_streams(imu: Sequence[InertialSamples]) -> list[Iterator[MessageBatch]]:
     """Return the streams of the samples of several devices.
 
     Raises

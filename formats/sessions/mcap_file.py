@@ -20,6 +20,7 @@ Specification: https://mcap.dev/spec
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import zlib
@@ -277,7 +278,7 @@ def _is_complete(index: Index, statistics: records.Statistics, metadata_offsets:
 
 
 def read_messages(
-    stream: IO[bytes], segment: Segment, channels: Collection[int]
+    stream: IO[bytes], segment: Segment, channels: Collection[int], *, use_index: bool = False
 ) -> Iterator[tuple[int, int, bytes]]:
     """Yield (channel id, log time in ns, payload) of the messages of a segment, in file order.
 
@@ -287,6 +288,9 @@ def read_messages(
     segment : Segment
     channels : collection of int
         Ids of the channels to read.
+    use_index : bool
+        Use the message indexes, if they agree with the segment: faster if most messages are of
+        other channels. Messages that an index omits are not read.
 
     Raises
     ------
@@ -294,6 +298,14 @@ def read_messages(
         The segment does not agree with the index, or its checksum is wrong.
     """
     data = read_segment(stream, segment)
+    if use_index and segment.message_indexes:
+        with contextlib.suppress(DamageError):
+            positions = find_messages(stream, segment, channels)
+            payloads = [message_payload(data, position) for position in positions]
+            if len({position.offset for position in positions}) == len(positions):
+                for position, payload in zip(positions, payloads, strict=True):
+                    yield position.channel, position.time_ns, payload
+                return
     for opcode, start, end in iter_records(data, segment.offset):
         if opcode == 5:  # Opcode.MESSAGE, whose comparison takes as long as the rest of the loop
             channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(data, start)

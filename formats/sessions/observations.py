@@ -36,7 +36,7 @@ from locatk.formats.sessions.messages import (
     MAX_BATCH_NS,
     SWEEPS,
     Batches,
-    TimedMessage,
+    MessageBatch,
     batch_edges,
 )
 from locatk.formats.sessions.reader import Session
@@ -175,23 +175,18 @@ def read_receivers(session: Session) -> dict[str, Receiver]:
     return {device: receiver for device, receiver in receivers.items() if receiver is not None}
 
 
-def sweep_messages(sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> Iterator[TimedMessage]:
-    """Yield batches of ``sweeps`` by device and time, ascending in the time of the first sweep."""
+def sweep_messages(sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> list[Iterator[MessageBatch]]:
+    """Return a stream of batches of ``sweeps`` for each device, batched by time."""
     _check_ranges(sweeps, None)
-    order = np.lexsort((sweeps.time_ns, sweeps.device))
-    columns = {
-        column.name: getattr(sweeps, column.name)[order]
-        for column in SWEEPS.columns
-        if not column.optional
-    }
-    device = sweeps.device[order]
-    edges = batch_edges(columns["time_ns"], device, max_duration_ns=batch_ns)
-    starts, stops = edges[:-1], edges[1:]
-    for number in np.argsort(columns["time_ns"][starts], kind="stable"):
-        part = slice(starts[number], stops[number])
-        name = sweeps.devices[device[starts[number]]]
-        message = SWEEPS.pack({"device": name}, {key: c[part] for key, c in columns.items()})
-        yield int(columns["time_ns"][part.start]), SWEEP_TOPIC_PREFIX + name, message
+    streams = []
+    for number, name in enumerate(sweeps.devices):
+        own = np.flatnonzero(sweeps.device == number)
+        own = own[np.argsort(sweeps.time_ns[own], kind="stable")]
+        columns = {c.name: getattr(sweeps, c.name)[own] for c in SWEEPS.columns if not c.optional}
+        edges = batch_edges(columns["time_ns"], sweeps.device[own], max_duration_ns=batch_ns)
+        topic = SWEEP_TOPIC_PREFIX + name
+        streams.append(SWEEPS.batches(topic, {"device": name}, columns, edges))
+    return streams
 
 
 def write_sweeps(writer: SessionWriter, sweeps: Sweeps, *, batch_ns: int = MAX_BATCH_NS) -> None:
@@ -199,8 +194,7 @@ def write_sweeps(writer: SessionWriter, sweeps: Sweeps, *, batch_ns: int = MAX_B
 
     One message covers at most ``batch_ns`` nanoseconds.
     """
-    for time_ns, topic, message in sweep_messages(sweeps, batch_ns=batch_ns):
-        writer.write(topic, message, time_ns)
+    write_streams(writer, sweep_messages(sweeps, batch_ns=batch_ns))
 
 
 def write_session(
@@ -265,7 +259,7 @@ def write_session(
     devices = {sweeps.devices[number] for number in np.unique(sweeps.device).tolist()}
     receiver_texts = receiver_attachments(receivers or {}, devices)
     streams = [
-        sweep_messages(sweeps),
+        *sweep_messages(sweeps),
         *reference_streams(truth, odometry),
         *imu_streams(imu),
         *onboard_messages(onboard),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import Message
 
 from locatk.core.dots.results import DotDetection, DotFacts
 from locatk.core.dots.sheet import Manifest
@@ -28,7 +29,6 @@ from locatk.formats.artifacts.schema import Artifact
 from locatk.formats.artifacts.sheets import MANIFEST
 from locatk.formats.artifacts.tags import TAGS
 from locatk.formats.sessions import foxglove
-from locatk.formats.sessions.messages import TimedMessage
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import (
     check_devices,
@@ -115,7 +115,9 @@ def write_solution(
                 writer.attach_toml(toml_file.file, toml_file.dumps(artifact))
         text = _encode(plain(_solution_record(solution, name)))
         writer.attach(SOLUTION_FILE, text.encode(), "application/json")
-        streams = [iter(_static_messages(solution, start_ns))]
+        for topic, message in _static_messages(solution, start_ns):
+            writer.write(topic, message, start_ns)
+        streams = []
         for t in solution.trajectories:
             streams.append(track_messages(f"/solution/{t.device}", t))
             streams.append(foxglove.poses(f"/pose/{t.device}", t))
@@ -156,23 +158,23 @@ def _encode(value: Any, depth: int = 0) -> str:
     return _ENCODER.encode(value)
 
 
-def _static_messages(solution: Solution, start_ns: int) -> list[TimedMessage]:
-    """Return the messages at the start of a solution: the artifact, whole paths, the log."""
+def _static_messages(solution: Solution, start_ns: int) -> list[tuple[str, Message]]:
+    """Return topics and messages at the start: the artifact, whole paths, the log."""
     scene = foxglove.scene_update(solution.artifact, solution.trajectories, start_ns)
-    messages: list[TimedMessage] = [(start_ns, "/scene", scene)]
+    messages: list[tuple[str, Message]] = [("/scene", scene)]
     for frame, cloud in foxglove.artifact_points(scene, start_ns).items():
-        messages.append((start_ns, f"/artifact_points/{frame}", cloud))
+        messages.append((f"/artifact_points/{frame}", cloud))
     for number, t in enumerate(solution.trajectories):
         if len(t) > 0:
-            messages.append((start_ns, f"/path/{t.device}", foxglove.path(t, start_ns)))
+            messages.append((f"/path/{t.device}", foxglove.path(t, start_ns)))
             points = foxglove.path_points(t, number, start_ns)
-            messages.append((start_ns, f"/path_points/{t.device}", points))
+            messages.append((f"/path_points/{t.device}", points))
     for warning in solution.warnings:
-        messages.append((start_ns, "/log", foxglove.log(warning.message, start_ns)))
+        messages.append(("/log", foxglove.log(warning.message, start_ns)))
     for reason, count in solution.rejected.items():
         if count:
             line = foxglove.log(f"rejected {count}: {reason}", start_ns, warning=True)
-            messages.append((start_ns, "/log", line))
+            messages.append(("/log", line))
     return messages
 
 

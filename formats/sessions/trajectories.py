@@ -14,6 +14,7 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
 from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.sessions import foxglove
+from locatk.formats.sessions.mcap_file import MAX_TIME_NS
 from locatk.formats.sessions.messages import (
     MAX_BATCH_SAMPLES,
     ODOMETRY,
@@ -21,17 +22,21 @@ from locatk.formats.sessions.messages import (
     BatchError,
     Batches,
     Layout,
-    TimedMessage,
+    MessageBatch,
     symmetric,
     triangle,
 )
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
+MAX_BUFFERED_BYTES = 8 << 20
+"""Size of the messages that are taken from streams before they are sorted and written: large
+compared with the overhead of sorting, small compared with the memory of a computer."""
+
 # ---- writing
 
 
-def track_messages(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
+def track_messages(topic: str, trajectory: Trajectory) -> Iterator[MessageBatch]:
     """Yield exact batches of the poses of one device."""
     columns: dict[str, NDArray[Any]] = {
         "time_ns": trajectory.time_ns,
@@ -42,10 +47,10 @@ def track_messages(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]
         columns["covariance_m_rad"] = triangle(trajectory.covariance)
     if trajectory.probability is not None:
         columns["probability"] = trajectory.probability
-    return _batched(POSES, topic, trajectory, columns)
+    return _batches(POSES, topic, trajectory, columns)
 
 
-def odometry_messages(topic: str, trajectory: Trajectory) -> Iterator[TimedMessage]:
+def odometry_messages(topic: str, trajectory: Trajectory) -> Iterator[MessageBatch]:
     """Yield batches of the planar part of a trajectory: x, y and heading."""
     columns = {
         "time_ns": trajectory.time_ns,
@@ -53,24 +58,23 @@ def odometry_messages(topic: str, trajectory: Trajectory) -> Iterator[TimedMessa
         "y_m": trajectory.position[:, 1],
         "heading_rad": heading_from_quaternion(trajectory.quaternion),
     }
-    return _batched(ODOMETRY, topic, trajectory, columns)
+    return _batches(ODOMETRY, topic, trajectory, columns)
 
 
-def _batched(
+def _batches(
     layout: Layout, topic: str, trajectory: Trajectory, columns: Mapping[str, NDArray[Any]]
-) -> Iterator[TimedMessage]:
+) -> Iterator[MessageBatch]:
     texts = {"device": trajectory.device, "frame_id": trajectory.frame}
-    for start in range(0, len(trajectory), MAX_BATCH_SAMPLES):
-        part = {key: column[start : start + MAX_BATCH_SAMPLES] for key, column in columns.items()}
-        yield int(part["time_ns"][0]), topic, layout.pack(texts, part)
+    edges = np.append(np.arange(0, len(trajectory), MAX_BATCH_SAMPLES), len(trajectory))
+    return layout.batches(topic, texts, columns, edges)
 
 
-def truth_messages(truth: Iterable[Trajectory]) -> list[Iterator[TimedMessage]]:
+def truth_messages(truth: Iterable[Trajectory]) -> list[Iterator[MessageBatch]]:
     """Return streams of reference poses: exact batches, and one message per pose for viewers."""
     return _pose_streams("truth", truth)
 
 
-def onboard_messages(onboard: Sequence[Trajectory]) -> list[Iterator[TimedMessage]]:
+def onboard_messages(onboard: Sequence[Trajectory]) -> list[Iterator[MessageBatch]]:
     """Return streams of the poses that devices estimated themselves, as :func:`truth_messages`.
 
     Raises
@@ -82,7 +86,7 @@ def onboard_messages(onboard: Sequence[Trajectory]) -> list[Iterator[TimedMessag
     return _pose_streams("onboard", onboard)
 
 
-def _pose_streams(kind: str, trajectories: Iterable[Trajectory]) -> list[Iterator[TimedMessage]]:
+def _pose_streams(kind: str, trajectories: Iterable[Trajectory]) -> list[Iterator[MessageBatch]]:
     streams = []
     for trajectory in trajectories:
         streams.append(track_messages(f"/{kind}_track/{trajectory.device}", trajectory))
@@ -92,7 +96,7 @@ def _pose_streams(kind: str, trajectories: Iterable[Trajectory]) -> list[Iterato
 
 def reference_streams(
     truth: Sequence[Trajectory], odometry: Sequence[Trajectory]
-) -> list[Iterator[TimedMessage]]:
+) -> list[Iterator[MessageBatch]]:
     """Return the streams of reference poses and odometry.
 
     Raises
@@ -114,15 +118,47 @@ def write_warnings(writer: SessionWriter, warnings: Iterable[str], end_ns: int) 
         writer.write("/log", foxglove.log(line, end_ns, warning=True), end_ns)
 
 
-def write_streams(writer: SessionWriter, streams: Iterable[Iterator[TimedMessage]]) -> int:
+def write_streams(writer: SessionWriter, streams: Iterable[Iterator[MessageBatch]]) -> int:
     """Write messages of several ascending streams in the order of their times.
+
+    At most :data:`MAX_BUFFERED_BYTES` and a batch of each stream are in memory.
 
     Returns the time of the last one, 0 without messages.
     """
-    time_ns = 0
-    for time_ns, topic, message in heapq.merge(*streams, key=lambda item: item[0]):
-        writer.write(topic, message, time_ns)
-    return time_ns
+    sources = list(streams)
+    waiting: list[list[MessageBatch]] = [[] for _ in sources]
+    # The streams that have not ended, by the time of the last message that was taken from them.
+    last_times = [(-1, number) for number in range(len(sources))]
+    end_ns = 0
+    while last_times or any(waiting):
+        taken_bytes = 0
+        while last_times and taken_bytes < MAX_BUFFERED_BYTES:
+            _, number = heapq.heappop(last_times)
+            batch = next(sources[number], None)
+            if batch is not None:
+                waiting[number].append(batch)
+                heapq.heappush(last_times, (int(batch.time_ns[-1]), number))
+                taken_bytes += sum(map(len, batch.payloads))
+        # Later batches of the streams have no earlier messages.
+        boundary_ns = last_times[0][0] if last_times else MAX_TIME_NS
+        ready = [part for batches in waiting for part in _take_until(batches, boundary_ns)]
+        if ready:
+            writer.write_batches(ready)
+            end_ns = max(int(batch.time_ns[-1]) for batch in ready)
+    return end_ns
+
+
+def _take_until(batches: list[MessageBatch], time_ns: int) -> list[MessageBatch]:
+    """Remove the messages up to ``time_ns`` from ascending batches and return them."""
+    taken = []
+    while batches and batches[0].time_ns[0] <= time_ns:
+        count = int(np.searchsorted(batches[0].time_ns, time_ns, side="right"))
+        if count < len(batches[0].time_ns):
+            part, batches[0] = batches[0].split(count)
+            taken.append(part)
+            break
+        taken.append(batches.pop(0))
+    return taken
 
 
 def check_devices(trajectories: Sequence[Trajectory], kind: str) -> None:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import IO, Any
 
+import numpy as np
 from google.protobuf.message import Message
-from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from locatk.core.errors import InputError
 from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.mcap_file import CHANNELS_RECORD, SESSION_RECORD
+from locatk.formats.sessions.mcap_writer import McapWriter
+from locatk.formats.sessions.messages import MessageBatch
 
 PROFILE = "locatk"
 FORMAT_VERSION = "1"
@@ -70,15 +72,14 @@ class SessionWriter:
             "system": system,
             **(facts or {}),
         }
-        self._writer: Writer | None = None
+        self._writer: McapWriter | None = None
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, tuple[int, type[Message]]] = {}
-        self._sequence: dict[int, int] = {}
 
     def __enter__(self) -> SessionWriter:
         stream = self._output.__enter__()
-        self._writer = Writer(stream, compression=CompressionType.ZSTD)
-        self._writer.start(profile=PROFILE, library=f"locatk {tool_version()}")
+        library = f"locatk {tool_version()}"
+        self._writer = McapWriter(stream, profile=PROFILE, library=library)
         self.metadata(SESSION_RECORD, self._record)
         return self
 
@@ -98,7 +99,7 @@ class SessionWriter:
         self._output.__exit__(kind, error, trace)
 
     @property
-    def _open_writer(self) -> Writer:
+    def _open_writer(self) -> McapWriter:
         if self._writer is None:
             raise RuntimeError("SessionWriter is used outside its `with` block")
         return self._writer
@@ -138,17 +139,32 @@ class SessionWriter:
         InputError
             The time is before 1970, which MCAP cannot represent.
         """
-        writer = self._open_writer
         channel = self.declare(topic, type(message))
-        if not 0 <= time_ns < 1 << 64:
-            raise InputError(
-                f"time {time_ns} ns of {topic} is not in the range of MCAP",
-                hint="Give times as nanoseconds since 1970",
-            )
-        sequence = self._sequence.get(channel, 0)
-        self._sequence[channel] = (sequence + 1) & 0xFFFFFFFF
+        _check_time(topic, time_ns)
         published = time_ns if publish_ns is None else publish_ns
-        writer.add_message(channel, time_ns, message.SerializeToString(), published, sequence)
+        self._open_writer.add_message(channel, time_ns, message.SerializeToString(), published)
+
+    def write_batches(self, batches: Sequence[MessageBatch]) -> None:
+        """Write the messages of several batches in the order of their times.
+
+        Messages of equal time are in the order of their batches.
+
+        Raises
+        ------
+        InputError
+            As :meth:`write`.
+        """
+        for batch in batches:
+            _check_time(batch.topic, int(batch.time_ns.min()))
+        channels = [self.declare(batch.topic, batch.message) for batch in batches]
+        time_ns = np.concatenate([batch.time_ns for batch in batches])
+        payloads = [payload for batch in batches for payload in batch.payloads]
+        order = np.argsort(time_ns, kind="stable")
+        self._open_writer.add_messages(
+            np.repeat(channels, [len(batch.payloads) for batch in batches])[order],
+            time_ns[order],
+            [payloads[k] for k in order.tolist()],
+        )
 
     def _register(self, topic: str, message_class: type[Message]) -> int:
         name = message_class.DESCRIPTOR.full_name
@@ -164,11 +180,11 @@ class SessionWriter:
 
     def attach(self, name: str, data: bytes, media_type: str, time_ns: int = 0) -> None:
         """Attach a file of a media type; for artifacts see :meth:`attach_toml`."""
-        self._open_writer.add_attachment(time_ns, time_ns, name, media_type, data)
+        self._open_writer.add_attachment(time_ns, name, media_type, data)
 
     def metadata(self, name: str, record: Mapping[str, str]) -> None:
         """Add a metadata record."""
-        self._open_writer.add_metadata(name, dict(record))
+        self._open_writer.add_metadata(name, record)
 
     def attach_toml(self, name: str, text: str) -> None:
         """Attach an artifact: ``attach_toml("scene.toml", text)``."""
@@ -178,3 +194,12 @@ class SessionWriter:
         """Write facts about a recording, as texts, to the metadata record ``facts``."""
         if facts:
             self.metadata("facts", {key: str(value) for key, value in facts.items()})
+
+
+def _check_time(topic: str, time_ns: int) -> None:
+    """Raise InputError for a time that MCAP cannot represent."""
+    if not 0 <= time_ns < 1 << 64:
+        raise InputError(
+            f"time {time_ns} ns of {topic} is not in the range of MCAP",
+            hint="Give times as nanoseconds since 1970",
+        )

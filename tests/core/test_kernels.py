@@ -356,6 +356,34 @@ def light_expected() -> Arguments:
     }
 
 
+def light_epochs() -> Arguments:
+    n = 9
+    return {
+        "starts": np.arange(n) % 4 == 0,
+        "time_ns": np.cumsum(random().uniform(0, 2e7, n)),
+        "planes": random().integers(1, 16, n),
+        "n": n,
+        "max_epoch_ns": 3e7,
+        "epoch": np.full(n, -1, np.int64),
+    }
+
+
+def light_positions() -> Arguments:
+    m, s = 5, 3
+    return {
+        "angle": 0.1 * doubles(m, s, 2),
+        "m": m,
+        "s": s,
+        "stations": doubles(s, 14),
+        "floor_z": 0.5,
+        "passes": 3,
+        "position": np.zeros((m, 3)),
+        "information": np.zeros((m, 3, 3)),
+        "residual": np.zeros((m, s, 2)),
+        "redundancy": np.zeros(m, np.int64),
+    }
+
+
 CASES: dict[str, Callable[[], Arguments]] = {
     case.__name__: case
     for case in (
@@ -373,6 +401,8 @@ CASES: dict[str, Callable[[], Arguments]] = {
         light_bits,
         light_places,
         light_expected,
+        light_epochs,
+        light_positions,
     )
 }
 """A valid call of each kernel, by the names of its arguments."""
@@ -392,6 +422,8 @@ OUTPUTS = {
     "light_bits": ("value", "value_first", "start"),
     "light_places": ("rows",),
     "light_expected": ("rows",),
+    "light_epochs": ("epoch",),
+    "light_positions": ("position", "information", "residual", "redundancy"),
 }
 
 ANY_SIZE = {("fit_lattices", "ring_radii"), ("light_bits", "value")}

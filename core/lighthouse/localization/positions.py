@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.light_planes import plane_normals
 
@@ -35,7 +36,8 @@ class PositionEstimates:
     position : (m, 3) ndarray
         ``nan`` if the planes do not determine a point in front of the stations.
     information : (m, 3, 3) ndarray
-        Inverse covariance for angles of unit variance.
+        Inverse covariance for angles of unit variance; ``nan`` if the planes intersect in no
+        single point.
     residual : (m, s, 2) ndarray
         Angle in radians between each plane and the position; ``nan`` without a sweep.
     redundancy : (m,) int ndarray
@@ -110,32 +112,96 @@ def estimate_positions(
     PositionEstimates
         In the unit of ``positions``.
     """
-    blocks = [
-        _estimate_block(
-            angles[k : k + EPOCHS_PER_BLOCK], positions, rotations, calibrations, floor_z, passes
-        )
-        for k in range(0, max(len(angles), 1), EPOCHS_PER_BLOCK)
-    ]
-    return PositionEstimates(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+    return intersect_planes(
+        correct_angles(angles, calibrations),
+        positions,
+        rotations,
+        calibrations,
+        floor_z=floor_z,
+        passes=passes,
+    )
 
 
-def _estimate_block(
-    angles: Array,
+def correct_angles(angles: Array, calibrations: tuple[Calibration, ...]) -> Array:
+    """Correct angles (m, s, 2) to those of ideal planes, station by station.
+
+    See :func:`~locatk.core.lighthouse.calibration.ideal_angles`.
+    """
+    ideal = np.empty_like(angles)
+    for start in range(0, len(angles), EPOCHS_PER_BLOCK):
+        block = slice(start, start + EPOCHS_PER_BLOCK)
+        for i, calibration in enumerate(calibrations):
+            ideal[block, i] = ideal_angles(angles[block, i], calibration)
+    return ideal
+
+
+def intersect_planes(
+    ideal: Array,
     positions: Array,
     rotations: Array,
     calibrations: tuple[Calibration, ...],
+    *,
+    floor_z: float | None = None,
+    passes: int = 3,
+) -> PositionEstimates:
+    """Estimate positions as :func:`estimate_positions`, from corrected angles.
+
+    Parameters
+    ----------
+    ideal : (m, s, 2) ndarray
+        From :func:`correct_angles`, with the same calibrations.
+    positions, rotations, calibrations, floor_z, passes
+        See :func:`estimate_positions`.
+    """
+    m, s = ideal.shape[:2]
+    tilt_tangents = np.array([np.tan(c.tilts) for c in calibrations]).reshape(s, 2)
+    estimates = PositionEstimates(
+        np.empty((m, 3)), np.empty((m, 3, 3)), np.empty((m, s, 2)), np.empty(m, np.int64)
+    )
+    if kernels is not None:
+        kernels.light_positions(
+            np.ascontiguousarray(ideal, np.float64),
+            m,
+            s,
+            np.concatenate([positions, rotations.reshape(s, 9), tilt_tangents], axis=1),
+            np.nan if floor_z is None else floor_z,
+            passes,
+            estimates.position,
+            estimates.information,
+            estimates.residual,
+            estimates.redundancy,
+        )
+        return estimates
+    for start in range(0, m, EPOCHS_PER_BLOCK):
+        block = slice(start, start + EPOCHS_PER_BLOCK)
+        (
+            estimates.position[block],
+            estimates.information[block],
+            estimates.residual[block],
+            estimates.redundancy[block],
+        ) = intersect_planes_numpy(
+            ideal[block], positions, rotations, tilt_tangents, floor_z, passes
+        )
+    return estimates
+
+
+def intersect_planes_numpy(
+    ideal: Array,
+    positions: Array,
+    rotations: Array,
+    tilt_tangents: Array,
     floor_z: float | None,
     passes: int,
 ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Estimate one block; returns the four arrays of :class:`PositionEstimates`."""
-    m, s = angles.shape[:2]
+    """Intersect planes without the compiled kernel, given the tangents (s, 2) of their tilts.
+
+    Returns the four arrays of :class:`PositionEstimates`.
+    """
+    m, s = ideal.shape[:2]
     dims = 3 if floor_z is None else 2
     normals = np.empty((m, s, 2, 3))
-    tilt_tangents = np.empty((s, 2))
-    for i, calibration in enumerate(calibrations):
-        corrected = ideal_angles(angles[:, i], calibration)
-        normals[:, i] = plane_normals(corrected, calibration.tilts) @ rotations[i].T
-        tilt_tangents[i] = np.tan(calibration.tilts)
+    for i in range(s):
+        normals[:, i] = plane_normals(ideal[:, i], np.arctan(tilt_tangents[i])) @ rotations[i].T
     is_observed = np.isfinite(normals[..., 0])
     normals[~is_observed] = 0.0
     offsets = np.einsum("msij,sj->msi", normals, positions)
@@ -170,9 +236,10 @@ def _estimate_block(
     # The planes of a station also intersect behind it, where it sends no light.
     is_behind = np.any((depth <= 0) & is_observed.any(axis=2), axis=1)
     is_unsolved = (redundancy < 0) | is_behind | ~np.isfinite(position).all(axis=1)
-    position[is_unsolved] = np.nan
     full = np.zeros((m, 3, 3))
     full[:, :dims, :dims] = information
+    full[np.isnan(position[:, 0])] = np.nan
+    position[is_unsolved] = np.nan
     return position, full, residual, redundancy
 
 

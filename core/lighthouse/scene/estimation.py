@@ -78,6 +78,10 @@ MAX_BUNDLE_KEYFRAMES = 1500
 """Largest number of keyframes in the bundle adjustment. More cost time and do not make the scene
 more accurate, because its error is that of the calibrations."""
 
+MAX_KEYFRAMES = 2 * MAX_BUNDLE_KEYFRAMES
+"""Largest number of keyframes from which a scene is estimated. A fifth of them is held out, and a
+third may be wrong, before the bundle adjustment has fewer than its largest number."""
+
 MAX_START_PAIRS = 3
 """Number of pairs of stations to start from. Further ones are tried if the first registers no more
 than half of the group of linked stations."""
@@ -386,6 +390,8 @@ def _estimate_several_stations(
     planar = {"two-planar": True, "two-3d": False}.get(kind)
     angles = rotor_angles(epochs)
     keyframes, _ = average_standstills(angles, epochs.device)
+    is_observed = np.asarray(np.isfinite(keyframes).all(axis=2))
+    keyframes = keyframes[spread_evenly(is_observed, np.arange(len(keyframes)), MAX_KEYFRAMES)]
 
     def misfit_of_markers(state: BundleState, columns: tuple[int, int]) -> float:
         marker_points, observed = marker_angles(prior.markers, epochs, angles)

@@ -20,8 +20,12 @@ from numpy.typing import NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.geometry import fit_homography as fit_checked_homography
 from locatk.core.geometry import fit_plane, rotation_angle
-from locatk.core.lighthouse.calibration import Calibration
-from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
+from locatk.core.lighthouse.calibration import Calibration, ideal_angles
+from locatk.core.lighthouse.localization.positions import (
+    PositionEstimates,
+    estimate_positions,
+    intersect_planes,
+)
 from locatk.core.lighthouse.scene.bundle_adjustment import BundleState, adjust_bundle
 from locatk.core.lighthouse.scene.keyframes import spread_evenly
 from locatk.core.lighthouse.scene.two_view import (
@@ -74,11 +78,17 @@ MIN_CROSSING_ANGLE_RAD = np.deg2rad(5.0)
 MAX_ROTATION_DISAGREEMENT_RAD = np.deg2rad(5.0)
 """Largest angle between the rotations of a new station from two pairs that are combined."""
 
+REFINEMENT_GROWTH = 1.5
+"""Growth of the number of registered stations after which all are refined together. The work of all
+refinements is then proportional to the number of stations, and not to its square."""
+
 MAX_REFINEMENT_KEYFRAMES = 300
 REFINEMENT_ITERATIONS = 10
 REFINEMENT_GATE_TAN = 3 * INLIER_GATE_TAN
-"""Size of the bundle adjustment after each registration. Its gate is wider than that of a
-correspondence, because a newly registered station is not accurate yet."""
+"""Size of a resection and of the bundle adjustments during the registration, and the gate of these:
+wider than that of a correspondence, because newly registered stations are not accurate yet. The
+accuracy saturates at
+:data:`~locatk.core.lighthouse.scene.bundle_adjustment.MAX_INDEPENDENT_POINTS`."""
 
 
 class StationRegistration:
@@ -121,13 +131,20 @@ class StationRegistration:
         self.rotations = np.tile(np.eye(3), (count, 1, 1))
         self.calibrations = list(calibrations)
         self.registered: list[int] = []
+        # Corrected angles, and the calibrations with which they were corrected.
+        self._ideal = np.empty_like(angles)
+        self._ideal_calibrations: list[Calibration | None] = [None] * count
         self._set(start.columns, start.state)
 
     def estimate_keyframes(self) -> PositionEstimates:
         """Estimate the positions of all keyframes from the registered stations."""
         chosen = self.registered
-        return estimate_positions(
-            self.angles[:, chosen],
+        for k in chosen:
+            if self._ideal_calibrations[k] is not self.calibrations[k]:
+                self._ideal_calibrations[k] = self.calibrations[k]
+                self._ideal[:, k] = ideal_angles(self.angles[:, k], self.calibrations[k])
+        return intersect_planes(
+            self._ideal[:, chosen],
             self.positions[chosen],
             self.rotations[chosen],
             tuple(self.calibrations[k] for k in chosen),
@@ -138,9 +155,11 @@ class StationRegistration:
         """Register every station that can be; returns the columns of the others, with reasons.
 
         The station with the most located keyframes is next, because each registered station makes
-        the following ones more accurate.
+        the following ones more accurate. All are refined together when their number has grown by
+        :data:`REFINEMENT_GROWTH`, and before a station is given up.
         """
         failed: dict[int, str] = {}
+        refined = len(self.registered)
         while len(self.registered) + len(failed) < len(self.positions):
             estimates = self.estimate_keyframes()
             is_located = np.isfinite(estimates.position[:, 0])
@@ -152,6 +171,10 @@ class StationRegistration:
             }
             index = max(shared, key=lambda k: len(shared[k]))
             station = self._resect(index, shared[index], estimates)
+            if station is None and refined < len(self.registered):
+                self._refine()
+                refined = len(self.registered)
+                continue
             if station is None:
                 # Even the most keyframes are too few: register any station that pairs determine.
                 by_pairs = (
@@ -164,6 +187,10 @@ class StationRegistration:
             self._set([index], station)
             # The new station may determine those that failed before.
             failed.clear()
+            if len(self.registered) >= REFINEMENT_GROWTH * refined:
+                self._refine()
+                refined = len(self.registered)
+        if refined < len(self.registered):
             self._refine()
         return failed
 
@@ -178,6 +205,7 @@ class StationRegistration:
         self, index: int, rows: NDArray[np.int64], estimates: PositionEstimates
     ) -> BundleState | None:
         """Resect a station on located keyframes; None if they do not determine its pose."""
+        rows = spread_evenly(self.is_observed[:, self.registered], rows, MAX_REFINEMENT_KEYFRAMES)
         points, rays = estimates.position[rows], self.rays[rows, index]
         try:
             poses: list[Pose] = (

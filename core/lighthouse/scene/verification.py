@@ -14,7 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration, predict_angles
-from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
+from locatk.core.lighthouse.localization.positions import (
+    PositionEstimates,
+    correct_angles,
+    intersect_planes,
+)
 from locatk.core.lighthouse.results import SceneVerification, StationVerification
 from locatk.core.lighthouse.scene.keyframes import spread_evenly
 from locatk.core.lighthouse.scene.model import StationArrays
@@ -125,16 +129,18 @@ def verify_stations(
         In the order of ``channels``.
     """
 
-    def locate(observed: Array) -> PositionEstimates:
-        return estimate_positions(observed, positions, rotations, calibrations, floor_z=floor_z)
+    ideal = correct_angles(angles, calibrations)
 
-    joint = locate(angles)
+    def locate(observed: Array) -> PositionEstimates:
+        return intersect_planes(observed, positions, rotations, calibrations, floor_z=floor_z)
+
+    joint = locate(ideal)
     checks = []
     for i, channel in enumerate(channels):
         rows = np.isfinite(angles[:, i]).any(axis=1)
-        other_angles = angles[rows]
-        other_angles[:, i] = np.nan
-        from_others = locate(other_angles)
+        without_station = ideal[rows]
+        without_station[:, i] = np.nan
+        from_others = locate(without_station)
         is_located = np.isfinite(from_others.position[:, 0])
         against = "others" if np.any(is_located) else "joint"
         position = from_others.position if np.any(is_located) else joint.position[rows]

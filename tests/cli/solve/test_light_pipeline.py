@@ -466,9 +466,9 @@ def test_an_interrupt_leaves_nothing(process, second: tuple[Array, Places], tmp_
         "whole = o.sweep_messages\n"
         "def forever(sweeps):\n"
         "    while True:\n"
-        "        yield from whole(sweeps)\n"
+        "        yield from whole(sweeps)[0]\n"
         "        print('writing', file=sys.stderr, flush=True)\n"
-        "o.sweep_messages = forever\n"
+        "o.sweep_messages = lambda sweeps: [forever(sweeps)]\n"
     )
     child = process("import", "saleae", source, "-o", run, first=endless)
     child.until("writing")

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse import epochs as limits
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.epochs import Epochs, group_epochs
@@ -51,6 +52,39 @@ def test_a_report_is_an_epoch(report: Any) -> None:
     np.testing.assert_array_equal(epochs.channels, [2, 5])
     assert epochs.rejected == {}
     assert epochs.labelled
+
+
+def random_sweeps(n: int) -> Sweeps:
+    """Return sweeps with silences, long epochs, planes that occur again, and invalid counts."""
+    rng = np.random.default_rng(4)
+    return Sweeps(
+        devices=("a", "b", "c", "d"),
+        time_ns=np.cumsum(rng.choice([0, 1, 5_000_000, 25_000_000], n)),
+        device=rng.choice([0, 1, 3], n).astype(np.int32),
+        sensor=rng.integers(0, 3, n, np.int32),
+        channel=rng.integers(1, 6, n, np.int32),
+        polynomial=np.full(n, -1, np.int32),
+        sweep=rng.integers(-1, 2, n, np.int32),
+        count=rng.uniform(-1e3, 1.3e5, n),
+    )
+
+
+@pytest.mark.parametrize("size", [1, 700, 2500])
+def test_blocks_do_not_change_the_epochs(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweeps = random_sweeps(5000)
+    at_once = group_epochs(sweeps)
+    monkeypatch.setattr(limits, "SWEEPS_PER_BLOCK", size)
+    assert_same(at_once, group_epochs(sweeps))
+    assert len(at_once.devices) == 9
+
+
+@pytest.mark.skipif(kernels is None, reason="the compiled kernels were not built")
+def test_the_kernel_equals_its_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweeps = random_sweeps(5000)
+    compiled = group_epochs(sweeps)
+    monkeypatch.setattr(limits, "kernels", None)
+    assert_same(compiled, group_epochs(sweeps))
+    assert len(compiled) > 500
 
 
 @settings(max_examples=20, deadline=None)

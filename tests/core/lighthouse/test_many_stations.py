@@ -12,9 +12,18 @@ import pytest
 from numpy.typing import NDArray
 
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse.calibration import FACTORY_UNITS, GENERIC_CALIBRATION, MODEL_SIGMA_RAD
-from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.calibration import (
+    FACTORY_UNITS,
+    GENERIC_CALIBRATION,
+    MODEL_SIGMA_RAD,
+    ideal_angles,
+)
+from locatk.core.lighthouse.light_planes import rays as rays_of
+from locatk.core.lighthouse.scene import Scene, estimation, registration
+from locatk.core.lighthouse.scene.bundle_adjustment import adjust_bundle
 from locatk.core.lighthouse.scene.estimation import StationsEstimate, estimate_stations
+from locatk.core.lighthouse.scene.registration import StationRegistration
+from locatk.core.lighthouse.scene.two_view import estimate_station_pair
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.core.lighthouse.solver import solve
 
@@ -282,3 +291,78 @@ def test_a_recorded_station_that_is_moved_in_the_scene_is_named(tracker: Any) ->
     solution = solve(tracker.sweeps, replace(tracker.scene, stations=stations))
     (warning,) = [w for w in solution.warnings if w.code == "wrong_station"]
     assert "channel 8 " in warning.message
+
+
+# ---- growth of the work
+
+
+@pytest.mark.slow
+def test_the_work_grows_with_the_number_of_stations(
+    world: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twice as many stations, all of which are received everywhere, are about twice the work."""
+    work = []
+
+    def counted(angles: Array, *arguments: Any, **options: Any) -> Any:
+        adjustment = adjust_bundle(angles, *arguments, **options)
+        work[-1] += angles.size * adjustment.iterations
+        return adjustment
+
+    monkeypatch.setattr(registration, "adjust_bundle", counted)
+    for number in (6, 12):
+        work.append(0)
+        lamps = hall(world, number, 6.0)
+        found = run(seen_by(lamps, along(150, 6.0, True)), planar=True)
+        assert len(found.stations) == number
+    assert work[1] < 2.6 * work[0]
+
+
+@pytest.mark.slow
+def test_all_are_refined_before_a_station_is_given_up(world: Any) -> None:
+    lamps = hall(world, 5, 6.0)
+    points = along(150, 6.0, True)
+    angles = seen_by(lamps, points)
+    generic = (GENERIC_CALIBRATION,) * 5
+    rays = np.stack([rays_of(ideal_angles(angles[:, k], GENERIC_CALIBRATION)) for k in range(5)], 1)
+    start = estimate_station_pair(
+        angles, rays, generic, (0, 1), sigma=MODEL_SIGMA_RAD, planar=True, marker_misfit=None
+    )
+
+    class Reluctant(StationRegistration):
+        """Resects the last two stations only if all others were refined after the third."""
+
+        refined = 0
+
+        def _refine(self) -> None:
+            super()._refine()
+            self.refined = len(self.registered)
+
+        def _resect(self, *arguments: Any) -> Any:
+            is_reliable = len(self.registered) < 4 or self.refined == len(self.registered)
+            return super()._resect(*arguments) if is_reliable else None
+
+    stations = Reluctant(angles, rays, generic, start, MODEL_SIGMA_RAD)
+    assert stations.register_all(lambda i, j: None) == {}
+    assert stations.refined == 5
+
+
+def test_a_scene_is_estimated_from_a_bounded_number_of_keyframes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Only they determine its cost, so that a recording may be long."""
+    recording = simulate(SimulationOptions(duration_s=40.0, stations=3))
+    marked = Scene(markers=recording.scene.markers)
+    monkeypatch.setattr(estimation, "MAX_KEYFRAMES", 250)
+    numbers = []
+
+    def counted(angles: Array, *arguments: Any, **options: Any) -> Any:
+        numbers.append(len(angles))
+        return estimate_stations(angles, *arguments, **options)
+
+    monkeypatch.setattr(estimation, "estimate_stations", counted)
+    solution = solve(recording.sweeps, marked)
+    assert numbers == [250]
+    assert solution.poses > 350
+    (truth,), (solved,) = recording.truth, solution.trajectories
+    true = np.stack([np.interp(solved.time_ns, truth.time_ns, c) for c in truth.position.T], 1)
+    assert np.median(np.linalg.norm(solved.position - true, axis=1)) < 2e-3

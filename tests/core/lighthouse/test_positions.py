@@ -11,7 +11,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse.calibration import FACTORY_UNITS, Calibration
+from locatk.core.lighthouse.localization import positions as positions_module
 from locatk.core.lighthouse.localization.positions import (
     EPOCHS_PER_BLOCK,
     PositionEstimates,
@@ -81,6 +83,41 @@ def test_a_bent_plane_alone_is_left_out_and_not_counted(world: Any) -> None:
     np.testing.assert_allclose(estimates.position, points, atol=1e-3)
     counted = np.count_nonzero(np.isfinite(estimates.residual), axis=(1, 2))
     np.testing.assert_array_equal(estimates.redundancy, counted - 3)
+
+
+@pytest.mark.skipif(kernels is None, reason="the compiled kernels were not built")
+@pytest.mark.parametrize("channels", [(1,), (1, 2), (1, 2, 5, 16)])
+@pytest.mark.parametrize("floor_z", [None, 0.07])
+def test_the_kernel_equals_its_twin(
+    world: Any, channels: tuple[int, ...], floor_z: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise, missing sweeps, points behind a station, and planes that do not intersect."""
+    lamps = world.lamps(*channels)
+    rng = np.random.default_rng(3)
+    points = world.curve(EPOCHS_PER_BLOCK + 50, flat=floor_z is not None) + [0, 0, 0.07]
+    angles = angles_of(lamps, points) + rng.normal(0, 1e-3, (len(points), len(channels), 2))
+    angles[rng.random(angles.shape) < 0.1] = np.nan
+    angles[:50] = rng.uniform(-2, 2, (50, *angles.shape[1:]))
+    angles[50:60] = np.nan
+    angles[60:70] = angles[60:70, :, :1]
+    compiled = estimate_positions(angles, *factory(lamps), floor_z=floor_z)
+    monkeypatch.setattr(positions_module, "kernels", None)
+    twin = estimate_positions(angles, *factory(lamps), floor_z=floor_z)
+    np.testing.assert_array_equal(compiled.redundancy, twin.redundancy)
+    is_solved = np.isfinite(twin.position[:, 0])
+    np.testing.assert_array_equal(is_solved, np.isfinite(compiled.position[:, 0]))
+    assert np.any(is_solved) == (len(channels) > 1 or floor_z is not None)
+    for name in ("position", "information", "residual"):
+        expected, actual = getattr(twin, name), getattr(compiled, name)
+        np.testing.assert_array_equal(np.isnan(actual), np.isnan(expected))
+        # The first planes are random and almost parallel, so that rounding errors grow.
+        for rows, tolerance in ((slice(0, 70), 1e-3), (slice(70, None), 1e-8)):
+            np.testing.assert_allclose(
+                actual[rows][is_solved[rows]],
+                expected[rows][is_solved[rows]],
+                rtol=tolerance,
+                atol=tolerance,
+            )
 
 
 def test_the_unit_does_not_matter(world: Any) -> None:

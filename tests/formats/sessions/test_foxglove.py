@@ -17,6 +17,7 @@ import foxglove_schemas_protobuf
 import mcap.reader
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
 from mcap_protobuf.decoder import DecoderFactory
@@ -246,7 +247,8 @@ def test_points_show_path_and_artifact(solved: tuple[str, Path]) -> None:
 
 def test_a_device_named_as_its_frame_has_a_frame_of_its_own() -> None:
     each = track("map", "map")
-    [transform, *_] = [message for *_, message in foxglove.transforms("/tf", each)]
+    [batch] = foxglove.transforms("/tf", each)
+    transform = FrameTransform.FromString(batch.payloads[0])
     assert (transform.parent_frame_id, transform.child_frame_id) == ("map", "map_body")
 
 

@@ -129,16 +129,23 @@ def test_sweeps_round_trip(tmp_path: Path, n: int, batch_ns: int) -> None:
 def test_batches_are_bounded_in_time_and_number() -> None:
     sweeps = make_sweeps(5000)
     for batch_ns, most in ((20_000_000, 1024), (10**15, 1024)):
-        for time_ns, topic, message in observations.sweep_messages(sweeps, batch_ns=batch_ns):
-            assert isinstance(message, LighthouseSweep)
+        for time_ns, topic, message in sweep_messages(sweeps, batch_ns):
             assert topic == f"/lighthouse/{message.device}"
             assert 1 <= len(message.time_ns) <= most
             assert list(message.time_ns) == sorted(message.time_ns)
             assert message.time_ns[0] == time_ns
             assert message.time_ns[-1] - time_ns < batch_ns
             assert message.timestamp.ToNanoseconds() == time_ns
-    many = list(observations.sweep_messages(sweeps, batch_ns=10**15))
-    assert len(many) < 10
+    assert len(sweep_messages(sweeps, batch_ns=10**15)) < 10
+
+
+def sweep_messages(sweeps: Sweeps, batch_ns: int) -> list[tuple[int, str, LighthouseSweep]]:
+    return [
+        (time_ns, batch.topic, LighthouseSweep.FromString(payload))
+        for stream in observations.sweep_messages(sweeps, batch_ns=batch_ns)
+        for batch in stream
+        for time_ns, payload in zip(batch.time_ns.tolist(), batch.payloads, strict=True)
+    ]
 
 
 @pytest.mark.slow
@@ -231,7 +238,7 @@ def test_garbage_is_a_batch_or_an_error(payload: bytes) -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 7))
 def test_a_flipped_bit_of_a_batch_is_a_batch_or_an_error(place: int, bit: int) -> None:
-    payload = bytearray(next(observations.sweep_messages(make_sweeps(50)))[2].SerializeToString())
+    payload = bytearray(next(observations.sweep_messages(make_sweeps(50))[0]).payloads[0])
     payload[place % len(payload)] ^= 1 << bit
     test_garbage_is_a_batch_or_an_error.hypothesis.inner_test(bytes(payload))
 
@@ -482,9 +489,12 @@ def test_poses_of_another_tool(tmp_path: Path) -> None:
     track = make_trajectory(20)
     path = tmp_path / "other.mcap"
     with SessionWriter(path, system="lighthouse") as writer:
-        for time_ns, topic, message in reversed(list(foxglove.poses("/truth/R", track))):
-            writer.write(topic, message, time_ns)
-            writer.write("/pose/R", message, time_ns)
+        (batch,) = foxglove.poses("/truth/R", track)
+        for time_ns, payload in zip(
+            batch.time_ns[::-1].tolist(), batch.payloads[::-1], strict=True
+        ):
+            writer.write(batch.topic, batch.message.FromString(payload), time_ns)
+            writer.write("/pose/R", batch.message.FromString(payload), time_ns)
     (truth,) = observations.read_truth(Session.open(path))
     same(truth, track, covariance=False)
     assert np.isnan(truth.covariance).all()

@@ -352,6 +352,60 @@ def test_mcap_of_other_tools(tmp_path: Path, options: dict[str, object]) -> None
     assert messages == [("/thing", 50 - n % 7, b'{"n": %d}' % n) for n in range(100)]
 
 
+@pytest.fixture
+def rare(tmp_path: Path) -> Path:
+    """A session of which one topic has a twentieth of the messages, in several chunks."""
+    path = tmp_path / "rare.mcap"
+    with SessionWriter(path, system="lighthouse") as writer:
+        for number in range(CHUNKS):
+            message = SerialChunk(port="p", byte_offset=number, data=payload(number))
+            writer.write("/rare" if number % 20 == 3 else "/raw/0", message, 1000 + number)
+    return path
+
+
+def rare_messages(path: Path) -> list[int]:
+    """Numbers of the messages of the rare topic, as read."""
+    messages = Session.open(path).messages(["/rare"])
+    return [SerialChunk.FromString(data).byte_offset for _, _, data in messages]
+
+
+def test_few_messages_are_read_by_the_index(rare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = list(range(3, CHUNKS, 20))
+    assert rare_messages(rare) == numbers
+    session = Session.open(rare)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("all messages were scanned")
+
+    monkeypatch.setattr(mcap_file, "iter_records", refuse)
+    assert len(list(session.messages(["/rare"]))) == len(numbers)
+    with pytest.raises(AssertionError, match="scanned"):
+        list(session.messages(["/raw/0"]))
+
+
+@pytest.mark.parametrize("change", ["other message", "other channel", "no message", "twice"])
+def test_a_wrong_message_index_is_not_used(rare: Path, change: str) -> None:
+    """All messages of the chunk are scanned instead."""
+    session = Session.open(rare)
+    segment = session.index.segments[1]
+    offsets = dict(segment.message_indexes)
+    number = next(iter(session.channel_ids(["/rare"])))
+    entries = offsets[number] + 9 + 6
+    data = bytearray(rare.read_bytes())
+    second = data[entries + 16 : entries + 32]
+    if change == "other message":
+        data[entries : entries + 8] = second[:8]
+    elif change == "other channel":
+        (other,) = session.channel_ids(["/raw/0"])
+        data[entries : entries + 16] = data[offsets[other] + 15 :][:16]
+    elif change == "no message":
+        data[entries + 8] ^= 1
+    else:
+        data[entries : entries + 16] = second
+    rare.write_bytes(data)
+    assert rare_messages(rare) == list(range(3, CHUNKS, 20))
+
+
 def test_messages_missing_from_the_index_are_noticed(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
