@@ -29,7 +29,7 @@ from locatk.core.lighthouse.scene import Scene
 from locatk.core.units import metres
 from locatk.formats.artifacts.receiver import read_receiver
 from locatk.formats.importers.crazyflie import read_config
-from locatk.formats.importers.crazyflie_usd.log_file import UsdLog, read_usd_log
+from locatk.formats.importers.crazyflie_usd.log_file import Event, UsdLog, read_usd_log
 from locatk.formats.importers.crazyflie_usd.sweeps import (
     SWEEP_EVENTS,
     LoggedSweeps,
@@ -141,16 +141,21 @@ def read_crazyflie_usd(
         )
     scene, warnings = read_scene(config, stations)
     sources = find_sources(log.events)
-    source = _choose_source(sources, sweeps, log, path)
-    logged = _read_sweeps(log, source)
-    if logged is None or not len(logged):
-        problem = "" if logged is None else f": {describe_rejected(logged.rejected)}"
+    problems: list[str] = []
+    for source in _candidate_sources(sources, sweeps, log, path):
+        event = log.events[SWEEP_EVENTS[source][0]]
+        logged = _read_sweeps(log, event, source)
+        if logged is not None and len(logged):
+            break
+        reasons = "" if logged is None else f": {describe_rejected(logged.rejected)}"
+        problems.append(f"none of the {len(event)} events {event.name} is usable{reasons}")
+    else:
         raise InputError(
-            f"none of the {len(log.events[SWEEP_EVENTS[source][0]])} events "
-            f"{SWEEP_EVENTS[source][0]} is usable{problem}",
+            "; ".join(problems),
             file=path,
             hint="A recording needs a few seconds of light of a station",
         )
+    warnings += problems
     start_s = _start_s(log, logged)
     blocks, repeated = _log_blocks(log, logged.clock, start_s)
     imu, track = read_imu(blocks, device), read_onboard_track(blocks, device)
@@ -226,8 +231,10 @@ def read_scene(config: Path | None, stations: bool) -> tuple[Scene | None, list[
     return Scene(calibrations=dict(sorted(calibrations.items())), ids=dict(sorted(ids.items()))), []
 
 
-def _choose_source(sources: list[str], wanted: str | None, log: UsdLog, path: Path) -> str:
-    """Return the source of the sweeps, ``wanted`` if it is available."""
+def _candidate_sources(
+    sources: list[str], wanted: str | None, log: UsdLog, path: Path
+) -> list[str]:
+    """Return the sources of sweeps to try, only ``wanted`` if it is given."""
     if not sources:
         raise FormatError(
             "no sweeps of a Lighthouse deck in the log",
@@ -236,19 +243,18 @@ def _choose_source(sources: list[str], wanted: str | None, log: UsdLog, path: Pa
             + list_names(name for name, event in log.events.items() if len(event)),
         )
     if wanted is None:
-        return sources[0]
+        return sources
     if wanted not in sources:
         raise InputError(
             f"no event {SWEEP_EVENTS[wanted][0]} in the log",
             file=path,
             hint=f"Give --sweeps {' or '.join(sources)}",
         )
-    return wanted
+    return [wanted]
 
 
-def _read_sweeps(log: UsdLog, source: str) -> LoggedSweeps | None:
+def _read_sweeps(log: UsdLog, event: Event, source: str) -> LoggedSweeps | None:
     """Return the sweeps of a source; None if none is usable."""
-    event = log.events[SWEEP_EVENTS[source][0]]
     if source == "uart":
         return read_uart_frames(event, log.resolution_s)
     return read_angles(event, clock_rates(log), log.resolution_s)

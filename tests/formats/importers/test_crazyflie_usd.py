@@ -383,6 +383,15 @@ def test_clock_rates_follow_from_the_cycle(crazyflie: ModuleType) -> None:
     assert len(clock_rates(parse_usd_log(log.data(), PATH))) == 2
 
 
+def test_the_next_source_replaces_an_unusable_one(crazyflie: ModuleType, tmp_path: Path) -> None:
+    log = crazyflie.write_flight(crazyflie.Flight(3.0), np.random.default_rng(3), angles=True)
+    frames = [event for event in log.events if event[1] == 11]
+    log.events = [event for event in log.events if event[1] != 11] + frames[:4]
+    session = read_crazyflie_usd([write(log, tmp_path)])
+    assert "events lhAngle" in session.facts["sweeps"]
+    assert session.warnings[0] == "none of the 4 events lhUartFrame is usable"
+
+
 def test_many_rejected_frames_are_reported(crazyflie: ModuleType, tmp_path: Path) -> None:
     stations = crazyflie.stations(3)
     stations[2].channel = 2  # two stations on one channel
