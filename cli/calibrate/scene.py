@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from locatk.core.lighthouse.results import FrameFacts
     from locatk.core.lighthouse.scene.setup import SceneSetup
     from locatk.formats.capture.status import CaptureStatus
-    from locatk.formats.pipeline import SolveReport
+    from locatk.formats.pipeline import SolveReport, SolveRequest
 
 MAX_COORDINATE_MM = 1e6
 """Largest coordinate of a marker [mm]: a kilometre."""
@@ -142,6 +142,11 @@ wizard_options = section(
     help="Algorithm: `paper` is the published one, `bundle` is more accurate.  [default: bundle]",
 )
 @scene_option
+@options.input_option(
+    "--artifact",
+    help="Scene (.toml) whose factory calibrations, ids and markers are used, in addition to those "
+    "of SESSION. Its stations are estimated anew.",
+)
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -150,6 +155,7 @@ def command(
     output: Path,
     method: str | None,
     scene: str | None,
+    artifact: Path | None,
     overwrite: bool,
     as_json: bool,
     port: str | None,
@@ -174,6 +180,8 @@ def command(
       locatk calibrate scene -o scene.toml --wizard /dev/ttyACM0 --x-distance 1000
       locatk solve later.mcap -o solved.mcap --artifact scene.toml
     """
+    from locatk.formats.pipeline import SolveRequest
+
     setup = scene_setup(**points)
     if port is not None:
         session = session or output.with_suffix(".mcap")
@@ -198,8 +206,11 @@ def command(
         if session is None:
             raise click.UsageError("Missing argument 'SESSION'.")
         options.must_exist([session])
-        options.guard_output(output, overwrite=overwrite, inputs=[session])
-    solve_scene(session, output, setup, method, scene, overwrite=overwrite, as_json=as_json)
+        options.guard_output(
+            output, overwrite=overwrite, inputs=[session, *([artifact] if artifact else [])]
+        )
+    request = SolveRequest(method=method, scene=scene, artifact=artifact, setup=setup)
+    solve_scene(session, output, request, overwrite=overwrite, as_json=as_json)
 
 
 def record_with_guide(
@@ -300,18 +311,16 @@ def scene_setup(
 def solve_scene(
     session: Path,
     output: Path,
-    setup: SceneSetup,
-    method: str | None = None,
-    scene: str | None = None,
+    request: SolveRequest,
     *,
-    overwrite: bool = False,
-    as_json: bool = False,
+    overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Solve a session, write its scene, and print the report."""
     from locatk.cli.solve.text import json_entry, notes, text
     from locatk.core.solution import to_json
     from locatk.formats.artifacts.scene import write_scene
-    from locatk.formats.pipeline import SolveRequest, solve_session, summarize
+    from locatk.formats.pipeline import solve_session, summarize
     from locatk.formats.sessions.reader import Session
 
     system = Session.open(session).facts.get("system")
@@ -322,7 +331,7 @@ def solve_scene(
             hint="Give a session with sweeps of Lighthouse stations",
         )
     with console.working("Solving"):
-        solved = solve_session(session, SolveRequest(method=method, scene=scene, setup=setup))
+        solved = solve_session(session, request)
     write_scene(output, solved.solution.artifact, overwrite=overwrite)
     report = summarize(str(session), str(output), solved.solution, solved.solve_s)
     facts = solved.solution.facts

@@ -48,6 +48,27 @@ def merge_scenes(given: Scene, own: Scene | None) -> tuple[Scene, list[SolverWar
     return merged, conflicts
 
 
+def knowledge_of_stations(scene: Scene) -> Scene:
+    """Return a scene whose stations have yet to be estimated, with what is known of them.
+
+    Their factory calibrations, serial numbers and directions of gravity are kept. Estimated
+    calibrations are not: they fit the poses that they were estimated with.
+    """
+    stations = scene.stations
+    if not stations:
+        return scene
+    factory = {s.channel: s.calibration for s in stations if s.calibration.source == "factory"}
+    ids = {s.channel: s.id for s in stations if s.id is not None}
+    ups = {s.channel: s.up for s in stations if s.up is not None}
+    return Scene(
+        markers=tuple(replace(marker, visits=()) for marker in scene.markers),
+        planar=scene.planar,
+        calibrations={**factory, **scene.calibrations},
+        ids={**ids, **scene.ids},
+        ups={**ups, **scene.ups},
+    )
+
+
 def _merge_markers(given: Scene, own: Scene) -> tuple[tuple[Marker, ...], list[SolverWarning]]:
     known = {marker.name: marker for marker in given.markers}
     conflicts = []

@@ -36,7 +36,7 @@ from locatk.core.solution import Solution, SolverWarning
 from locatk.formats.artifacts import maps, scene, sheets, tags
 from locatk.formats.artifacts.registry import ARTIFACTS
 from locatk.formats.artifacts.schema import read_format
-from locatk.formats.pipeline.scene_merging import merge_scenes
+from locatk.formats.pipeline.scene_merging import knowledge_of_stations, merge_scenes
 from locatk.formats.sessions import observations, station_reports
 from locatk.formats.sessions.reader import Session
 
@@ -153,6 +153,8 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     """Read sweeps, scene, reports of the stations, receivers and odometry."""
     sweeps = observations.read_sweeps(session)
     given = None if request.artifact is None else scene.read_scene(request.artifact)
+    if given is not None and request.setup is not None:
+        given = knowledge_of_stations(given)  # A scene is calibrated anew.
     own = observations.read_scene(session)
     known, conflicts = (own, []) if given is None else merge_scenes(given, own)
     reports = observations.read_station_reports(session)

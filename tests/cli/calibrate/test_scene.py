@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from locatk.core.geometry import Similarity, quaternion_inverse, quaternion_rotate
+from locatk.core.inertial import STANDARD_GRAVITY_M_S2, InertialSamples
+from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport
 from locatk.core.lighthouse.simulation.session import (
     FLOOR_MARKERS_M,
@@ -18,7 +21,7 @@ from locatk.core.lighthouse.simulation.session import (
     SimulationOptions,
     simulate,
 )
-from locatk.formats.artifacts.scene import read_scene
+from locatk.formats.artifacts.scene import read_scene, write_scene
 from locatk.formats.sessions.observations import write_session
 
 
@@ -92,8 +95,6 @@ def test_a_floor_with_a_known_axis(
 @pytest.mark.slow
 def test_accelerometers_level_a_recording(locatk: Callable[..., Any], tmp_path: Path) -> None:
     """Stations send bytes; those of the reports come back from the session."""
-    from locatk.core.lighthouse.receiver import DECK
-
     run = simulate(
         SimulationOptions(planar=False, receiver=DECK, duration_s=15.0, report_hz=30, seed=3)
     )
@@ -124,6 +125,47 @@ def test_accelerometers_level_a_recording(locatk: Callable[..., Any], tmp_path: 
         assert solved.rotation[2] == pytest.approx(station.rotation[2], abs=0.05)
     assert scene.frame == "station-1-level"
     assert "z is up by gravity from channel 1 and channel 2" in result.stderr
+
+
+@pytest.mark.slow
+def test_an_imu_at_rest_levels_a_recording(locatk: Callable[..., Any], tmp_path: Path) -> None:
+    options = SimulationOptions(planar=False, receiver=DECK, duration_s=28.0, report_hz=16, seed=4)
+    run = simulate(options)
+    (truth,) = run.truth
+    up = np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])
+    force = quaternion_rotate(quaternion_inverse(truth.quaternion), up)
+    imu = InertialSamples("robot-1", truth.time_ns, force, np.zeros_like(force))
+    path, out = tmp_path / "run.mcap", tmp_path / "scene.toml"
+    write_session(
+        path, system="lighthouse", sweeps=run.sweeps, receivers={"robot-1": DECK}, imu=[imu]
+    )
+    result = locatk("calibrate", "scene", path, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    assert "z is up by gravity from the IMU of robot-1" in result.stderr
+    scene = read_scene(out)
+    assert np.degrees(scene.level_sigma_rad) == pytest.approx(1.0)
+    for station in run.true_scene.stations:
+        solved = scene.station(station.channel)
+        assert solved is not None
+        assert solved.rotation[2] == pytest.approx(station.rotation[2], abs=0.04)
+
+
+def test_factory_calibrations_of_an_artifact_and_standstills(
+    locatk: Callable[..., Any], simulated: SimulatedSession, session: Path, tmp_path: Path
+) -> None:
+    """The artifact is the true scene, with stations elsewhere: they are estimated anew."""
+    artifact, out = tmp_path / "site.toml", tmp_path / "scene.toml"
+    away = Similarity(1.0, np.eye(3), np.array([5.0, 0.0, 0.0]))
+    write_scene(artifact, simulated.true_scene.transformed(away))
+    args = (*MARKERS, "--artifact", artifact)
+    result = locatk("calibrate", "scene", session, "-o", out, *args)
+    assert result.exit_code == 0, result.stderr
+    assert "generic" not in result.stderr
+    for station in simulated.true_scene.stations:
+        solved = read_scene(out).station(station.channel)
+        assert solved is not None
+        assert solved.calibration.source == "factory"
+        assert solved.position == pytest.approx(station.position, abs=0.005)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
-from locatk.formats.pipeline.scene_merging import merge_scenes
+from locatk.formats.pipeline.scene_merging import knowledge_of_stations, merge_scenes
 
 FACTORY = Calibration(np.full((2, 7), 0.01), "factory")
 OTHER = Calibration(np.full((2, 7), 0.02), "factory")
@@ -66,6 +66,29 @@ def test_visits_in_a_solved_scene_are_of_another_recording() -> None:
     assert merged.stations == (station,)
     assert merged.markers[0].visits == (SECOND,)
     assert (merged.frame, merged.planar) == ("room", None)
+
+
+def test_a_scene_that_is_calibrated_anew_keeps_what_stations_sent() -> None:
+    fitted = Calibration(np.zeros((2, 7)), "estimated")
+    given = Scene(
+        (
+            Station(1, np.zeros(3), np.eye(3), FACTORY, 7, up=UP),
+            Station(2, np.zeros(3), np.eye(3), fitted),
+        ),
+        markers=(marker("a", 1.0, FIRST),),
+        calibrations={3: OTHER},
+        scale="markers",
+        frame_source="markers",
+        level_sigma_rad=0.1,
+    )
+    known = knowledge_of_stations(given)
+    assert known.stations == ()
+    assert known.calibrations == {1: FACTORY, 3: OTHER}
+    assert (known.ids, known.ups) == ({1: 7}, {1: UP})
+    assert known.markers[0].visits == ()
+    assert (known.scale, known.frame_source, known.level_sigma_rad) == ("unit", None, None)
+    by_hand = Scene(markers=(marker("a", 1.0, FIRST),))
+    assert knowledge_of_stations(by_hand) is by_hand
 
 
 def test_a_session_without_scene() -> None:
