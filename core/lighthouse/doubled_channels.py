@@ -161,6 +161,8 @@ def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, floa
     period_s = float(period_ticks(channel)) / TICK_HZ
     rows = rows[np.argsort(sweeps.device[rows], kind="stable")]
     for own in np.split(rows, np.flatnonzero(np.diff(sweeps.device[rows])) + 1):
+        if not len(own):  # No sweep of the channel has a count.
+            continue
         own = own[np.argsort(sweeps.time_ns[own], kind="stable")]
         time_s = (sweeps.time_ns[own] - sweeps.time_ns[own[0]]) * 1e-9
         count_s = sweeps.count[own] * (TICKS_PER_COUNT / TICK_HZ)
