@@ -52,8 +52,8 @@ MAX_NAME_BYTES = 100
 
 HINT = "Give a log of the micro SD card deck, such as log00"
 
-_ID, _TIME = "(id)", "(timestamp)"
-"""Names of the fields in front of the variables, which may have the names without brackets."""
+_ID, _TIME = "\nid", "\ntimestamp"
+"""Names of the fields in front of the variables, whose names are one line."""
 
 _NAME = re.compile(rb"[ -~]*")
 _VARIABLE = re.compile(r"(.+)\((.)\)")
