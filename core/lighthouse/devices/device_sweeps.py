@@ -16,19 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.channels import CHANNELS, TICK_HZ, period_counts, period_ticks
 from locatk.core.lighthouse.devices.pose_fit import SweepObservations
-from locatk.core.lighthouse.epochs import MIN_PLANE_DELAY_TURNS
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
+from locatk.core.lighthouse.plane_labels import assign_planes
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S, UNKNOWN, Sweeps
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-MAX_LONE_FIRST_PLANE_TURNS = 0.40
-MIN_LONE_SECOND_PLANE_TURNS = 0.60
-"""Fractions of a rotation before and after which a lone sweep can only be of the first or of the
-second plane, for photodiodes within 70 degrees of the station's forward axis."""
 
 MAX_SWEEPS_PER_WINDOW = 512
 """Maximum number of sweeps used of one window; of more, every second or third is used. Two
@@ -158,62 +153,6 @@ def select_device_sweeps(
         2 * np.pi * rotor_turns + ROTOR_ZERO_RAD[plane],
     )
     return selected, rejected
-
-
-def assign_planes(time_ns: IntArray, channel: NDArray[np.int32], count: Array) -> IntArray:
-    """Assign each sweep of a device to the first or second plane of its station.
-
-    In one rotation of a station the first plane crosses all photodiodes of a device within a
-    small angle, and the second plane follows about a third of a rotation later. The widest gap of
-    a rotation therefore separates the planes. If only one plane was received, its rotor angle
-    decides, except in the middle of the rotation.
-
-    Parameters
-    ----------
-    time_ns : (n,) int64 ndarray
-    channel : (n,) int ndarray
-        1 to 16.
-    count : (n,) ndarray
-        LFSR steps since the zero of the rotor.
-
-    Returns
-    -------
-    (n,) int ndarray
-        0, 1, or -1 if the plane is unknown.
-    """
-    rotor_turns = count / period_counts(channel)
-    rotation = _number_rotations(time_ns, channel, rotor_turns)
-    lone_plane = np.where(
-        rotor_turns < MAX_LONE_FIRST_PLANE_TURNS,
-        0,
-        np.where(rotor_turns > MIN_LONE_SECOND_PLANE_TURNS, 1, UNKNOWN),
-    )
-    order = np.lexsort((rotor_turns, rotation))
-    turns_sorted, rotation_sorted = rotor_turns[order], rotation[order]
-    step = np.diff(turns_sorted)
-    step[np.diff(rotation_sorted) != 0] = 0.0
-    widest = np.zeros(int(np.max(rotation, initial=-1)) + 1)
-    np.maximum.at(widest, rotation_sorted[1:], step)
-    gap = np.flatnonzero((step > MIN_PLANE_DELAY_TURNS) & (step == widest[rotation_sorted[1:]]))
-    boundary = np.full(len(widest), np.nan)
-    boundary[rotation_sorted[gap]] = turns_sorted[gap] + step[gap] / 2
-    boundary = boundary[rotation]
-    return np.where(np.isnan(boundary), lone_plane, (rotor_turns > boundary).astype(np.int64))
-
-
-def _number_rotations(
-    time_ns: IntArray, channel: NDArray[np.int32], rotor_turns: Array
-) -> IntArray:
-    """Number the rotations of all stations; (n,) with equal numbers for one rotation."""
-    period_ns = period_ticks(channel) * (NANOSECONDS_PER_S / TICK_HZ)
-    elapsed_ns = time_ns - (time_ns[0] if len(time_ns) else 0)
-    rotor_zero_ns = elapsed_ns - rotor_turns * period_ns
-    order = np.lexsort((rotor_zero_ns, channel))
-    is_new = np.diff(rotor_zero_ns[order]) > 0.5 * period_ns[order][1:]
-    is_new = np.r_[True, is_new | (np.diff(channel[order]) != 0)][: len(order)]
-    rotation = np.empty(len(order), np.int64)
-    rotation[order] = np.cumsum(is_new) - 1
-    return rotation
 
 
 def mean_angles(sweeps: DeviceSweeps, sensors: int) -> Array:

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from locatk.core.lighthouse.devices.device_sweeps import (
     DeviceSweeps,
-    assign_planes,
     has_enough_sweeps,
     make_windows,
     select_device_sweeps,
 )
+from locatk.core.lighthouse.plane_labels import assign_planes
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 
@@ -38,7 +38,7 @@ def planes_of(*rotations: list[float]) -> list[list[int]]:
 
 
 def test_the_widest_gap_of_a_rotation_separates_the_planes() -> None:
-    assert planes_of([0.30, 0.31, 0.62, 0.64], [0.45, 0.46, 0.61]) == [[0, 0, 1, 1], [0, 0, 1]]
+    assert planes_of([0.30, 0.31, 0.62, 0.64], [0.32, 0.33, 0.65]) == [[0, 0, 1, 1], [0, 0, 1]]
 
 
 def test_the_rotor_angle_decides_on_a_lone_plane_unless_it_is_in_the_middle() -> None:
