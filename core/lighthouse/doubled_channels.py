@@ -159,6 +159,8 @@ def _compare_hypotheses(sweeps: Sweeps, channel: int) -> tuple[bool, float, floa
     evidence = np.zeros(2)
     rows = np.flatnonzero((sweeps.channel == channel) & np.isfinite(sweeps.count))
     period_s = float(period_ticks(channel)) / TICK_HZ
+    if not len(rows):
+        return False, 0.0, 0.0
     rows = rows[np.argsort(sweeps.device[rows], kind="stable")]
     for own in np.split(rows, np.flatnonzero(np.diff(sweeps.device[rows])) + 1):
         if not len(own):  # No sweep of the channel has a count.
