@@ -127,6 +127,21 @@ def test_accelerometers_level_a_recording(locatk: Callable[..., Any], tmp_path: 
     assert "z is up by gravity from channel 1 and channel 2" in result.stderr
 
 
+def test_photodiodes_at_unknown_positions_are_located_one_by_one(
+    locatk: Callable[..., Any], simulated: SimulatedSession, tmp_path: Path
+) -> None:
+    path, out = tmp_path / "run.mcap", tmp_path / "scene.toml"
+    sweeps = replace(simulated.sweeps, sensor=np.full_like(simulated.sweeps.sensor, 2))
+    write_session(path, system="lighthouse", sweeps=sweeps)
+    result = locatk("calibrate", "scene", path, "-o", out, *MARKERS)
+    assert result.exit_code == 0, result.stderr
+    assert read_scene(out).frame_source == "markers"
+    assert "1  robot-1/2" in result.stdout
+    for name in ("robot-1", "robot-1/2"):
+        named = (*MARKERS, "--device", name, "--overwrite")
+        assert locatk("calibrate", "scene", path, "-o", out, *named).exit_code == 0
+
+
 @pytest.mark.slow
 def test_an_imu_at_rest_levels_a_recording(locatk: Callable[..., Any], tmp_path: Path) -> None:
     options = SimulationOptions(planar=False, receiver=DECK, duration_s=28.0, report_hz=16, seed=4)
