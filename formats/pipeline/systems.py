@@ -22,6 +22,7 @@ from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.frame import given_scene_warnings
 from locatk.core.lighthouse.scene.levelling import inertial_ups, level_solution
 from locatk.core.lighthouse.scene.setup import (
     AssignedStandstill,
@@ -187,6 +188,9 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
             solution = place_on_floor(solution, setup, rests, prior, ups)
         ups = inertial_ups(imus, solution.trajectories, standstills)
         solution = level_solution(solution, prior, ups)
+        if initial.stations and own is not None and solution.artifact.scale != "unit":
+            misfit = given_scene_warnings(own.markers, solution.trajectories)
+            solution = replace(solution, warnings=(*solution.warnings, *misfit))
         if rests:
             solution = with_standstills(solution, rests)
         return replace(solution, warnings=(*conflicts, *solution.warnings))
