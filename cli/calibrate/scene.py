@@ -182,6 +182,8 @@ def command(
     """
     from locatk.formats.pipeline import SolveRequest
 
+    if port is not None:
+        points["floor"] = True
     setup = scene_setup(**points)
     if port is not None:
         session = session or output.with_suffix(".mcap")
@@ -236,8 +238,8 @@ def record_with_guide(
     from locatk.formats.sessions.observations import read_sweeps
     from locatk.formats.sessions.reader import Session
 
-    if setup.markers or setup.origin or setup.x_axis or setup.ignored or setup.device:
-        raise click.UsageError("--wizard finds the points itself: leave out --marker and numbers.")
+    if setup.origin or setup.x_axis or setup.ignored or setup.device:
+        raise click.UsageError("--wizard finds the points itself: leave out their numbers.")
     options.check_ending(session, (".mcap",))
     options.guard_output(output, overwrite=overwrite)
     guide = SceneGuide(floor_points, setup.x_distance_m)

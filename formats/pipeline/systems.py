@@ -14,12 +14,15 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from locatk.core import dots, landmarks, lighthouse, polaris
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.lighthouse.demodulation.sweep_reports import report_stations
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.frame import given_scene_warnings
 from locatk.core.lighthouse.scene.levelling import inertial_ups, level_solution
 from locatk.core.lighthouse.scene.setup import (
     AssignedStandstill,
@@ -29,7 +32,7 @@ from locatk.core.lighthouse.scene.setup import (
     place_on_floor,
     with_standstills,
 )
-from locatk.core.lighthouse.scene.standstills import find_standstills
+from locatk.core.lighthouse.scene.standstills import Standstill, find_standstills
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.tag import Tags
 from locatk.core.solution import Solution, SolverWarning
@@ -175,7 +178,7 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     def solve() -> Solution:
         setup, prior = request.setup, initial
         rests: tuple[AssignedStandstill, ...] = ()
-        standstills = find_standstills(sweeps) if setup is not None or imus else []
+        standstills = _find_standstills(sweeps, receivers) if setup is not None or imus else []
         if setup is not None:
             rests = assign_standstills(setup, standstills)
             prior = add_to_prior(initial, setup, rests, is_rigid=bool(receivers))
@@ -185,11 +188,32 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
             solution = place_on_floor(solution, setup, rests, prior, ups)
         ups = inertial_ups(imus, solution.trajectories, standstills)
         solution = level_solution(solution, prior, ups)
+        if initial.stations and own is not None and solution.artifact.scale != "unit":
+            misfit = given_scene_warnings(own.markers, solution.trajectories)
+            solution = replace(solution, warnings=(*solution.warnings, *misfit))
         if rests:
             solution = with_standstills(solution, rests)
         return replace(solution, warnings=(*conflicts, *solution.warnings))
 
     return solve
+
+
+def _find_standstills(sweeps: Sweeps, receivers: Mapping[str, Receiver]) -> list[Standstill]:
+    """Find standstills, with the names of trajectories as those of their devices.
+
+    The photodiodes of a device without known positions are solved separately, as ``device/0``; the
+    first one stands for the device.
+    """
+    is_single = ~np.isin(sweeps.device, [sweeps.devices.index(name) for name in receivers])
+    standstills = find_standstills(sweeps)
+    if not np.any(sweeps.sensor[is_single]):
+        return standstills
+    names = {
+        name: name if name in receivers else f"{name}/{sweeps.sensor[sweeps.device == k].min()}"
+        for k, name in enumerate(sweeps.devices)
+        if np.any(sweeps.device == k)
+    }
+    return [replace(each, device=names[each.device]) for each in standstills]
 
 
 def _rigid_devices(sweeps: Sweeps, receivers: Mapping[str, Receiver]) -> dict[str, Receiver]:

@@ -22,6 +22,7 @@ from locatk.core.lighthouse.noise import INLIER_GATE_RAD
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene
 from locatk.core.lighthouse.scene.bundle_adjustment import BundleState
+from locatk.core.lighthouse.scene.reframing import median_position
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -190,6 +191,26 @@ def marker_misfit_warning(misfit_m: float) -> SolverWarning:
         f"the markers are {1e3 * misfit_m:.0f} mm (rms) from their positions in the scene: a "
         "marker was measured wrong, or the scene is wrong",
     )
+
+
+def given_scene_warnings(
+    markers: Sequence[Marker], trajectories: Sequence[Trajectory]
+) -> list[SolverWarning]:
+    """Return a warning if devices that rested on markers are elsewhere in a given scene."""
+    errors = [
+        float(np.linalg.norm(position - marker.position))
+        for marker in markers
+        for visit in marker.visits
+        if (position := median_position(trajectories, visit)) is not None
+    ]
+    misfit_m = float(np.sqrt(np.mean(np.square(errors)))) if errors else 0.0
+    if misfit_m <= MAX_MARKER_MISFIT_M:
+        return []
+    message = (
+        f"devices on the markers of the session are {1e3 * misfit_m:.0f} mm (rms) from them in the "
+        "given scene: its frame is another one, a station was moved, or a marker is wrong"
+    )
+    return [SolverWarning("marker_misfit", message)]
 
 
 def _scale(

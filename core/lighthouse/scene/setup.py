@@ -89,12 +89,17 @@ def assign_standstills(
     devices = sorted({each.device for each in standstills})
     needs_points = bool(setup.markers) or setup.has_floor
     if setup.device is not None:
-        if setup.device not in devices:
+        # The photodiode of a device, as in ``robot/0``, goes by the name of the device as well.
+        standstills = [
+            each
+            for each in standstills
+            if setup.device in (each.device, each.device.rpartition("/")[0])
+        ]
+        if not standstills:
             raise InputError(
                 f"device {setup.device!r} did not rest",
                 hint=f"devices that rested: {', '.join(devices) or 'none'}",
             )
-        standstills = [each for each in standstills if each.device == setup.device]
     elif needs_points and len(devices) > 1:
         raise InputError(
             f"{len(devices)} devices rested: {', '.join(devices)}",

@@ -18,11 +18,14 @@ from locatk.core.lighthouse.scene.keyframes import STANDSTILL_ANGLE_RAD
 
 Array = NDArray[np.float64]
 
-WINDOW_S = 0.25
-"""Time over which angles are averaged [s]: about twelve rotations."""
+MIN_WINDOW_S = 0.25
+"""Shortest time over which angles are averaged [s]: about twelve rotations."""
 
-MIN_EPOCHS_PER_WINDOW = 2
-"""Fewest epochs from which the angle of a window is used."""
+EPOCHS_PER_WINDOW = 5
+"""Number of epochs of a window of devices that report rarely: the median outvotes two of them."""
+
+MIN_EPOCHS_PER_WINDOW = 3
+"""Fewest epochs from which the angle of a window is used: their median outvotes one wrong sweep."""
 
 MIN_STANDSTILL_S = 1.5
 """Shortest standstill [s]. Robots that turn or brake rest for less."""
@@ -35,9 +38,15 @@ minute of Gaussian noise is 7 of them."""
 MAX_STANDSTILL_ANGLE_RAD = 4e-3
 """Largest spread of the angles of a rest, however noisy they are [rad]: 8 mm at 2 m."""
 
-STILL_QUANTILE = 0.75
-"""Fraction of the light planes whose angles must be constant: one station of several may be
-received by reflection at times."""
+MAX_MOVING_FRACTION = 0.25
+"""Fraction of the light planes whose angles may change at rest: one station of several may be
+received by reflection at times. Of one station both planes must be constant."""
+
+ANCHOR_WINDOWS = 8
+"""Windows at the beginning of a rest whose median is its position. More would cost time."""
+
+MAX_WRONG_WINDOWS = 2
+"""Largest number of windows with other angles within a rest: a person passes by."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +116,9 @@ def _device_standstills(
     rows = np.flatnonzero(np.isin(epochs.device, photodiodes))
     if len(rows) == 0:
         return []
-    window_ns = round(WINDOW_S * NANOSECONDS_PER_S)
+    interval_ns = np.diff(epochs.time_ns[rows])[np.diff(epochs.device[rows]) == 0]
+    epoch_ns = float(np.median(interval_ns)) if len(interval_ns) else 0.0
+    window_ns = round(max(MIN_WINDOW_S * NANOSECONDS_PER_S, EPOCHS_PER_WINDOW * epoch_ns))
     first_ns = int(epochs.time_ns[rows].min())
     window = (epochs.time_ns[rows] - first_ns) // window_ns
     windows, medians = _window_medians(window, epochs.device[rows], angles[rows], photodiodes)
@@ -115,7 +126,8 @@ def _device_standstills(
         return []
     max_spread_rad = _max_spread(window, epochs.device[rows], angles[rows])
     standstills = []
-    for first, last in _split_rests(medians, max_spread_rad):
+    rests = _split_rests(medians, max_spread_rad)
+    for first, last in _join_rests(medians, rests, max_spread_rad):
         # Up to half of the first and the last window may be of the motion.
         start_ns = first_ns + int(windows[first]) * window_ns + window_ns // 2
         end_ns = first_ns + int(windows[last]) * window_ns + window_ns // 2
@@ -167,28 +179,52 @@ def _max_spread(window: NDArray[np.int64], device: NDArray[np.int64], angles: Ar
 def _split_rests(medians: Array, max_spread_rad: float) -> list[tuple[int, int]]:
     """Return the first and last rows of the longest runs of windows with constant angles.
 
-    The spread of the angles within a run is limited, so that a slow motion is none. Windows without
-    data do not end a run.
+    The angles are compared with those of the beginning of their run, so that a slow motion is none.
+    Windows without data do not end a run.
     """
     rests: list[tuple[int, int]] = []
-    start = 0
-    low, high = medians[0].copy(), medians[0].copy()
+    start, anchor = 0, medians[0]
     for row in range(1, len(medians) + 1):
         if row < len(medians):
-            new_low, new_high = np.fmin(low, medians[row]), np.fmax(high, medians[row])
-            is_common = np.isfinite(medians[row - 1]) & np.isfinite(medians[row])
-            if _is_still((new_high - new_low)[is_common], max_spread_rad):
-                low, high = new_low, new_high
+            deviation = np.abs(medians[row] - anchor)
+            if _is_still(deviation[np.isfinite(deviation)], 0.5 * max_spread_rad):
+                if row - start < ANCHOR_WINDOWS:
+                    anchor = _column_medians(medians[start : row + 1])
                 continue
         if row - 1 > start:
             rests.append((start, row - 1))
         if row < len(medians):
-            start, low, high = row, medians[row].copy(), medians[row].copy()
+            start, anchor = row, medians[row]
     return rests
 
 
-def _is_still(spread: Array, max_spread_rad: float) -> bool:
-    """Return whether the angles of enough light planes have a small spread."""
-    if len(spread) < 2:
+def _is_still(deviation: Array, max_deviation_rad: float) -> bool:
+    """Return whether the angles of enough light planes deviate by little."""
+    if len(deviation) < 2:
         return False
-    return bool(np.quantile(spread, STILL_QUANTILE, method="lower") <= max_spread_rad)
+    moving = np.count_nonzero(deviation > max_deviation_rad)
+    return bool(moving <= MAX_MOVING_FRACTION * len(deviation))
+
+
+def _join_rests(
+    medians: Array, rests: list[tuple[int, int]], max_spread_rad: float
+) -> list[tuple[int, int]]:
+    """Join rests at one position that a few wrong windows divide."""
+    joined: list[tuple[int, int]] = []
+    for first, last in rests:
+        if joined and 0 < first - joined[-1][1] - 1 <= MAX_WRONG_WINDOWS:
+            before = _column_medians(medians[joined[-1][0] : joined[-1][1] + 1])
+            change = np.abs(_column_medians(medians[first : last + 1]) - before)
+            if _is_still(change[np.isfinite(change)], 0.5 * max_spread_rad):
+                joined[-1] = (joined[-1][0], last)
+                continue
+        joined.append((first, last))
+    return joined
+
+
+def _column_medians(medians: Array) -> Array:
+    """Return the median of each column, ``nan`` if it has no value."""
+    result = np.full(medians.shape[1], np.nan)
+    is_known = np.isfinite(medians).any(axis=0)
+    result[is_known] = np.nanmedian(medians[:, is_known], axis=0)
+    return result

@@ -127,6 +127,38 @@ def test_accelerometers_level_a_recording(locatk: Callable[..., Any], tmp_path: 
     assert "z is up by gravity from channel 1 and channel 2" in result.stderr
 
 
+@pytest.mark.parametrize(("shift_m", "is_reported"), [(0.0, False), (0.05, True)])
+def test_markers_of_a_session_validate_a_given_scene(
+    locatk: Callable[..., Any],
+    simulated: SimulatedSession,
+    tmp_path: Path,
+    shift_m: float,
+    is_reported: bool,
+) -> None:
+    path, artifact = tmp_path / "run.mcap", tmp_path / "site.toml"
+    write_session(path, system="lighthouse", sweeps=simulated.sweeps, scene=simulated.scene)
+    away = Similarity(1.0, np.eye(3), np.array([shift_m, 0.0, 0.0]))
+    write_scene(artifact, replace(simulated.true_scene.transformed(away), markers=()))
+    result = locatk("solve", path, "-o", tmp_path / "solved.mcap", "--artifact", artifact)
+    assert result.exit_code == 0, result.stderr
+    assert ("on the markers of the session are 50 mm (rms)" in result.stderr) == is_reported
+
+
+def test_photodiodes_at_unknown_positions_are_located_one_by_one(
+    locatk: Callable[..., Any], simulated: SimulatedSession, tmp_path: Path
+) -> None:
+    path, out = tmp_path / "run.mcap", tmp_path / "scene.toml"
+    sweeps = replace(simulated.sweeps, sensor=np.full_like(simulated.sweeps.sensor, 2))
+    write_session(path, system="lighthouse", sweeps=sweeps)
+    result = locatk("calibrate", "scene", path, "-o", out, *MARKERS)
+    assert result.exit_code == 0, result.stderr
+    assert read_scene(out).frame_source == "markers"
+    assert "1  robot-1/2" in result.stdout
+    for name in ("robot-1", "robot-1/2"):
+        named = (*MARKERS, "--device", name, "--overwrite")
+        assert locatk("calibrate", "scene", path, "-o", out, *named).exit_code == 0
+
+
 @pytest.mark.slow
 def test_an_imu_at_rest_levels_a_recording(locatk: Callable[..., Any], tmp_path: Path) -> None:
     options = SimulationOptions(planar=False, receiver=DECK, duration_s=28.0, report_hz=16, seed=4)

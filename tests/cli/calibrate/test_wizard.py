@@ -49,8 +49,9 @@ def port(recorded: Path, tmp_path: Path, process: Callable[..., Process]) -> Pat
 def test_a_scene_from_a_port(port: Path, tmp_path: Path, process: Callable[..., Process]) -> None:
     out = tmp_path / "room.toml"
     wizard = process(
-        "calibrate", "scene", "-o", out, "--wizard", port, *DEVICE, "--x-distance", 1000, "--json"
-    )
+        "calibrate", "scene", "-o", out, "--wizard", port, *DEVICE, "--x-distance", 1000,
+        "--height", 10, "--json"
+    )  # fmt: skip
     wizard.until("Recorded: origin. Put it on the x axis, 1 m from the origin")
     wizard.until("Recorded: x axis")
     wizard.until("Move the device through the whole room")
@@ -62,7 +63,7 @@ def test_a_scene_from_a_port(port: Path, tmp_path: Path, process: Callable[..., 
     (entry,) = json.loads(wizard.stdout)["sessions"]
     roles = [rest["role"] for rest in entry["frame"]["standstills"]]
     assert roles[:4] == ["origin", "x axis", "floor", "floor"]
-    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    corners = [[0, 0, 0.01], [1, 0, 0.01], [1, 1, 0.01], [0, 1, 0.01]]
     for rest, corner in zip(entry["frame"]["standstills"], corners, strict=False):
         assert rest["position_m"] == pytest.approx(corner, abs=0.02)
     scene = read_scene(out)
@@ -102,8 +103,8 @@ def test_a_port_without_light(
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (("--marker", "a=0,0", "--marker", "b=1,0", "--marker", "c=0,1"), "leave out --marker"),
-        (("--origin", 1), "leave out --marker and numbers"),
+        (("--marker", "a=0,0", "--marker", "b=1,0", "--marker", "c=0,1"), "Give one of them"),
+        (("--origin", 1), "leave out their numbers"),
         (("run.txt",), "ends in '.txt'"),
     ],
 )
