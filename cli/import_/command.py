@@ -125,11 +125,11 @@ def command(
       crazyflie-config
                     stations of a Crazyflie (YAML): poses and calibrations; the
                     output is a scene (scene.toml) instead of a session
-      crazyflie-usd a Crazyflie's log from its micro SD card (log00): sweeps of the
-                    Lighthouse deck, IMU, and the Crazyflie's own estimate
-      crazyflie-csv log variables of a Crazyflie, of cfclient (one file a block) or
-                    of programs with cflib: IMU, the Crazyflie's own estimate, and
-                    sampled angles of stations, as far as they are logged
+      crazyflie-usd a Crazyflie's log from its micro SD card (log00): sweeps of
+                    the Lighthouse deck, IMU, and the Crazyflie's own estimate
+      crazyflie-csv log variables of a Crazyflie, of cfclient (one file a block)
+                    or of programs with cflib: IMU, the Crazyflie's own estimate,
+                    and sampled angles of stations, as far as they are logged
       images        camera frames of a dot sheet: files, folders or patterns, in
                     the order of the file names (frame2 before frame10)
       video         frames of one video file, with its times

@@ -499,6 +499,7 @@ def test_published_light(
     told = answer(locatk("import", "saleae", data / "lighthouse" / name, "-o", run, "--json"))
     assert set(told) == {
         *("version", "output", "format", "sweeps", "devices", "truth_poses", "stations"),
+        *("imu_samples", "onboard_poses"),
         "warnings",
     }
     assert [station["id"] for station in told["stations"]] == ids

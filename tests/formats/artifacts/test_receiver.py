@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -200,6 +201,6 @@ def test_recordings_of_a_deck_have_its_receiver(tmp_path: Path) -> None:
     assert observations.read_receivers(recorded(tmp_path / "2.mcap", "dotbot-gateway")) == {}
     given = observations.read_receivers(recorded(tmp_path / "3.mcap", "lighthouse-deck", WAND))
     assert same(given["robot"], WAND)
-    [(name, text)] = receivers.deck_artifacts(None).items()
+    [(name, text)] = receivers.deck_artifacts(SimpleNamespace(kind="lighthouse", sensors=4)).items()
     assert name == "receiver.toml"
     assert same(loads_receiver(text), DECK)

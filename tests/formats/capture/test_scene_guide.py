@@ -31,9 +31,12 @@ def follow(guide: SceneGuide, sweeps: Sweeps, until_s: float = 1e9) -> list[str]
     """Feed a guide as a recording does, and return what it told."""
     first_ns = int(sweeps.time_ns.min())
     messages = [
-        StampedMessage(topic, message, time_ns, time_ns)
-        for time_ns, topic, message in sweep_messages(sweeps, batch_ns=20_000_000)
+        StampedMessage(batch.topic, batch.message.FromString(payload), time_ns, time_ns)
+        for stream in sweep_messages(sweeps, batch_ns=20_000_000)
+        for batch in stream
+        for time_ns, payload in zip(batch.time_ns.tolist(), batch.payloads, strict=True)
     ]
+    messages.sort(key=lambda message: message.time_ns)
     lines: list[str] = []
     pending: Iterator[StampedMessage] = iter(messages)
     current = next(pending, None)
