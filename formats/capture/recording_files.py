@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import math
 import os
 import re
 import shutil
@@ -290,6 +291,7 @@ class LiveFile:
         self._allocated_end = 0
         self._reserved = RESERVED_BYTES
         self._can_allocate = sys.platform == "linux"
+        self._largest_size = _size_limit()
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
         """Append all of ``data``, or nothing of it.
@@ -321,7 +323,8 @@ class LiveFile:
         """Allocate ``more`` bytes beyond the present end, so that they can certainly be written.
 
         Up to :data:`RESERVED_BYTES` are allocated in addition, as many as the disk has. On file
-        systems without allocation this has no effect.
+        systems without allocation this has no effect, except that the limit of the process for the
+        size of a file is respected.
 
         Raises
         ------
@@ -329,6 +332,9 @@ class LiveFile:
             The disk is full; space allocated before remains available to finish the file.
         """
         wanted = self._size + more
+        # The system allocates space beyond this limit, and refuses to write there.
+        if wanted > self._largest_size:
+            raise DiskFullError(_describe_errno(errno.EFBIG), file=self.path)
         # tmpfs releases all unwritten space of a range whose allocation fails: begin behind it.
         start = max(self._size, self._allocated_end)
         while self._can_allocate and wanted + self._reserved // 2 > self._allocated_end:
@@ -385,6 +391,16 @@ class LiveFile:
         with contextlib.suppress(OSError):
             os.fsync(self._file.fileno())
         self._file.close()
+
+
+def _size_limit() -> float:
+    """Return the largest size of a file that this process may write (``ulimit -f``)."""
+    try:
+        import resource
+    except ImportError:
+        return math.inf
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else float(limit)
 
 
 def check_idle(path: Path) -> None:

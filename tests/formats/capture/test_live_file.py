@@ -250,7 +250,7 @@ def test_a_small_disk_gives_what_it_has(tmp_path: Path, taken: Taken) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_FSIZE of Linux")
 def test_a_disk_of_six_megabytes_is_used(tmp_path: Path) -> None:
-    """A limit of the file size, which needs no rights, refuses allocations like a full disk."""
+    """A limit of the file size, which needs no rights, is like a full disk."""
     import resource
 
     path = tmp_path / "run.mcap"
@@ -266,6 +266,23 @@ def test_a_disk_of_six_megabytes_is_used(tmp_path: Path) -> None:
     session = Session.open(path)
     assert session.metadata()["capture"]["ended"] == "full"
     assert 3 << 20 < path.stat().st_size <= 6 << 20
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_FSIZE of Linux")
+def test_no_room_is_promised_beyond_the_limit_of_the_file_size(tmp_path: Path) -> None:
+    """Linux allocates space beyond the limit, where it then refuses to write."""
+    import resource
+
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, old[1]))
+    try:
+        file = LiveFile(tmp_path / "run.mcap")
+        file.make_room(1 << 20)
+        with pytest.raises(DiskFullError):
+            file.make_room((1 << 20) + 1)
+        file.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
 
 
 def log_for_ever(made: RecordingFiles) -> None:
