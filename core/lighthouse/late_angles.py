@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from locatk.core.clock_line import ClockLine, fit_clock_line
 from locatk.core.lighthouse.channels import TICK_HZ, TICKS_PER_COUNT, period_ticks
-from locatk.core.lighthouse.plane_labels import FRAME_S, MAX_GROUP_GAP_TICKS, PULSE_HZ
+from locatk.core.lighthouse.plane_labels import FRAME_S, MAX_PULSE_GAP_TICKS, PULSE_HZ
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -26,7 +26,7 @@ IntArray = NDArray[np.int64]
 COUNT_S = TICKS_PER_COUNT / TICK_HZ
 """Duration of an LFSR step [s]."""
 
-GROUP_GAP_S = MAX_GROUP_GAP_TICKS / PULSE_HZ
+GROUP_GAP_S = MAX_PULSE_GAP_TICKS / PULSE_HZ
 """Time without light after which the next pulse completes a passage [s], and with it the angles."""
 
 MAX_DELAY_TURNS = 0.7

@@ -1,4 +1,4 @@
-"""Light plane, channel and count of pulses that a receiver reports without them.
+"""Light plane, channel and count of pulses of light from a receiver that does not report them.
 
 A Lighthouse deck reports the time of each pulse of light, for about two thirds of the pulses the
 channel of their station, and for one of them in each passage the *offset*: the time since the zero
@@ -11,11 +11,12 @@ the stations:
 2. **Planes.** Both planes of one rotation cross a device about a third of a rotation apart, the
    first plane first (:func:`label_planes`). If only one passage was received, the passages of
    neighbouring rotations determine its plane. If there are none, a single passage may be of either
-   plane: angle alone decides only near the station's forward axis.
+   plane: its angle decides only within 70 degrees of the station's forward axis.
 3. **Unknown channels.** A pulse has the channel and the plane of the passage in which it was
    received. It is rejected if it contradicts the path of its photodiode in the neighbouring
-   rotations. A pulse outside of any passage is accepted if exactly one station and plane agree
-   with that path. Pulses that remain ambiguous are counted, and not guessed.
+   rotations, or agrees with another station and plane as well. A pulse outside of any passage is
+   accepted if exactly one station and plane agree with that path. Pulses that remain ambiguous are
+   counted, and not guessed.
 
 The grouping of pulses follows crazyflie-firmware, ``pulse_processor_v2.c``, which needs all four
 photodiodes and both planes of a rotation; rotor phases replace this requirement.
@@ -37,13 +38,14 @@ IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 PULSE_HZ = 24_000_000
-"""Counter of a Lighthouse deck (bitcraze/lighthouse-fpga, readme)."""
+"""Frequency of the counter of a Lighthouse deck, half of that of a station's periods
+(bitcraze/lighthouse-fpga, readme)."""
 
 FRAME_S = 12 * 10 / 230_400
 """Duration of a frame of the deck on the serial port [s]: the shortest time from a pulse to its
-reception (lighthouse-fpga, readme: 12 bytes at 230,400 baud)."""
+arrival at the host (lighthouse-fpga, readme: 12 bytes at 230,400 baud)."""
 
-MAX_GROUP_GAP_TICKS = 10_000
+MAX_PULSE_GAP_TICKS = 10_000
 """Longest time between two pulses of one passage, in ticks of 24 MHz
 (crazyflie-firmware ``pulse_processor_v2.c``)."""
 
@@ -65,8 +67,8 @@ MIN_ZEROS = 3
 """Zeros that must agree in an interval. Three wrong ones do so by chance in 4e-8 of the cases."""
 
 MIN_AGREEING_FRACTION = 0.8
-"""Fraction of the zeros of an interval that must agree. Of two stations on one channel, neither
-reaches it."""
+"""Fraction of the zeros of an interval that must agree. Of two stations that are received about as
+often on one channel, neither reaches it."""
 
 MAX_EXTRAPOLATION_S = 1.0
 """Longest time from an averaged phase to a pulse [s]."""
@@ -77,7 +79,7 @@ MAX_PASSAGE_GAP_TURNS = MIN_PLANE_DELAY_TURNS / 2
 """Longest gap between sweeps of one passage [rotations], for devices of any size: half of the
 shortest delay between the planes."""
 
-MAX_HISTORY_ROTATIONS = 12
+MAX_NEIGHBOUR_ROTATIONS = 12
 """Largest distance of neighbouring rotations that determine the plane of a single passage: 0.25 s.
 A device at 1 m that flies 2 m/s moves by 0.08 rotations in this time."""
 
@@ -102,9 +104,9 @@ PREDICTION_TOLERANCE_RAD = 1e-3
 
 LIKELY_ACCELERATION_RAD_S2 = 10.0
 MAX_ACCELERATION_RAD_S2 = 50.0
-"""Angular acceleration seen from a station: likely (10 m/s^2 at 1 m), and at most (two g at 0.4 m).
-A pulse that only its angle assigns to a station must agree within the likely one, which noise does
-by chance in 1e-3 of the cases for each plane."""
+"""Angular acceleration seen from a station: likely (10 m/s^2 at 1 m), and at most (20 m/s^2 at
+0.4 m). A pulse that only its angle assigns to a station must agree within the likely one, which a
+stray pulse does by chance in 1e-3 of the cases for each plane and neighbours a rotation away."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,7 @@ def track_rotor(tick: IntArray, offset: IntArray, period: float) -> RotorTrack |
     time = tick[order].astype(float)
     zero = time - offset[order]
     rate = 0.0
-    # The rate over one rotation is rough and unique; over 0.5 s it is fine, and unique given that.
+    # Over one rotation the rate is coarse but unambiguous; it resolves the finer one over 0.5 s.
     for lag, max_rate in ((0.9 * period, MAX_PERIOD_ERROR), (0.5 * PULSE_HZ, 1e-5)):
         later = np.searchsorted(time, time + lag)
         has_later = later < len(time)
@@ -208,7 +210,7 @@ def _wrap(difference: Array, period: float) -> Array:
 
 
 def label_planes(rotation: IntArray, phase: Array) -> IntArray:
-    """Assign the sweeps of one station over one device to its two light planes.
+    """Assign the sweeps of one station over one device to its two light planes, by rotation.
 
     Parameters
     ----------
@@ -248,7 +250,7 @@ def assign_planes(time_ns: IntArray, channel: NDArray[np.int32], count: Array) -
     Parameters
     ----------
     time_ns : (n,) int64 ndarray
-        Times of the light, to a quarter of a rotation.
+        Times of the light, accurate to better than a quarter of a rotation.
     channel : (n,) int ndarray
         1 to 16.
     count : (n,) ndarray
@@ -288,7 +290,7 @@ def _label_passages(rotation: IntArray, phase: Array) -> IntArray:
     plane[first], plane[first + 1] = 0, 1
 
     rest = np.flatnonzero(plane == UNKNOWN)
-    expected = _interpolate(rotation[first], pairs, rotation[rest], MAX_HISTORY_ROTATIONS)
+    expected = _interpolate(rotation[first], pairs, rotation[rest], MAX_NEIGHBOUR_ROTATIONS)
     distance = np.abs(phase[rest, None] - expected)
     tolerance = (expected[:, 1] - expected[:, 0]) / 4
     nearest = np.argmin(np.where(np.isnan(distance), np.inf, distance), axis=1)
@@ -318,7 +320,7 @@ def _agree_with_neighbours(rotation: IntArray, values: Array) -> Mask:
     rows = np.clip(rows, 0, max(n - 1, 0))
     if not n:
         return np.zeros(0, bool)
-    is_row &= np.abs(rotation[rows] - rotation[:, None]) <= MAX_HISTORY_ROTATIONS
+    is_row &= np.abs(rotation[rows] - rotation[:, None]) <= MAX_NEIGHBOUR_ROTATIONS
     neighbours = np.where(is_row[:, :, None], values[rows], np.nan)
     deviation = np.abs(values - np.nanmedian(neighbours, axis=1))
     return np.asarray(np.all(deviation <= MAX_PATH_DEVIATION_TURNS, axis=1))
@@ -404,8 +406,8 @@ def label_pulses(
     """
     order = np.argsort(tick, kind="stable")
     pulses = _Pulses(tick[order], sensor[order], channel[order], offset[order])
-    pulses.locate_known()
-    pulses.assign_unknown()
+    pulses.label_known_channels()
+    pulses.label_unknown_channels()
     row = np.flatnonzero(pulses.reason < 0)
     result = np.argsort(order[row])
     row = row[result]
@@ -438,7 +440,7 @@ class _Pulses:
         self.reason = np.full(n, _REASONS.index(CHANNEL_UNKNOWN))
         self.rotors: dict[int, RotorTrack] = {}
 
-    def locate_known(self) -> None:
+    def label_known_channels(self) -> None:
         """Find the rotors, and the angle and plane of all pulses of a known channel."""
         for channel in np.unique(self.channel[self.channel != UNKNOWN]).tolist():
             rows = np.flatnonzero(self.channel == channel)
@@ -450,7 +452,7 @@ class _Pulses:
                 self.reason[rows] = _REASONS.index(ROTOR_UNKNOWN)
                 continue
             self.rotors[channel] = rotor
-            rotation, phase = self._rotor_angles(rotor, rows)
+            rotation, phase = self._compute_rotor_angles(rotor, rows)
             error = np.abs(_wrap(phase * period - offset, period))
             is_wrong = (offset > 0) & ((error > MAX_ZERO_ERROR_TICKS) | (offset >= period))
             is_tracked = ~np.isnan(phase)
@@ -458,15 +460,15 @@ class _Pulses:
             self.reason[rows[is_tracked & is_wrong]] = _REASONS.index(OFFSET_CONTRADICTED)
             is_usable = is_tracked & ~is_wrong
             rows, rotation, phase = rows[is_usable], rotation[is_usable], phase[is_usable]
-            self._accept(rows, channel, label_planes(rotation, phase), rotation, phase)
+            self._set_labels(rows, channel, label_planes(rotation, phase), rotation, phase)
 
-    def _rotor_angles(self, rotor: RotorTrack, rows: IntArray) -> tuple[IntArray, Array]:
+    def _compute_rotor_angles(self, rotor: RotorTrack, rows: IntArray) -> tuple[IntArray, Array]:
         """Return number and fraction of the rotation of pulses; the fraction may be ``nan``."""
         turns = (self.tick[rows] - rotor.phase_at(self.tick[rows])) / rotor.period
         rotation = np.floor(turns)
         return np.nan_to_num(rotation).astype(np.int64), turns - rotation
 
-    def _accept(
+    def _set_labels(
         self, rows: IntArray, channel: int, plane: IntArray, rotation: IntArray, phase: Array
     ) -> None:
         """Set the labels of pulses; one without a plane is rejected."""
@@ -474,47 +476,51 @@ class _Pulses:
         self.rotation[rows], self.phase[rows] = rotation, phase
         self.reason[rows] = np.where(plane == UNKNOWN, _REASONS.index(PLANE_AMBIGUOUS), -1)
 
-    def assign_unknown(self) -> None:
+    def label_unknown_channels(self) -> None:
         """Assign pulses of unknown channel to the only station and plane that they agree with."""
         rest = np.flatnonzero(self.channel == UNKNOWN)
-        inherited = self._passage_labels()[rest]
+        passage_label = self._find_passage_labels()[rest]
         matches = np.zeros(len(rest), np.int64)
         found: list[tuple[IntArray, int, int, IntArray, Array]] = []
         for channel, rotor in self.rotors.items():
-            rotation, phase = self._rotor_angles(rotor, rest)
+            rotation, phase = self._compute_rotor_angles(rotor, rest)
             for plane in (0, 1):
-                is_heir = inherited == 2 * channel + plane
+                is_in_passage = passage_label == 2 * channel + plane
                 acceleration = np.where(
-                    is_heir, MAX_ACCELERATION_RAD_S2, LIKELY_ACCELERATION_RAD_S2
+                    is_in_passage, MAX_ACCELERATION_RAD_S2, LIKELY_ACCELERATION_RAD_S2
                 )
                 for sensor in np.unique(self.sensor[rest]).tolist():
-                    is_mine = (self.sensor[rest] == sensor) & ~np.isnan(phase)
-                    path = self._path(channel, plane, sensor)
-                    is_mine &= ~np.isin(rotation, self.rotation[path])
-                    # A photodiode that is always hit first is never identified: its neighbours
-                    # are heirs, too.
-                    heirs = np.flatnonzero(is_mine & is_heir)
-                    mine = np.flatnonzero(is_mine)
-                    error, limit = _path_errors(
-                        np.concatenate([self.rotation[path], rotation[heirs]]),
-                        np.concatenate([self.phase[path], phase[heirs]]),
-                        rotation[mine],
-                        phase[mine],
-                        acceleration[mine],
+                    is_candidate = (self.sensor[rest] == sensor) & ~np.isnan(phase)
+                    path = self._find_path(channel, plane, sensor)
+                    is_candidate &= ~np.isin(rotation, self.rotation[path])
+                    # A photodiode that is always hit first is never identified: its path is that
+                    # of pulses of unknown channel in known passages.
+                    companions = np.flatnonzero(is_candidate & is_in_passage)
+                    candidates = np.flatnonzero(is_candidate)
+                    error, limit = _compute_path_errors(
+                        np.concatenate([self.rotation[path], rotation[companions]]),
+                        np.concatenate([self.phase[path], phase[companions]]),
+                        rotation[candidates],
+                        phase[candidates],
+                        acceleration[candidates],
                         rotor.period,
                     )
-                    chosen = mine[error <= limit]
+                    # Of several pulses in one rotation, the nearest to the path is its sweep.
+                    ranked = np.argsort(error, kind="stable")
+                    ranked = ranked[(error <= limit)[ranked]]
+                    _, nearest = np.unique(rotation[candidates[ranked]], return_index=True)
+                    chosen = candidates[np.sort(ranked[nearest])]
                     matches[chosen] += 1
                     found.append((chosen, channel, plane, rotation[chosen], phase[chosen]))
         for chosen, channel, plane, rotation, phase in found:
             is_unique = matches[chosen] == 1
             rows = rest[chosen[is_unique]]
             planes = np.full(len(rows), plane)
-            self._accept(rows, channel, planes, rotation[is_unique], phase[is_unique])
+            self._set_labels(rows, channel, planes, rotation[is_unique], phase[is_unique])
 
-    def _passage_labels(self) -> IntArray:
+    def _find_passage_labels(self) -> IntArray:
         """Return twice the channel plus the plane of the passage of each pulse, -1 if unclear."""
-        group = np.cumsum(np.diff(self.tick, prepend=self.tick[:1]) > MAX_GROUP_GAP_TICKS)
+        group = np.cumsum(np.diff(self.tick, prepend=self.tick[:1]) > MAX_PULSE_GAP_TICKS)
         known = np.flatnonzero(self.reason < 0)
         label = 2 * self.channel[known] + self.plane[known]
         lowest = np.full(len(group), np.iinfo(np.int64).max)
@@ -523,13 +529,13 @@ class _Pulses:
         np.maximum.at(highest, group[known], label)
         return np.where(lowest == highest, lowest, UNKNOWN)[group]
 
-    def _path(self, channel: int, plane: int, sensor: int) -> IntArray:
+    def _find_path(self, channel: int, plane: int, sensor: int) -> IntArray:
         """Return the accepted pulses of one photodiode and plane, ascending."""
         is_member = (self.channel == channel) & (self.plane == plane) & (self.sensor == sensor)
         return np.flatnonzero(is_member & (self.reason < 0))
 
 
-def _path_errors(
+def _compute_path_errors(
     known: IntArray,
     known_phase: Array,
     rotation: IntArray,

@@ -4,7 +4,7 @@ A DotBot computes an image point from the two counts of a station and maps it to
 floor by a homography. The file holds one homography for each station, in the order of the channels
 from channel 1::
 
-    u8 number of homographies, then for each nine int32 (little endian), row by row, times 1000
+    u8 number of homographies, then for each nine int32 (little endian), row by row
 
 ``dotbot-calibration`` writes it, swarmit and PyDotBot send it to the robots. Sources:
 github.com/DotBots/dotbot-lh2-calibration ``lighthouse2.py``, DotBot-libs ``bsp/nrf/lh2_default.c``
@@ -20,7 +20,7 @@ squares of the error in millimetres.)
 division. It is chosen so that the largest entry fills the int32. With the usual factor, for which
 the last entry is 1, rounding to 0.001 costs up to 0.1 % of a coordinate.
 
-**Floor.** x to the right and y to the viewer, seen from above, in millimetres: the reference points
+**Floor.** x to the right and y downwards in a view from above, in millimetres: the reference points
 of ``dotbot-calibration`` are top left, top right, bottom left and bottom right, with y increasing
 downwards, and the robots steer in these axes (DotBot-libs ``drv/control_loop/control_loop.c``:
 clockwise is positive). In the frame of a scene (z up), y is negated. Robots discard negative
@@ -52,7 +52,7 @@ Array = NDArray[np.float64]
 MILLIMETRES_PER_METRE = 1000
 
 INTEGER_SCALE = 1000
-"""Factor of the integers in the file."""
+"""Integer of 1 in homographies whose last entry is 1."""
 
 MAX_INTEGER = 2**31 - 1
 
@@ -61,7 +61,7 @@ FIRMWARE_PERIOD_TICKS = {14: 901_900}
 
 UNCERTAIN_CHANNELS = (4, 14)
 """Channels whose period is wrong in some versions of the firmware: 951,000 instead of 949,000 ticks
-in 2025, and 901,900 instead of 901,000."""
+in 2025 (channel 4), and 901,900 instead of 901,000 (channel 14)."""
 
 MARGIN_M = 0.05
 """Margin of the floor around poses and markers, the radius of a robot."""
@@ -70,6 +70,9 @@ CELL_M = 0.1
 MIN_CELL_POSES = 3
 """Size of the cells of the floor, and number of poses in a cell on which robots drive. Fewer are
 outliers, or of a robot that is carried: a driving one has about three (0.3 m/s, 10 Hz)."""
+
+MIN_HOMOGRAPHY_POINTS = 4
+"""Fewest points that determine a homography."""
 
 MAX_FLOOR_RELIEF_M = 0.05
 """Largest difference of height of poses that are on one floor."""
@@ -100,7 +103,7 @@ class FloorHomography:
     ----------
     channel : int
     matrix : (3, 3) int64 ndarray
-        From the firmware's image points to millimetres on its floor, as in the file.
+        From the firmware's image points to millimetres in the robots' frame, as in the file.
     visible_fraction : float
         Part of the floor that the station sees.
     rms_mm, max_mm : float
@@ -172,13 +175,13 @@ def build_calibration(
     if fault := describe_frame_fault(scene):
         raise InputError(fault, hint=LEVEL_FRAME_HINT)
     positions = [t.position for t in trajectories if t.frame == scene.frame]
-    points = _known_points(positions, [marker.position for marker in scene.markers])
-    floor_z = scene.floor_z if scene.planar else _floor_height(points)
+    points = _collect_floor_points(positions, [marker.position for marker in scene.markers])
+    floor_z = scene.floor_z if scene.planar else _estimate_floor_height(points)
     if area_mm is not None:
         area = np.array(area_mm, float)
         origin = area[[0, 3]]
     else:
-        area = _area_around(points)
+        area = _bound_area(points)
         origin = _choose_origin(area)
     x, y = (
         np.linspace(area[k], area[k + 2], GRID_POINTS_PER_AXIS) / MILLIMETRES_PER_METRE
@@ -199,7 +202,7 @@ def build_calibration(
 
 
 def dumps_calibration(calibration: DotBotCalibration) -> bytes:
-    """Return the content of the file."""
+    """Return the content of ``calibration.out``."""
     by_channel = {station.channel: station.matrix for station in calibration.stations}
     number = max(by_channel)
     matrices = [by_channel.get(channel, UNKNOWN_STATION) for channel in range(1, number + 1)]
@@ -209,7 +212,7 @@ def dumps_calibration(calibration: DotBotCalibration) -> bytes:
 def write_calibration(
     path: str | os.PathLike[str], calibration: DotBotCalibration, *, overwrite: bool = False
 ) -> None:
-    """Write the file.
+    """Write ``calibration.out``.
 
     Raises
     ------
@@ -223,7 +226,7 @@ def write_calibration(
 # ---- the floor
 
 
-def _known_points(trajectories: Sequence[Array], markers: Sequence[Array]) -> Array:
+def _collect_floor_points(trajectories: Sequence[Array], markers: Sequence[Array]) -> Array:
     """Return the markers and the poses (n, 3) on which robots drive, in metres."""
     poses = np.concatenate([np.zeros((0, 3)), *trajectories])
     poses = poses[np.isfinite(poses).all(axis=1)]
@@ -237,7 +240,7 @@ def _known_points(trajectories: Sequence[Array], markers: Sequence[Array]) -> Ar
     return np.concatenate([poses, np.reshape(np.array(markers, float), (-1, 3))])
 
 
-def _floor_height(points: Array) -> float:
+def _estimate_floor_height(points: Array) -> float:
     """Return the common height of the points in a scene that is not planar."""
     if not len(points):
         raise InputError(
@@ -254,7 +257,8 @@ def _floor_height(points: Array) -> float:
     return float(np.mean(points[:, 2]))
 
 
-def _area_around(points: Array) -> Array:
+def _bound_area(points: Array) -> Array:
+    """Return the area (4,) in millimetres of points (n, 3) with a margin."""
     if not len(points):
         raise InputError(
             "the floor on which the robots drive is unknown: no poses and no markers",
@@ -276,7 +280,8 @@ def _is_near_hull(floor: Array, points: Array) -> NDArray[np.bool_]:
 def _choose_origin(area_mm: Array) -> Array:
     """Return an origin (2,) from which the area has positive coordinates.
 
-    It is that of the scene if possible, and a corner of the area otherwise.
+    Along each axis it is that of the scene if possible, and otherwise the border of the area,
+    rounded outwards.
     """
     return np.array(
         [
@@ -319,7 +324,7 @@ def _fit_station(station: Station, floor_m: Array, origin_mm: Array) -> FloorHom
     is_visible = np.abs(np.arctan2(local[:, 1], local[:, 0])) < MAX_AZIMUTH_RAD
     is_visible &= np.abs(np.arctan2(local[:, 2], np.hypot(*local[:, :2].T))) < MAX_ELEVATION_RAD
     fraction = float(np.mean(is_visible))
-    if fraction < MIN_VISIBLE_FRACTION:
+    if fraction < MIN_VISIBLE_FRACTION or np.count_nonzero(is_visible) < MIN_HOMOGRAPHY_POINTS:
         return None
     floor_m, local = floor_m[is_visible], local[is_visible]
     if station.floor_map is not None:

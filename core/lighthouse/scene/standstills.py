@@ -31,7 +31,7 @@ MIN_STANDSTILL_S = 1.5
 """Shortest standstill [s]. Robots that turn or brake rest for less."""
 
 MAX_SPREAD_SIGMAS = 8.0
-"""Largest spread of the angles of a rest, in standard deviations of the angle of a window, beyond
+"""Largest spread of the angles of a rest, in standard deviations of the angle of a window, added to
 :data:`~locatk.core.lighthouse.scene.keyframes.STANDSTILL_ANGLE_RAD`: the range of the medians of a
 minute of Gaussian noise is 7 of them."""
 
@@ -43,10 +43,10 @@ MAX_MOVING_FRACTION = 0.25
 received by reflection at times. Of one station both planes must be constant."""
 
 ANCHOR_WINDOWS = 8
-"""Windows at the beginning of a rest whose median is its position. More would cost time."""
+"""Windows at the beginning of a rest whose median angles stand for it. More would cost time."""
 
 MAX_WRONG_WINDOWS = 2
-"""Largest number of windows with other angles within a rest: a person passes by."""
+"""Largest number of windows with other angles within a rest, for example when a person passes."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Standstill:
     ----------
     device : str
     start_ns, end_ns : int
-        Nanoseconds since the epoch, within the rest.
+        Unix times in nanoseconds, within the rest.
     channels : tuple of int
         Stations that it received.
     """
@@ -82,30 +82,34 @@ def find_standstills(
     ----------
     sweeps : Sweeps
     min_duration_s : float
-        Shorter ones are left out.
+        Shorter ones are left out, to one window (:data:`MIN_WINDOW_S`).
 
     Returns
     -------
     list of Standstill
-        An interruption of the light at rest does not divide it.
+        Gaps without light do not split a standstill.
     """
     epochs = group_epochs(sweeps)
     angles = rotor_angles(epochs).reshape(len(epochs), 2 * len(epochs.channels))
     standstills: list[Standstill] = []
     for device in sweeps.devices:
-        photodiodes = [k for k, name in enumerate(epochs.devices) if _device_of(name) == device]
+        own = [device] if device in epochs.devices else []
+        names = own or [name for name in epochs.devices if _parse_device(name) == device]
+        photodiodes = [epochs.devices.index(name) for name in names]
         if photodiodes:
-            standstills += _device_standstills(device, epochs, angles, photodiodes, min_duration_s)
+            standstills += _find_device_standstills(
+                device, epochs, angles, photodiodes, min_duration_s
+            )
     return sorted(standstills, key=lambda each: each.start_ns)
 
 
-def _device_of(photodiode: str) -> str:
-    """Return the device of a photodiode's name, as in ``device/0``."""
+def _parse_device(photodiode: str) -> str:
+    """Return the device in the name of a photodiode, as in ``device/0``."""
     device, separator, number = photodiode.rpartition("/")
     return device if separator and number.isdigit() else photodiode
 
 
-def _device_standstills(
+def _find_device_standstills(
     device: str,
     epochs: Epochs,
     angles: Array,
@@ -121,10 +125,12 @@ def _device_standstills(
     window_ns = round(max(MIN_WINDOW_S * NANOSECONDS_PER_S, EPOCHS_PER_WINDOW * epoch_ns))
     first_ns = int(epochs.time_ns[rows].min())
     window = (epochs.time_ns[rows] - first_ns) // window_ns
-    windows, medians = _window_medians(window, epochs.device[rows], angles[rows], photodiodes)
+    windows, medians = _compute_window_medians(
+        window, epochs.device[rows], angles[rows], photodiodes
+    )
     if len(windows) == 0:
         return []
-    max_spread_rad = _max_spread(window, epochs.device[rows], angles[rows])
+    max_spread_rad = _compute_max_spread(window, epochs.device[rows], angles[rows])
     standstills = []
     rests = _split_rests(medians, max_spread_rad)
     for first, last in _join_rests(medians, rests, max_spread_rad):
@@ -140,7 +146,7 @@ def _device_standstills(
     return standstills
 
 
-def _window_medians(
+def _compute_window_medians(
     window: NDArray[np.int64], device: NDArray[np.int64], angles: Array, photodiodes: Sequence[int]
 ) -> tuple[NDArray[np.int64], Array]:
     """Return the windows with data, ascending, and the median angles (w, photodiodes x planes)."""
@@ -161,8 +167,13 @@ def _window_medians(
     return windows[is_received], medians[is_received]
 
 
-def _max_spread(window: NDArray[np.int64], device: NDArray[np.int64], angles: Array) -> float:
-    """Return the largest spread of the medians of a rest, from the noise of the angles."""
+def _compute_max_spread(
+    window: NDArray[np.int64], device: NDArray[np.int64], angles: Array
+) -> float:
+    """Return the largest spread of the medians of a rest, from the noise of the angles.
+
+    The rows are sorted by photodiode, then by time.
+    """
     is_neighbour = (np.diff(window) == 0) & (np.diff(device) == 0)
     steps = np.abs(np.diff(angles, axis=0)[is_neighbour])
     steps = steps[np.isfinite(steps)]
@@ -171,16 +182,18 @@ def _max_spread(window: NDArray[np.int64], device: NDArray[np.int64], angles: Ar
     # The lower quartile of the steps is of rests if the device rests for a quarter of the time;
     # that of Gaussian steps is 0.45 standard deviations of an angle.
     sigma_rad = float(np.quantile(steps, 0.25)) / 0.4506
-    number = max(MIN_EPOCHS_PER_WINDOW, len(window) / len(np.unique(np.c_[window, device], axis=0)))
-    spread_rad = STANDSTILL_ANGLE_RAD + MAX_SPREAD_SIGMAS * sigma_rad / np.sqrt(number)
+    epochs_per_window = max(
+        MIN_EPOCHS_PER_WINDOW, len(window) / len(np.unique(np.c_[window, device], axis=0))
+    )
+    spread_rad = STANDSTILL_ANGLE_RAD + MAX_SPREAD_SIGMAS * sigma_rad / np.sqrt(epochs_per_window)
     return float(min(spread_rad, MAX_STANDSTILL_ANGLE_RAD))
 
 
 def _split_rests(medians: Array, max_spread_rad: float) -> list[tuple[int, int]]:
-    """Return the first and last rows of the longest runs of windows with constant angles.
+    """Return the first and last rows of runs of windows with constant angles.
 
-    The angles are compared with those of the beginning of their run, so that a slow motion is none.
-    Windows without data do not end a run.
+    The angles are compared with those of the beginning of their run, so that slow motion is not
+    taken for rest. Windows without data do not end a run.
     """
     rests: list[tuple[int, int]] = []
     start, anchor = 0, medians[0]
@@ -189,7 +202,7 @@ def _split_rests(medians: Array, max_spread_rad: float) -> list[tuple[int, int]]
             deviation = np.abs(medians[row] - anchor)
             if _is_still(deviation[np.isfinite(deviation)], 0.5 * max_spread_rad):
                 if row - start < ANCHOR_WINDOWS:
-                    anchor = _column_medians(medians[start : row + 1])
+                    anchor = _compute_column_medians(medians[start : row + 1])
                 continue
         if row - 1 > start:
             rests.append((start, row - 1))
@@ -213,8 +226,8 @@ def _join_rests(
     joined: list[tuple[int, int]] = []
     for first, last in rests:
         if joined and 0 < first - joined[-1][1] - 1 <= MAX_WRONG_WINDOWS:
-            before = _column_medians(medians[joined[-1][0] : joined[-1][1] + 1])
-            change = np.abs(_column_medians(medians[first : last + 1]) - before)
+            before = _compute_column_medians(medians[joined[-1][0] : joined[-1][1] + 1])
+            change = np.abs(_compute_column_medians(medians[first : last + 1]) - before)
             if _is_still(change[np.isfinite(change)], 0.5 * max_spread_rad):
                 joined[-1] = (joined[-1][0], last)
                 continue
@@ -222,7 +235,7 @@ def _join_rests(
     return joined
 
 
-def _column_medians(medians: Array) -> Array:
+def _compute_column_medians(medians: Array) -> Array:
     """Return the median of each column, ``nan`` if it has no value."""
     result = np.full(medians.shape[1], np.nan)
     is_known = np.isfinite(medians).any(axis=0)
