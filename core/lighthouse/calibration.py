@@ -40,7 +40,7 @@ cosines here.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,18 @@ PARAMETERS = ("phase", "tilt", "curve", "gibmag", "gibphase", "ogeemag", "ogeeph
 magnitude of gib in radians, those of curve and ogee without unit."""
 
 PHASE, TILT, CURVE, GIBMAG, GIBPHASE, OGEEMAG, OGEEPHASE = range(7)
+
+LINEAR_PARAMETERS = (
+    "phase",
+    "tilt",
+    "curve",
+    "gibmag cos gibphase",
+    "gibmag sin gibphase",
+    "ogeemag cos ogeephase",
+    "ogeemag sin ogeephase",
+)
+"""Parameters of a sweep with the waves as phasors: angles are smooth functions of these, also if a
+magnitude is zero. :meth:`Calibration.linear_parameters` returns them."""
 
 MODELS = ("libsurvive", "crazyflie")
 
@@ -86,6 +98,22 @@ class Calibration:
     def tilts(self) -> Array:
         """Tilts (2,) of the planes in radians, nominal plus factory tilt."""
         return PLANE_TILT_RAD + self.sweeps[:, TILT]
+
+    def linear_parameters(self) -> Array:
+        """Return the parameters (2, 7) with phasors, as :data:`LINEAR_PARAMETERS`."""
+        parameters = self.sweeps.copy()
+        for magnitude, phase in ((GIBMAG, GIBPHASE), (OGEEMAG, OGEEPHASE)):
+            wave = self.sweeps[:, magnitude] * np.exp(1j * self.sweeps[:, phase])
+            parameters[:, magnitude], parameters[:, phase] = wave.real, wave.imag
+        return parameters
+
+    def with_linear_parameters(self, parameters: Array) -> Calibration:
+        """Return the calibration with other :data:`LINEAR_PARAMETERS` (2, 7)."""
+        sweeps = parameters.copy()
+        for magnitude, phase in ((GIBMAG, GIBPHASE), (OGEEMAG, OGEEPHASE)):
+            wave = parameters[:, magnitude] + 1j * parameters[:, phase]
+            sweeps[:, magnitude], sweeps[:, phase] = np.abs(wave), np.angle(wave)
+        return replace(self, sweeps=sweeps)
 
     @property
     def is_generic(self) -> bool:
@@ -155,6 +183,36 @@ def predict_with_gradient(points: Array, calibration: Calibration) -> tuple[Arra
     return model.angles, by_point, by_tilt
 
 
+def predict_sweeps(
+    points: Array, plane: NDArray[np.int64], calibration: Calibration
+) -> tuple[Array, Array, Array]:
+    """Predict the rotor angles of single sweeps, with derivatives by all parameters.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+        In the station's axes, in any unit of length.
+    plane : (n,) int ndarray
+        0 or 1.
+    calibration : Calibration
+
+    Returns
+    -------
+    angle : (n,) ndarray
+        Radians; ``nan`` for points that the plane does not cross.
+    by_point : (n, 3) ndarray
+        Derivative by the point.
+    by_parameters : (n, 7) ndarray
+        Derivative by :data:`LINEAR_PARAMETERS` of the plane.
+    """
+    angles, by_point, by_tilt = predict_with_gradient(points, calibration)
+    rows = np.arange(len(points))
+    x, y, z = (points[:, None, i] for i in range(3))
+    model = _ForwardModel(np.arctan2(y, x), z / np.hypot(x, y), calibration)
+    by_parameters = model.by_linear_parameters(by_tilt)
+    return angles[rows, plane], by_point[rows, plane], by_parameters[rows, plane]
+
+
 class _ForwardModel:
     """Eq. 1 to 6 of the module for directions, evaluated once for angles and derivatives.
 
@@ -176,7 +234,7 @@ class _ForwardModel:
     """
 
     def __init__(self, azimuth: Array, slope: Array, calibration: Calibration) -> None:
-        self.parameters, self.slope = calibration.sweeps, slope
+        self.parameters, self.azimuth, self.slope = calibration.sweeps, azimuth, slope
         parameters, tilt = calibration.sweeps, calibration.tilts
         self.tan_tilt, self.cos_tilt, self.sin_tilt = np.tan(tilt), np.cos(tilt), np.sin(tilt)
         self.is_crazyflie = calibration.model == "crazyflie"
@@ -224,6 +282,27 @@ class _ForwardModel:
         if self.is_crazyflie:
             return by_azimuth - d_gib, by_slope, by_tilt
         return by_azimuth * (1.0 - d_gib), by_slope * (1.0 - d_gib), by_tilt * (1.0 - d_gib)
+
+    def by_linear_parameters(self, by_tilt: Array) -> Array:
+        """Return the derivatives (..., 2, 7) by :data:`LINEAR_PARAMETERS`, given those by tilt."""
+        gib_base = self.gib_angle - self.parameters[:, GIBPHASE]
+        by_crossing = np.ones_like(gib_base)
+        if not self.is_crazyflie:
+            by_crossing = 1.0 - self.parameters[:, GIBMAG] * np.sin(self.gib_angle)
+        derivatives = np.zeros((*self.angles.shape, len(LINEAR_PARAMETERS)))
+        derivatives[..., PHASE], derivatives[..., TILT] = -1.0, by_tilt
+        derivatives[..., GIBMAG] = np.cos(gib_base)
+        derivatives[..., GIBPHASE] = -np.sin(gib_base)
+        if not self.is_crazyflie:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                self._curve(self.azimuth)
+                d_curved_offset = 1.0 / np.sqrt(1.0 - self.sin_curved_offset**2)
+                by_curve = -self.lens * self.cos_tilt / self.denominator**2 * d_curved_offset
+            ogee_base = self.ogee_angle - self.parameters[:, OGEEPHASE]
+            derivatives[..., CURVE] = by_curve * by_crossing
+            derivatives[..., OGEEMAG] = derivatives[..., CURVE] * np.cos(ogee_base)
+            derivatives[..., OGEEPHASE] = -derivatives[..., CURVE] * np.sin(ogee_base)
+        return derivatives
 
     def _curved_gradient(self, d_offset: Array, d_tan_tilt: Array) -> tuple[Array, Array, Array]:
         """Return the derivatives of the crossing (Eq. 5) of curved planes."""
@@ -370,19 +449,6 @@ units are those of the recordings in jdavidberger/libsurvive-extras-data (MIT), 
 were published by Bitcraze."""
 
 
-def _mean(units: Array) -> Array:
-    """Return the mean calibration (2, 7); waves are averaged as phasors."""
-    sweeps = np.zeros((2, 7))
-    sweeps[1, PHASE] = units[:, 0].mean()
-    sweeps[:, TILT] = units[:, 1:3].mean(axis=0)
-    sweeps[:, CURVE] = units[:, 3:5].mean(axis=0)
-    for magnitude, phase, column in ((GIBMAG, GIBPHASE, 5), (OGEEMAG, OGEEPHASE, 9)):
-        phasors = units[:, column : column + 2] * np.exp(1j * units[:, column + 2 : column + 4])
-        mean = phasors.mean(axis=0)
-        sweeps[:, magnitude], sweeps[:, phase] = np.abs(mean), np.angle(mean)
-    return sweeps
-
-
 def _phase_tilt_sigma(units: Array) -> Array:
     """Return the standard deviation (2, 2) over units: a row per sweep, columns phase, tilt."""
     sigma = np.zeros((2, 2))
@@ -391,7 +457,23 @@ def _phase_tilt_sigma(units: Array) -> Array:
     return sigma
 
 
-GENERIC_CALIBRATION = Calibration(_mean(FACTORY_UNITS), "generic")
+def _linear_parameters(units: Array) -> Array:
+    """Return the parameters (n, 2, 7) of units as :data:`LINEAR_PARAMETERS`."""
+    parameters = np.zeros((len(units), 2, 7))
+    parameters[:, 1, PHASE] = units[:, 0]
+    parameters[:, :, TILT], parameters[:, :, CURVE] = units[:, 1:3], units[:, 3:5]
+    for magnitude, phase, column in ((GIBMAG, GIBPHASE, 5), (OGEEMAG, OGEEPHASE, 9)):
+        wave = units[:, column : column + 2] * np.exp(1j * units[:, column + 2 : column + 4])
+        parameters[:, :, magnitude], parameters[:, :, phase] = wave.real, wave.imag
+    return parameters
+
+
+FACTORY_LINEAR_PARAMETERS = _linear_parameters(FACTORY_UNITS)
+"""(11, 2, 7) :data:`LINEAR_PARAMETERS` of both planes of :data:`FACTORY_UNITS`."""
+
+GENERIC_CALIBRATION = Calibration(np.zeros((2, 7)), "generic").with_linear_parameters(
+    FACTORY_LINEAR_PARAMETERS.mean(axis=0)
+)
 """Mean of :data:`FACTORY_UNITS`, for stations whose factory data are unknown."""
 
 PHASE_TILT_SIGMA_RAD = _phase_tilt_sigma(FACTORY_UNITS)

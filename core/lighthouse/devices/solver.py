@@ -33,6 +33,7 @@ from locatk.core.lighthouse.devices.tracking import (
     TrackedDevice,
     track_devices,
 )
+from locatk.core.lighthouse.devices.trajectories import refine_tracks
 from locatk.core.lighthouse.devices.verification import verify_devices
 from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
@@ -106,6 +107,14 @@ def solve_devices(
     if not scene.stations:
         estimate = _estimate_scene(sweeps, receivers, scene)
     tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
+    refined, tracked = refine_tracks(
+        tracked,
+        receivers,
+        estimate.scene,
+        is_estimated=not scene.stations,
+        interval_ns=None if interval_s is None else max(1, round(interval_s * 1e9)),
+    )
+    estimate = replace(estimate, scene=refined)
     trajectories = tuple(device.trajectory for device in tracked)
     detections = station_detections(tracked, estimate.scene)
     facts = _tracking_facts(estimate.facts, tracked, estimate.scene, detections)

@@ -1,0 +1,1 @@
+"""Trajectories in continuous time: every sweep at its own time."""

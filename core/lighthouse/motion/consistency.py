@@ -1,0 +1,115 @@
+"""Sweeps that contradict the path on which they were received.
+
+Reflections and wrong sweeps are found by what the rest of the path predicts for them. A rejected
+sweep is compared with the path that was estimated without it. An accepted one has pulled the path
+towards itself; its residual is divided by the standard deviation that remains (data snooping,
+Baarda 1968). Photodiodes that one plane crosses within a knot interval are tested together as well:
+they share the error of a reflection, and their mean has less noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+
+from locatk.core.block_tridiagonal import BlockTridiagonal
+from locatk.core.lighthouse.motion.equations import PathSweeps, Residuals, interval_rows
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+REJECTED_SIGMAS = 5.0
+"""Normalized residual above which a sweep or the mean of a group is rejected."""
+
+ACCEPTED_SIGMAS = 3.5
+"""Normalized residual below which a rejected sweep is taken back."""
+
+NEIGHBOUR_KNOTS = 4
+"""Knots around a contradiction within which only the largest one is rejected at a time: the others
+may be its consequence."""
+
+MIN_REDUNDANCY = 0.02
+"""Part of the variance of an angle that the path must not have absorbed for a test."""
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Prediction of each sweep by the path.
+
+    Attributes
+    ----------
+    variance : (n,) ndarray
+        Variance of the predicted angle [rad^2].
+    ratio : (n,) ndarray
+        Normalized residual, of a sweep or of its group, whichever is larger.
+    innovation : (n,) ndarray
+        Residual over the standard deviation of angle and prediction, for sweeps that the path was
+        estimated without.
+    """
+
+    variance: Array
+    ratio: Array
+    innovation: Array
+
+
+def leverage(
+    sweeps: PathSweeps,
+    residuals: Residuals,
+    states: BlockTridiagonal,
+    sigma: float,
+    is_used: Mask,
+) -> Consistency:
+    """Compare the residuals of sweeps with the variance of their predictions."""
+    diagonal, above = states.inverse_blocks
+    k, d = diagonal.shape[:2]
+    joint = np.zeros((k - 1, 2 * d, 2 * d))
+    joint[:, :d, :d], joint[:, d:, d:] = diagonal[:-1], diagonal[1:]
+    joint[:, :d, d:], joint[:, d:, :d] = above, above.mT
+    is_finite = np.isfinite(residuals.residual)
+    by_pose = np.where(is_finite[:, None], residuals.by_pose, 0.0)
+    jacobian = (sweeps.weights[:, :, None] * by_pose[:, None, :]).reshape(-1, 2 * d)
+    index = interval_rows(sweeps.knot, k - 1)
+    blocks = np.concatenate([jacobian, np.zeros((1, 2 * d))])[index]
+    covariance = blocks @ joint @ blocks.mT
+    is_sweep = index >= 0
+    variance = np.zeros(len(sweeps))
+    variance[index[is_sweep]] = np.einsum("kii->ki", covariance)[is_sweep]
+    residual = np.where(is_finite, residuals.residual, 0.0)
+    remaining = np.maximum(sigma**2 - variance, MIN_REDUNDANCY * sigma**2)
+    ratio = np.abs(residual) / np.sqrt(remaining)
+    padded_residual = np.append(residual, 0.0)[index]
+    padded_used = np.append(is_used & is_finite, False)[index]
+    source = np.append(2 * sweeps.station + sweeps.plane, -1)[index]
+    for group in range(int(source.max()) + 1):
+        member = (source == group) & padded_used
+        size = np.count_nonzero(member, axis=1)
+        rows = np.flatnonzero(size > 1)
+        if not len(rows):
+            continue
+        member, size = member[rows], size[rows]
+        total = np.abs(np.sum(padded_residual[rows] * member, axis=1))
+        absorbed = np.einsum("ki,kij,kj->k", member, covariance[rows], member)
+        own = size * sigma**2
+        group_ratio = total / np.sqrt(np.maximum(own - absorbed, MIN_REDUNDANCY * own))
+        chosen = index[rows][member]
+        ratio[chosen] = np.maximum(ratio[chosen], np.repeat(group_ratio, size))
+    innovation = np.abs(residual) / np.sqrt(sigma**2 + variance)
+    innovation[~is_finite] = np.inf
+    return Consistency(variance, ratio, innovation)
+
+
+def find_contradictions(
+    sweeps: PathSweeps, consistency: Consistency, is_used: Mask
+) -> tuple[Mask, Mask]:
+    """Return which accepted sweeps (n,) to reject, and which rejected ones to take back."""
+    ratio = np.where(is_used, consistency.ratio, 0.0)
+    largest = np.zeros(int(sweeps.knot.max(initial=0)) + 1)
+    np.maximum.at(largest, sweeps.knot, ratio)
+    nearby = maximum_filter1d(largest, 2 * NEIGHBOUR_KNOTS + 1, mode="nearest")
+    leaves = is_used & (ratio > REJECTED_SIGMAS) & (ratio > 0.7 * nearby[sweeps.knot])
+    comes = ~is_used & (consistency.innovation < ACCEPTED_SIGMAS)
+    return leaves, comes

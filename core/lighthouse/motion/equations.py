@@ -1,0 +1,270 @@
+"""Normal equations of paths and common parameters.
+
+The states of the paths form a chain, so that their part of the matrix is block-tridiagonal. The
+common parameters couple to all states (an arrow) and are solved by a Schur complement. The same
+factorization gives the covariance of each state, with the part that the common parameters add.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from locatk.core.block_tridiagonal import BlockTridiagonal
+from locatk.core.lighthouse.motion.parameters import CommonParameters
+from locatk.core.lighthouse.motion.path import Path, lever_jacobian, prior_information
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+WEAK_RATE_SIGMA = np.repeat([30.0, 100.0], 3)
+"""Standard deviations of velocity [m/s] and angular velocity [rad/s] before any sweep."""
+
+
+@dataclass(frozen=True)
+class PathSweeps:
+    """Sweeps on paths, in the order of their knots.
+
+    Attributes
+    ----------
+    knot : (n,) int ndarray
+        Ascending; each sweep is between this knot and the next one.
+    weights : (n, 4) ndarray
+        Weights of the states at both knots (:meth:`~locatk.core.lighthouse.motion.path.Path.\
+hermite_weights`).
+    station, plane, photodiode : (n,) int ndarray
+    angle : (n,) ndarray
+        Observed rotor angle in radians.
+    """
+
+    knot: IntArray
+    weights: Array
+    station: IntArray
+    plane: IntArray
+    photodiode: IntArray
+    angle: Array
+
+    def __len__(self) -> int:
+        return len(self.knot)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of sweeps with their derivatives.
+
+    Attributes
+    ----------
+    residual : (n,) ndarray
+        Predicted minus observed angle in radians; ``nan`` if no light plane meets the photodiode.
+    by_pose : (n, pose size) ndarray
+        Derivative by the pose of the device at the time of the sweep.
+    by_common, column : (n, m) ndarray
+        Derivatives by the common parameters that the sweep depends on, and their indices.
+    """
+
+    residual: Array
+    by_pose: Array
+    by_common: Array
+    column: IntArray
+
+
+def linearize(sweeps: PathSweeps, path: Path, common: CommonParameters) -> Residuals:
+    """Predict all sweeps; return residuals and derivatives."""
+    position, rotation = path.poses(sweeps.knot, sweeps.weights)
+    if rotation is None:
+        angle, by_pose, by_common, column = common.predict(sweeps.station, sweeps.plane, position)
+        return Residuals(angle - sweeps.angle, by_pose, by_common, column)
+    lever = common.levers[sweeps.photodiode]
+    diode = position + (rotation @ lever[:, :, None])[..., 0]
+    angle, by_position, by_station, column = common.predict(sweeps.station, sweeps.plane, diode)
+    bias = common.bias_columns(sweeps.station, sweeps.plane, sweeps.photodiode)
+    by_lever = (by_position[:, None] @ rotation)[:, 0]
+    return Residuals(
+        angle + common.value[bias] - sweeps.angle,
+        lever_jacobian(by_position, rotation, lever),
+        np.concatenate([by_station, by_lever, np.ones((len(sweeps), 1))], axis=1),
+        np.concatenate([column, common.lever_columns(sweeps.photodiode), bias[:, None]], axis=1),
+    )
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations at a state, with unit variance after weighting.
+
+    Attributes
+    ----------
+    states : BlockTridiagonal
+        Factorized block of the states.
+    gradient : (k, d) ndarray
+        By the states.
+    coupling : (k, d, m) ndarray
+        Between states and common parameters.
+    common : (m, m) ndarray
+    common_gradient : (m,) ndarray
+    gauge : (m, g) ndarray
+        Directions of the common parameters that are not estimated.
+    """
+
+    states: BlockTridiagonal
+    gradient: Array
+    coupling: Array
+    common: Array
+    common_gradient: Array
+    gauge: Array
+
+    def step(self) -> tuple[Array, Array]:
+        """Return the change of the states (k, d) and of the common parameters (m,)."""
+        right = np.concatenate([self.coupling, self.gradient[:, :, None]], axis=2)
+        solved = self.states.solve(right)
+        response, own = solved[:, :, :-1], solved[:, :, -1]
+        covariance = self._common_covariance(response)
+        flat = self.coupling.reshape(-1, self.coupling.shape[2])
+        reduced = self.common_gradient - flat.T @ own.ravel()
+        change = -covariance @ reduced
+        return -(own + response @ change), change
+
+    def states_step(self) -> Array:
+        """Return the change of the states (k, d) while the common parameters are held."""
+        return -self.states.solve(self.gradient)
+
+    def covariances(self) -> tuple[Array, Array]:
+        """Return the covariance (m, m) of the common parameters and the states' response to them.
+
+        The response (k, d, m) is the change of the states per change of the common parameters.
+        """
+        response = self.states.solve(self.coupling)
+        covariance = self._common_covariance(response)
+        return covariance, -response
+
+    def _common_covariance(self, response: Array) -> Array:
+        flat = self.coupling.reshape(-1, self.coupling.shape[2])
+        reduced = self.common - flat.T @ response.reshape(flat.shape)
+        basis = _complement(self.gauge)
+        inner = basis.T @ reduced @ basis
+        # Scaled to unit diagonal: metres, radians and curvatures differ by many orders.
+        scale = 1.0 / np.sqrt(np.maximum(np.diagonal(inner), 1e-300))
+        inverse = np.linalg.inv(inner * scale[:, None] * scale)
+        inverse = (inverse + inverse.T) / 2 * scale[:, None] * scale
+        return np.asarray(basis @ inverse @ basis.T)
+
+
+def _complement(directions: Array) -> Array:
+    """Return an orthonormal basis (m, m - g) of what is orthogonal to directions (m, g)."""
+    count, size = directions.shape
+    if not size:
+        return np.eye(count)
+    full = np.linalg.qr(np.concatenate([directions, np.eye(count)], axis=1))[0]
+    return np.asarray(full[:, size:count])
+
+
+def assemble(
+    sweeps: PathSweeps,
+    residuals: Residuals,
+    weight: Array,
+    path: Path,
+    power: Array,
+    common: CommonParameters,
+    *,
+    with_common: bool,
+) -> NormalEquations:
+    """Return the normal equations.
+
+    Parameters
+    ----------
+    sweeps : PathSweeps
+    residuals : Residuals
+    weight : (n,) ndarray
+        Inverse variance of each sweep, 0 for rejected ones.
+    path : Path
+    power : (k - 1, 2) ndarray
+        Power of the noise that drives the acceleration: of the position in m^2/s^3, and of the
+        rotation in rad^2/s^3.
+    common : CommonParameters
+    with_common : bool
+        False if the common parameters are held: their parts are empty.
+    """
+    k, n = len(path), path.pose_size
+    d = 2 * n
+    diagonal, above, gradient = prior_equations(path, power)
+    is_used = (weight > 0) & np.isfinite(residuals.residual)
+    root = np.sqrt(np.where(is_used, weight, 0.0))
+    residual = np.where(is_used, residuals.residual, 0.0) * root
+    by_pose = np.where(is_used[:, None], residuals.by_pose, 0.0) * root[:, None]
+    jacobian = (sweeps.weights[:, :, None] * by_pose[:, None, :]).reshape(-1, 2 * d)
+    index = interval_rows(sweeps.knot, k - 1)
+    blocks = np.concatenate([jacobian, np.zeros((1, 2 * d))])[index]
+    square = blocks.mT @ blocks
+    diagonal[:-1] += square[:, :d, :d]
+    diagonal[1:] += square[:, d:, d:]
+    above += square[:, :d, d:]
+    push = (np.append(residual, 0.0)[index][:, None] @ blocks)[:, 0]
+    gradient[:-1] += push[:, :d]
+    gradient[1:] += push[:, d:]
+    states = BlockTridiagonal(diagonal, above)
+    count = len(common.value)
+    if not with_common:
+        empty = np.zeros(0)
+        return NormalEquations(
+            states, gradient, np.zeros((k, d, 0)), np.zeros((0, 0)), empty, np.zeros((0, 0))
+        )
+    rows = np.arange(len(sweeps) + 1)
+    width = residuals.column.shape[1]
+    by_common = np.where(is_used[:, None], residuals.by_common, 0.0) * root[:, None]
+    shared = csr_array(
+        (by_common.ravel(), residuals.column.ravel(), rows * width), (len(sweeps), count)
+    )
+    columns = (sweeps.knot * d)[:, None] + np.arange(2 * d)
+    own = csr_array((jacobian.ravel(), columns.ravel(), rows * 2 * d), (len(sweeps), k * d))
+    return NormalEquations(
+        states,
+        gradient,
+        np.asarray((own.T @ shared).toarray()).reshape(k, d, count),
+        (shared.T @ shared).toarray() + common.information,
+        shared.T @ residual + common.information @ common.value,
+        common.gauge,
+    )
+
+
+def prior_equations(path: Path, power: Array) -> tuple[Array, Array, Array]:
+    """Return the part of the prior in the equations of the states.
+
+    Returns
+    -------
+    diagonal, above : (k, d, d) and (k - 1, d, d) ndarray
+    gradient : (k, d) ndarray
+    """
+    k, n = len(path), path.pose_size
+    unit = prior_information(np.diff(path.time_s)) * path.is_linked[:, None, None]
+    diagonal = np.zeros((k, 2, n, 2, n))
+    above = np.zeros((k - 1, 2, n, 2, n))
+    # Errors are those of the end in the axes of pose and rate; the start predicts without error.
+    error = np.concatenate([np.zeros((k - 1, 2, n)), path.prior_errors()], axis=1)
+    gradient = np.zeros((k, 2, n))
+    for axis in range(n):
+        block = unit / power[:, axis // 3, None, None]
+        diagonal[:-1, :, axis, :, axis] += block[:, :2, :2]
+        diagonal[1:, :, axis, :, axis] += block[:, 2:, 2:]
+        above[:, :, axis, :, axis] += block[:, :2, 2:]
+        push = (block @ error[:, :, axis, None])[..., 0]
+        gradient[:-1, :, axis] += push[:, :2]
+        gradient[1:, :, axis] += push[:, 2:]
+        weak = WEAK_RATE_SIGMA[axis] ** -2.0
+        diagonal[:, 1, axis, 1, axis] += weak
+        rate = path.velocity if axis < 3 else path.spin
+        assert rate is not None
+        gradient[:, 1, axis] += weak * rate[:, axis % 3]
+    d = 2 * n
+    return diagonal.reshape(k, d, d), above.reshape(k - 1, d, d), gradient.reshape(k, d)
+
+
+def interval_rows(knot: IntArray, count: int) -> IntArray:
+    """Return the rows (count, m) of ascending ``knot`` in each interval, padded with -1."""
+    start = np.searchsorted(knot, np.arange(count))
+    stop = np.searchsorted(knot, np.arange(count), side="right")
+    column = np.arange(int(np.max(stop - start, initial=1)))
+    rows = start[:, None] + column
+    return np.where(rows < stop[:, None], rows, -1)
