@@ -21,6 +21,7 @@ from locatk.core.lighthouse.doubled_channels import (
 )
 from locatk.core.lighthouse.epochs import Epochs, group_epochs, rotor_angles
 from locatk.core.lighthouse.localization.photodiodes import detect_stations, track_photodiodes
+from locatk.core.lighthouse.localization.trajectories import refine_photodiodes
 from locatk.core.lighthouse.published.scene import solve_published
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
@@ -175,7 +176,9 @@ def _solve_photodiodes(
         estimate = estimate_scene(
             epochs, scene, kind=options.scene, odometry=odometry, seed=options.seed
         )
-    return _locate_and_verify(estimate, epochs.rejected, options.method)
+    return _locate_and_verify(
+        estimate, sweeps, epochs.rejected, options.method, is_estimated=not scene.stations
+    )
 
 
 def _with_unsolved_devices(solution: Solution, sweeps: Sweeps, error: DegenerateError) -> Solution:
@@ -203,12 +206,22 @@ def _with_unsolved_devices(solution: Solution, sweeps: Sweeps, error: Degenerate
 
 
 def _locate_and_verify(
-    estimate: SceneEstimate, rejected_sweeps: Mapping[str, int], method: str
+    estimate: SceneEstimate,
+    sweeps: Sweeps,
+    rejected_sweeps: Mapping[str, int],
+    method: str,
+    *,
+    is_estimated: bool,
 ) -> Solution:
-    """Locate all epochs in a scene, and verify the scene."""
+    """Locate all epochs in a scene, estimate paths where photodiodes move, and verify the scene."""
     scene = estimate.scene
     tracks = track_photodiodes(estimate.epochs, scene)
     channels = tracks.epochs.channels.tolist()
+    trajectories, rejected, sigma_rad = tracks.trajectories, tracks.rejected, tracks.angle_sigma_rad
+    paths = refine_photodiodes(sweeps, channels, trajectories, scene, is_estimated=is_estimated)
+    if paths is not None:
+        scene, trajectories, sigma_rad = paths.scene, paths.trajectories, paths.sigma_rad
+        rejected = add_counts(rejected, paths.rejected)
     stations = {c: s for c in channels if (s := scene.station(c)) is not None}
     verification = None
     # A floor homography has no pose to verify.
@@ -227,8 +240,8 @@ def _locate_and_verify(
     return Solution(
         "lighthouse",
         method,
-        tracks.trajectories,
-        add_counts(rejected_sweeps, estimate.rejected, tracks.rejected),
+        trajectories,
+        add_counts(rejected_sweeps, estimate.rejected, rejected),
         detect_stations(
             tracks.epochs, stations, tracks.estimates.residual, tracks.is_accepted, verification
         ),
@@ -236,7 +249,7 @@ def _locate_and_verify(
         facts=replace(
             estimate.facts,
             restored_swapped_epochs=tracks.restored_epochs or None,
-            angle_sigma_rad=tracks.angle_sigma_rad,
+            angle_sigma_rad=sigma_rad,
             calibration_sigma_rad=tracks.calibration_sigma_rad,
             verification=verification,
         ),

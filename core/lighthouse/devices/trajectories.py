@@ -12,24 +12,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import Similarity, quaternion_from_matrix
+from locatk.core.geometry import Similarity
 from locatk.core.lighthouse.devices.device_sweeps import rotation_limits_ns
-from locatk.core.lighthouse.devices.tracking import MAX_POSE_SIGMA_M_RAD, TrackedDevice
+from locatk.core.lighthouse.devices.tracking import TrackedDevice
 from locatk.core.lighthouse.motion.frames import fix_frame
-from locatk.core.lighthouse.motion.parameters import STATION_PARAMETERS, make_parameters
+from locatk.core.lighthouse.motion.parameters import make_parameters
+from locatk.core.lighthouse.motion.results import (
+    make_trajectory,
+    pose_covariances,
+    refined_scene,
+)
 from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.scene.model import JOINT_PARAMETERS
 from locatk.core.lighthouse.scene.reframing import transform_trajectory
-from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-MIN_SWEEP_RATE = 4.0
-"""Fewest accepted sweeps in the two rotations around a pose."""
 
 MIN_FRAME_MARKERS = 3
 """Fewest visited markers that define a frame."""
@@ -96,29 +96,21 @@ def refine_tracks(
         residual[estimate.sweep[own] - begin] = estimate.residual[own]
         is_used[estimate.sweep[own] - begin] = estimate.is_used[own]
         begin = end
-        knots = _pose_knots(estimate, number, interval_ns or fastest_ns)
-        rotation = estimate.path.rotation
-        assert rotation is not None
-        is_determined = np.all(
-            np.sqrt(np.einsum("kii->ki", covariance[knots])) < MAX_POSE_SIGMA_M_RAD, axis=1
-        )
-        is_supported = _used_nearby(estimate, 2)[knots] >= MIN_SWEEP_RATE
-        kept = knots[is_determined & is_supported]
-        trajectory = Trajectory(
+        made = make_trajectory(
+            estimate,
+            covariance,
+            number,
             device.trajectory.device,
             device.trajectory.frame,
-            estimate.time_ns[kept],
-            estimate.path.position[kept],
-            quaternion_from_matrix(rotation[kept]),
-            covariance[kept],
+            interval_ns or fastest_ns,
         )
         rejected = dict(device.rejected)
-        rejected["pose_not_determined"] = int(np.count_nonzero(is_supported & ~is_determined))
+        rejected["pose_not_determined"] = made.undetermined
         rejected["sweep_contradicts_pose"] = int(np.count_nonzero(np.isfinite(residual) & ~is_used))
         refined.append(
             replace(
                 device,
-                trajectory=transform_trajectory(trajectory, to_frame, scene.frame),
+                trajectory=transform_trajectory(made.trajectory, to_frame, scene.frame),
                 residual=residual,
                 is_used=is_used,
                 sigma_rad=estimate.sigma_rad,
@@ -149,70 +141,3 @@ def _marker_knots(
             is_visit &= (estimate.time_ns >= visit.start_ns) & (estimate.time_ns <= visit.end_ns)
             number[is_visit] = k
     return number
-
-
-def refined_scene(scene: Scene, channels: Sequence[int], estimate: PathEstimate) -> Scene:
-    """Return a scene with the estimated stations and their joint covariance."""
-    positions, rotations, calibrations = estimate.common.stations
-    order = {channel: i for i, channel in enumerate(channels)}
-    stations = []
-    rows: list[IntArray] = []
-    for station in scene.stations:
-        i = order.get(station.channel)
-        if i is None:
-            return scene
-        first = i * STATION_PARAMETERS
-        pose = slice(first, first + 6)
-        calibration = calibrations[i]
-        if station.calibration.is_generic:
-            calibration = replace(calibration, source="estimated")
-        stations.append(
-            replace(
-                station,
-                position=positions[i],
-                rotation=rotations[i],
-                calibration=calibration,
-                covariance=estimate.common_covariance[pose, pose],
-            )
-        )
-        rows.append(first + np.arange(JOINT_PARAMETERS))
-    index = np.concatenate(rows)
-    joint = estimate.common_covariance[np.ix_(index, index)]
-    return replace(scene, stations=tuple(stations), covariance=joint)
-
-
-def pose_covariances(estimate: PathEstimate) -> Array:
-    """Return the covariances (k, 6, 6) of the poses, rotations in the axes of the frame."""
-    factor = _square_root(estimate.common_covariance)
-    shared = estimate.response @ factor
-    covariance = estimate.pose_covariance + shared @ shared.mT
-    k, n = covariance.shape[:2]
-    full = np.full((k, 6, 6), np.nan)
-    full[:, :n, :n] = covariance
-    if estimate.path.rotation is not None:
-        to_frame = np.zeros((k, 6, 6))
-        to_frame[:, :3, :3], to_frame[:, 3:, 3:] = np.eye(3), estimate.path.rotation
-        full = to_frame @ full @ to_frame.mT
-    return full
-
-
-def _square_root(covariance: Array) -> Array:
-    """Return a factor F (m, m) of a covariance F F^T that may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def _pose_knots(estimate: PathEstimate, device: int, interval_ns: int) -> IntArray:
-    """Return the knots of a device at which poses are given, one in each interval."""
-    knots = np.flatnonzero(estimate.device == device)
-    interval = estimate.time_ns[knots] // interval_ns
-    return knots[np.r_[True, np.diff(interval) > 0]] if len(knots) else knots
-
-
-def _used_nearby(estimate: PathEstimate, knots: int) -> IntArray:
-    """Return the number of accepted sweeps within some knots of each knot."""
-    count = np.bincount(estimate.knot[estimate.is_used], minlength=len(estimate.path))
-    total = np.concatenate([[0], np.cumsum(count)])
-    index = np.arange(len(count))
-    low, high = np.maximum(index - knots, 0), np.minimum(index + knots, len(count))
-    return np.asarray(total[high] - total[low])

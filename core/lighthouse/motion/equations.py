@@ -25,6 +25,10 @@ WEAK_RATE_SIGMA = np.repeat([30.0, 100.0], 3)
 """Standard deviations of velocity [m/s] and angular velocity [rad/s] before any sweep."""
 
 
+FLOOR_SIGMA_M = 1e-5
+"""Standard deviation of the height over a floor: it is a known plane."""
+
+
 @dataclass(frozen=True)
 class PathSweeps:
     """Sweeps on paths, in the order of their knots.
@@ -170,6 +174,7 @@ def assemble(
     common: CommonParameters,
     *,
     with_common: bool,
+    floor_z: float | None = None,
 ) -> NormalEquations:
     """Return the normal equations.
 
@@ -186,10 +191,15 @@ def assemble(
     common : CommonParameters
     with_common : bool
         False if the common parameters are held: their parts are empty.
+    floor_z : float, optional
+        Height of all poses.
     """
     k, n = len(path), path.pose_size
     d = 2 * n
     diagonal, above, gradient = prior_equations(path, power)
+    if floor_z is not None:
+        diagonal[:, 2, 2] += FLOOR_SIGMA_M**-2
+        gradient[:, 2] += (path.position[:, 2] - floor_z) * FLOOR_SIGMA_M**-2
     is_used = (weight > 0) & np.isfinite(residuals.residual)
     root = np.sqrt(np.where(is_used, weight, 0.0))
     residual = np.where(is_used, residuals.residual, 0.0) * root

@@ -134,6 +134,8 @@ def estimate_paths(
     start: Sequence[Trajectory],
     common: CommonParameters,
     knot_ns: int,
+    *,
+    floor_z: float | None = None,
 ) -> PathEstimate | None:
     """Estimate the paths of the devices of a recording.
 
@@ -149,6 +151,8 @@ def estimate_paths(
         Without photodiodes if the devices have single ones.
     knot_ns : int
         Time from knot to knot.
+    floor_z : float, optional
+        Height of single photodiodes on a floor.
 
     Returns
     -------
@@ -160,7 +164,7 @@ def estimate_paths(
     )
     if layout is None:
         return None
-    problem = _Problem(layout.sweeps, common, layout.path)
+    problem = _Problem(layout.sweeps, common, layout.path, floor_z)
     problem.fit_robustly()
     problem.reject_contradictions()
     problem.finish()
@@ -302,8 +306,14 @@ def _interpolate(trajectory: Trajectory, time_ns: IntArray) -> tuple[Array, Arra
 class _Problem:
     """Paths and common parameters while they are estimated."""
 
-    def __init__(self, sweeps: PathSweeps, common: CommonParameters, path: Path) -> None:
-        self.sweeps, self.common, self.path = sweeps, common, path
+    def __init__(
+        self,
+        sweeps: PathSweeps,
+        common: CommonParameters,
+        path: Path,
+        floor_z: float | None = None,
+    ) -> None:
+        self.sweeps, self.common, self.path, self.floor_z = sweeps, common, path, floor_z
         centre = common.positions.mean(axis=0)
         self.size_m = float(np.median(np.linalg.norm(path.position - centre, axis=1)))
         unit = np.array([self.size_m**2, 1.0])
@@ -328,6 +338,7 @@ class _Problem:
             self.power,
             self.common,
             with_common=with_common,
+            floor_z=self.floor_z,
         )
         if with_common:
             self._hold_scale(equations)

@@ -1,0 +1,183 @@
+"""Trajectories of single photodiodes in continuous time, where they move.
+
+A photodiode that reports each sweep at its own time, many times a second, has a path; its sweeps
+are treated as those of rigid devices (:mod:`locatk.core.lighthouse.motion`). Reports of a few
+sweeps with one time stamp are located one by one
+(:mod:`locatk.core.lighthouse.localization.photodiodes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.geometry import Similarity, umeyama
+from locatk.core.lighthouse.devices.device_sweeps import (
+    DeviceSweeps,
+    rotation_limits_ns,
+    select_device_sweeps,
+)
+from locatk.core.lighthouse.motion.frames import fix_frame
+from locatk.core.lighthouse.motion.parameters import make_parameters
+from locatk.core.lighthouse.motion.results import (
+    make_trajectory,
+    pose_covariances,
+    refined_scene,
+)
+from locatk.core.lighthouse.motion.solver import estimate_paths
+from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.reframing import transform_trajectory
+from locatk.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+MAX_POSE_INTERVAL_S = 0.05
+"""Longest usual time between rough positions on a path: over longer times, a robot may turn."""
+
+MIN_OWN_TIMES = 0.7
+"""Smallest fraction of sweeps of a photodiode whose time differs from that of the sweep before."""
+
+MIN_PATH_POSES = 20
+"""Fewest rough positions of a path."""
+
+
+@dataclass(frozen=True)
+class PhotodiodePaths:
+    """Trajectories in continuous time.
+
+    Attributes
+    ----------
+    scene : Scene
+        With refined stations if it was estimated from the same sweeps.
+    trajectories : tuple of Trajectory
+    rejected : dict of str to int
+    sigma_rad : float
+        Standard deviation of an angle.
+    """
+
+    scene: Scene
+    trajectories: tuple[Trajectory, ...]
+    rejected: dict[str, int]
+    sigma_rad: float
+
+
+def refine_photodiodes(
+    sweeps: Sweeps,
+    channels: Sequence[int],
+    rough: Sequence[Trajectory],
+    scene: Scene,
+    *,
+    is_estimated: bool,
+) -> PhotodiodePaths | None:
+    """Estimate the paths of moving photodiodes, and the stations with them.
+
+    Parameters
+    ----------
+    sweeps : Sweeps
+    channels : sequence of int
+        Stations of the scene that were received.
+    rough : sequence of Trajectory
+        Of all photodiodes.
+    scene : Scene
+    is_estimated : bool
+        True if the scene was estimated from the same sweeps. Otherwise it is returned unchanged.
+
+    Returns
+    -------
+    PhotodiodePaths or None
+        None if a photodiode does not move on a path.
+    """
+    if len(channels) < 2:
+        return None
+    parts = [_select_photodiode(sweeps, t.device, channels) for t in rough]
+    if not all(_is_path(own, t) for own, t in zip(parts, rough, strict=True)):
+        return None
+    positions = np.concatenate([t.position for t in rough])
+    centre = np.mean([s.position for s in scene.stations], axis=0)
+    common = make_parameters(
+        scene,
+        channels,
+        np.zeros((0, 3)),
+        is_estimated=is_estimated,
+        size_m=float(np.median(np.linalg.norm(positions - centre, axis=1))),
+    )
+    fastest_ns, _ = rotation_limits_ns(channels)
+    floor_z = scene.floor_z if scene.planar else None
+    estimate = estimate_paths(
+        parts, [0] * len(parts), rough, common, fastest_ns // 2, floor_z=floor_z
+    )
+    if estimate is None:
+        return None
+    to_frame = Similarity.identity()
+    if is_estimated:
+        estimate = fix_frame(estimate, np.ones(len(estimate.path), bool), with_scale=True)
+        to_frame = _rough_frame(
+            [
+                (
+                    t,
+                    estimate.time_ns[estimate.device == k],
+                    estimate.path.position[estimate.device == k],
+                )
+                for k, t in enumerate(rough)
+            ]
+        )
+        scene = refined_scene(scene, channels, estimate).transformed(to_frame)
+    covariance = pose_covariances(estimate)
+    made = [
+        make_trajectory(estimate, covariance, k, t.device, t.frame, fastest_ns)
+        for k, t in enumerate(rough)
+    ]
+    rejected = {
+        "sweep_contradicts_pose": int(np.count_nonzero(~estimate.is_used)),
+        "pose_not_determined": sum(part.undetermined for part in made),
+    }
+    return PhotodiodePaths(
+        scene,
+        tuple(transform_trajectory(part.trajectory, to_frame, scene.frame) for part in made),
+        {reason: count for reason, count in rejected.items() if count},
+        estimate.sigma_rad,
+    )
+
+
+def _select_photodiode(sweeps: Sweeps, name: str, channels: Sequence[int]) -> DeviceSweeps:
+    """Return the sweeps of a photodiode, ``device`` or ``device/sensor``."""
+    if name in sweeps.devices:
+        device, sensor = name, None
+    else:
+        device, _, number = name.rpartition("/")
+        sensor = int(number)
+    count = int(np.max(sweeps.sensor, initial=0)) + 1
+    index = sweeps.devices.index(device)
+    selected, _ = select_device_sweeps(sweeps, index, Receiver(np.zeros((count, 3))), channels)
+    if sensor is not None:
+        selected = selected.take(selected.sensor == sensor)
+    return replace(selected, sensor=np.zeros(len(selected), np.int64))
+
+
+def _is_path(own: DeviceSweeps, rough: Trajectory) -> bool:
+    """Return whether sweeps come at their own times, often enough for a path."""
+    if len(rough) < MIN_PATH_POSES:
+        return False
+    interval_s = float(np.median(np.diff(rough.time_ns))) * 1e-9
+    return interval_s < MAX_POSE_INTERVAL_S and bool(
+        np.mean(np.diff(own.time_ns) > 0) > MIN_OWN_TIMES
+    )
+
+
+def _rough_frame(parts: Sequence[tuple[Trajectory, NDArray[np.int64], Array]]) -> Similarity:
+    """Return the transform to the frame of the rough trajectories: their median is kept."""
+    source, target = [], []
+    for rough, time_ns, position in parts:
+        index = np.clip(np.searchsorted(time_ns, rough.time_ns), 0, len(time_ns) - 1)
+        source.append(position[index])
+        target.append(rough.position)
+    a, b = np.concatenate(source), np.concatenate(target)
+    transform = umeyama(a, b)
+    distance = np.linalg.norm(transform.apply(a) - b, axis=1)
+    is_close = distance <= 3 * np.median(distance)
+    return umeyama(a[is_close], b[is_close])
