@@ -59,8 +59,9 @@ START_POWER = np.array([0.5, 30.0])
 """Power of the motion at the start: of the position, relative to the square of the distance of the
 stations in metres, and of the rotation in rad^2/s^3. Those of an agile flight."""
 
-MIN_POWER = np.array([1e-6, 1e-4])
-"""Smallest power of the motion, in the same units: that of a device at rest."""
+MIN_POWER, MAX_POWER = np.array([1e-6, 1e-4]), np.array([5.0, 1e3])
+"""Smallest and largest power of the motion, in the same units: at rest, and thrown or shaken. With
+more, a path could follow wrong sweeps."""
 
 POWER_WINDOW_S = 1.0
 """Time over which the power of the motion is averaged."""
@@ -317,7 +318,7 @@ class _Problem:
         centre = common.positions.mean(axis=0)
         self.size_m = float(np.median(np.linalg.norm(path.position - centre, axis=1)))
         unit = np.array([self.size_m**2, 1.0])
-        self.min_power = MIN_POWER * unit
+        self.min_power, self.max_power = MIN_POWER * unit, MAX_POWER * unit
         self.power = np.tile(START_POWER * unit, (len(path) - 1, 1))
         self.sigma = ANGLE_SIGMA_RAD
         self.residuals = linearize(sweeps, path, common)
@@ -389,8 +390,6 @@ class _Problem:
             weight[self.is_left_out] = 0.0
             equations = self.equations(np.nan_to_num(weight), with_common=with_common)
             self.move(equations, with_common=with_common)
-            if iteration >= 2:
-                self.update_power(equations)
         with np.errstate(invalid="ignore"):
             spread = robust_sigma(self.residuals.residual)
             self.is_used = np.abs(self.residuals.residual) < max(6 * spread, 10 * self.sigma)
@@ -489,7 +488,8 @@ class _Problem:
             usual = max(usual, self.min_power[part])
             # One degree of freedom of usual motion keeps windows without sweeps in range.
             local = (smooth[0] + usual / window) / (smooth[1] + 1.0 / window)
-            self.power[:, part] = np.clip(local, self.min_power[part], MAX_LOCAL_POWER * usual)
+            largest = min(MAX_LOCAL_POWER * usual, self.max_power[part])
+            self.power[:, part] = np.clip(local, self.min_power[part], largest)
 
     def estimate(self, layout: _Layout) -> PathEstimate:
         """Return the result with covariances."""
