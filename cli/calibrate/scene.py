@@ -175,7 +175,7 @@ def command(
       locatk calibrate scene run.mcap -o scene.toml
       locatk calibrate scene run.mcap -o scene.toml --scene two-3d
       locatk calibrate scene run.mcap -o scene.toml --floor --x-distance 1000
-      locatk calibrate scene run.mcap -o scene.toml
+      locatk calibrate scene run.mcap -o scene.toml \\
           --marker a=0,0 --marker b=2000,0 --marker c=2000,1500
       locatk calibrate scene -o scene.toml --wizard /dev/ttyACM0 --x-distance 1000
       locatk solve later.mcap -o solved.mcap --artifact scene.toml
@@ -293,6 +293,9 @@ def scene_setup(
     if not (markers or has_floor) and (ignore or height):
         option = "--ignore" if ignore else "--height"
         raise click.UsageError(f"{option} needs --marker or --floor.")
+    for number in (origin, x_axis):
+        if number is not None and number in ignore:
+            raise click.UsageError(f"Standstill {number} is a point of the floor and ignored.")
     names = [name for name, _ in markers]
     if len(set(names)) < len(names):
         raise click.UsageError("Two markers have the same name.")

@@ -65,6 +65,9 @@ MAX_FLOOR_SLOPE = 0.05
 """Largest difference of the heights of corners on one floor, relative to their distance. Averaging
 the heights changes lengths by half of its square, 0.1 %."""
 
+MAX_COORDINATE = 1e7
+"""Largest coordinate of a corner: 10 km in millimetres."""
+
 MAX_PIXELS = 1e5
 """Largest coordinate in a video: no frame is that wide."""
 
@@ -207,6 +210,8 @@ def _read_entries(path: Path) -> dict[str, Any]:
         ) from error
     except RecursionError:
         raise FormatError("not a calibration: nested too deeply", file=path) from None
+    except ValueError:  # An integer of more than 4300 digits.
+        raise FormatError("not a calibration: a number is too long", file=path) from None
     if not isinstance(content, dict):
         raise FormatError("not a calibration: should be an object", file=path)
     entries = {"": content} if any(key in content for key in METRES) else content
@@ -279,11 +284,18 @@ def _object(value: Any, path: Path, where: str) -> dict[str, Any]:
 
 def _point(value: Any, path: Path, where: str) -> Array:
     """Return the two or three numbers of a list as a point (3,); z is zero if it is missing."""
-    is_valid = isinstance(value, list) and len(value) in (2, 3)
-    if is_valid:
-        is_valid = all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-    if not is_valid or not np.all(np.isfinite(np.array(value, float))):
-        raise FormatError(f"{str(value)[:40]} should be two finite numbers", file=path, where=where)
+    is_valid = (
+        isinstance(value, list)
+        and len(value) in (2, 3)
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+        and all(abs(v) <= MAX_COORDINATE for v in value)
+    )
+    if not is_valid:
+        raise FormatError(
+            f"{repr(value)[:40]} should be two numbers up to {MAX_COORDINATE:.0e}",
+            file=path,
+            where=where,
+        )
     return np.array([*value, 0.0][:3], float)
 
 
