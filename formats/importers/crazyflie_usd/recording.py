@@ -251,9 +251,8 @@ def _candidate_sources(
 
 def _read_sweeps(log: UsdLog, event: Event, source: str) -> LoggedSweeps | None:
     """Return the sweeps of a source; None if none is usable."""
-    if source == "uart":
-        return read_uart_frames(event, log.resolution_s)
-    return read_angles(event, clock_rates(log), log.resolution_s)
+    read = read_uart_frames if source == "uart" else read_angles
+    return read(event, clock_rates(log), log.resolution_s)
 
 
 def clock_rates(log: UsdLog) -> list[tuple[float, float]]:

@@ -366,6 +366,37 @@ def test_unknown_stations_have_the_number_of_the_build(
     check_sweeps(session, flight, tolerance_s=1e-3)
 
 
+def test_one_wrong_offset_of_an_unknown_station_does_no_harm(
+    crazyflie: ModuleType, tmp_path: Path
+) -> None:
+    log = crazyflie.write_flight(crazyflie.Flight(3.0), np.random.default_rng(4))
+    frames = [k for k, event in enumerate(log.events) if event[1] == 11]
+    first = next(k for k in frames if log.events[k][2][1] == 4)
+    time_s, number, values = log.events[first]
+    log.events[first] = (time_s, number, (*values[:2], 4000, *values[3:]))
+    session = read_crazyflie_usd([write(log, tmp_path)])
+    assert len(session.sweeps) > 0.95 * len(frames)
+
+
+@pytest.mark.parametrize("rate", [84 / 85, 0.98906, 1.0])
+def test_a_gap_of_many_wraps_of_the_short_counter(
+    crazyflie: ModuleType, tmp_path: Path, rate: float
+) -> None:
+    """A clock that is 1.2 % slow is wrong by more than half of a wrap after 30 s."""
+    flight = crazyflie.Flight(60.0)
+    log = crazyflie.write_flight(flight, np.random.default_rng(4), rate=rate, imu_hz=100)
+    name, variables = log.types[11]
+    log.types[11] = (name, [each for each in variables if each[0] != "timestamp2FPGA"])
+    gap = range(round(31.7 + 5 * rate), round(31.7 + 55 * rate))
+    log.events = [
+        (time_s, number, values if number != 11 else (*values[:4], values[5]))
+        for time_s, number, values in log.events
+        if number != 11 or int(time_s) not in gap
+    ]
+    session = read_crazyflie_usd([write(log, tmp_path)])
+    check_sweeps(session, flight, tolerance_s=1e-4)
+
+
 def test_a_station_with_the_largest_number_is_one(crazyflie: ModuleType, tmp_path: Path) -> None:
     """Station 2 of a build for 16, from which no frame is unknown."""
     flight = crazyflie.Flight(3.0, stations=crazyflie.stations(3))
