@@ -130,7 +130,8 @@ def read_crazyflie_csv(
     _align_wraps(files)
     _check_overlap(files)
     start_ns = min(int(each.time_ns.min()) for each in files)
-    shift_ns = 0 if start_ns >= FIRST_DATE_NS else UNDATED_START_NS - start_ns
+    is_dated = start_ns >= FIRST_DATE_NS
+    shift_ns = 0 if is_dated else UNDATED_START_NS - start_ns
     data = read_device_data([(each.time_ns + shift_ns, each.series) for each in files], device)
     sweeps, dropped = _sweeps(data.blocks, device)
     scene, warnings = read_scene(config, stations)
@@ -141,7 +142,7 @@ def read_crazyflie_csv(
     facts = {
         "format": "crazyflie-csv",
         "files": ", ".join(each.path.name for each in files),
-        "clock": "dates of the files" if shift_ns == 0 else "since the first sample",
+        "clock": "dates of the files" if is_dated else "since the first sample",
         "variables": list_names(names, len(names)),
     }
     if unused := {name for each in files for name in each.unused}:
@@ -314,23 +315,28 @@ def _check_overlap(files: Sequence[_LogFile]) -> None:
 
 
 def _sweeps(blocks: Sequence[LogBlock], device: str) -> tuple[Sweeps, int]:
-    """Return the logged rotor angles, and the number of samples that repeat one."""
+    """Return the logged rotor angles, and the number of samples that repeat one.
+
+    Of an angle in several blocks, the one with the most samples is used.
+    """
     parts: list[tuple[IntArray, IntArray, IntArray, Array]] = []
     repeated = 0
-    for block in blocks:
-        for name in ANGLES.keys() & block.columns.keys():
-            station, plane = ANGLES[name]
-            is_logged = np.isfinite(block.columns[name])
-            angle = block.columns[name][is_logged]
-            turns = (angle - ROTOR_ZERO_RAD[plane]) / (2 * np.pi)
-            is_new = np.diff(angle, prepend=np.nan) != 0
-            # The firmware's angles are 0 until the first light.
-            is_angle = (turns >= 0) & (turns < 1) & (angle != 0)
-            repeated += int(np.count_nonzero(is_angle & ~is_new))
-            rows = np.flatnonzero(is_angle & is_new)
-            counts = turns[rows] * period_counts(station + 1)
-            labels = (np.full(len(rows), station + 1), np.full(len(rows), plane))
-            parts.append((block.time_ns[is_logged][rows], *labels, counts))
+    for name, (station, plane) in ANGLES.items():
+        owners = [block for block in blocks if name in block.columns]
+        if not owners:
+            continue
+        block = max(owners, key=lambda block: len(block.time_ns))
+        is_logged = np.isfinite(block.columns[name])
+        angle = block.columns[name][is_logged]
+        turns = (angle - ROTOR_ZERO_RAD[plane]) / (2 * np.pi)
+        is_new = np.diff(angle, prepend=np.nan) != 0
+        # The firmware's angles are 0 until the first light.
+        is_angle = (turns >= 0) & (turns < 1) & (angle != 0)
+        repeated += int(np.count_nonzero(is_angle & ~is_new))
+        rows = np.flatnonzero(is_angle & is_new)
+        counts = turns[rows] * period_counts(station + 1)
+        labels = (np.full(len(rows), station + 1), np.full(len(rows), plane))
+        parts.append((block.time_ns[is_logged][rows], *labels, counts))
     if not parts:
         parts = [(np.zeros(0, np.int64), np.zeros(0, int), np.zeros(0, int), np.zeros(0))]
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -242,6 +242,10 @@ def test_sampled_angles_become_sweeps(tmp_path: Path) -> None:
     np.testing.assert_allclose(turns, expected, atol=1e-12)
     assert len(session.receivers["crazyflie"]) == 4
     assert "3 samples repeat one" in session.facts["sweeps"]
+    assert session.facts["clock"] == "since the first sample"
+    # An angle of two blocks is used once.
+    again = write(tmp_path / "again.csv", ["Timestamp", names[1]], [(1005, 0.2), (1015, 0.21)])
+    assert len(read_crazyflie_csv([again, path]).sweeps) == len(sweeps)
 
 
 def test_a_restart_is_reported(tmp_path: Path) -> None:
