@@ -241,17 +241,17 @@ def _parse_square(path: Path, name: str, video: Any) -> FloorSquare:
         return {corner: point[:2] for corner, point in points(key).items()}
 
     floor_m = {corner: METRES[unit] * point for corner, point in points(unit).items()}
-    axes = "axes as given"
+    changes = []
     corners_m = np.array(list(floor_m.values()))
     relief_m = np.ptp(corners_m[:, 2]) if len(corners_m) else 0.0
     if 0 < relief_m <= MAX_FLOOR_SLOPE * np.ptp(corners_m[:, :2], axis=0).max():
-        axes = f"heights averaged over {1e3 * relief_m:.0f} mm"
+        changes.append(f"heights averaged over {1e3 * relief_m:.0f} mm")
         floor_m = {c: np.append(p[:2], corners_m[:, 2].mean()) for c, p in floor_m.items()}
     if all(corner in floor_m for corner in CLOCKWISE):
         x, y, _ = np.array([floor_m[corner] for corner in CLOCKWISE]).T
         if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0:
             floor_m = {corner: value * [1.0, -1.0, 1.0] for corner, value in floor_m.items()}
-            axes += ", y negated, so that z is up"
+            changes.append("y negated, so that z is up")
     stays = {
         corner: _stay(value, path, f"timestamps_lh2.{corner}")
         for corner, value in _object(
@@ -266,7 +266,7 @@ def _parse_square(path: Path, name: str, video: Any) -> FloorSquare:
         planar_points("corners_px"),
         planar_points("corners_lh2"),
         stays,
-        axes,
+        ", ".join(changes) or "axes as given",
         f"{number} circles" if number else "",
     )
     for part in (square.pixels, square.plane, square.stays):

@@ -397,7 +397,9 @@ def stays() -> dict:
 def test_truth_in_floor_metres_with_z_up(write: Write) -> None:
     write(json.dumps({"video.mp4": SQUARE}), "calibration.json")
     recording, track = write(TWO + ROW), write(TRACK, "1_blender.csv")
-    (truth,) = read_dotbot([recording], [track]).truth
+    session = read_dotbot([recording], [track])
+    assert session.facts["calibration"].endswith("(y negated, so that z is up)")
+    (truth,) = session.truth
     assert isinstance(truth, Trajectory)
     assert truth.device == "R"
     np.testing.assert_allclose(truth.position, [[0.8, -0.8, 0], [1.0, -1.0, 0]], atol=1e-12)
