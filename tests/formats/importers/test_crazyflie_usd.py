@@ -141,6 +141,21 @@ def test_the_part_behind_a_damaged_time_is_not_read(crazyflie: ModuleType) -> No
     assert len(read.events["estDistance"]) <= 4
 
 
+def test_a_torn_log_of_sweeps_continues_after_a_long_gap(crazyflie: ModuleType) -> None:
+    log = crazyflie.UsdWriter()
+    log.event_type(7, "estSweepAngle", "sweepAngle:f")
+    for k, time in enumerate([5.0, 5.1, 5.2, 505.2, 505.3, 505.4, 505.5]):
+        log.add(time, 7, k)
+    read = parse_usd_log(log.data(crc=False), PATH)
+    assert len(read.events["estSweepAngle"]) == 7
+    assert read.damage is not None
+    assert "no complete event" not in read.damage
+    # The time of one event is damaged: those behind it do not follow it.
+    log.events[3] = (90_000.0, 7, (3,))
+    read = parse_usd_log(log.data(crc=False, in_order=False), PATH)
+    assert len(read.events["estSweepAngle"]) == 3
+
+
 def test_zeros_behind_a_log_are_no_events(crazyflie: ModuleType) -> None:
     """A file system may have reserved space; 0 is also the number of an event."""
     log = small_log(crazyflie)
