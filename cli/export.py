@@ -260,7 +260,13 @@ def export_calibration(
     low_x, low_y, high_x, high_y = calibration.area_mm
     origin_x, origin_y = calibration.origin_mm
     console.result(f"Floor: x {low_x:.0f} to {high_x:.0f}, y {low_y:.0f} to {high_y:.0f} mm")
-    console.result(f"A DotBot at (x, y) reports (x {-origin_x:+.0f}, {origin_y:.0f} - y) mm")
+    console.result(f"A DotBot at (x, y) reports (x {0 - origin_x:+.0f}, {origin_y:.0f} - y) mm")
+    for station in calibration.stations:
+        if station.rms_mm > dotbot.MAX_USEFUL_ERROR_MM:
+            console.warn(
+                f"one homography is not enough for this floor and channel {station.channel}: "
+                "choose a smaller --area, or a station that is nearer to it"
+            )
     for channel in calibration.hidden_channels:
         console.warn(f"the station on channel {channel} sees too little of the floor: left out")
     for channel in channels:

@@ -175,7 +175,7 @@ def command(
       locatk calibrate scene run.mcap -o scene.toml
       locatk calibrate scene run.mcap -o scene.toml --scene two-3d
       locatk calibrate scene run.mcap -o scene.toml --floor --x-distance 1000
-      locatk calibrate scene run.mcap -o scene.toml
+      locatk calibrate scene run.mcap -o scene.toml \\
           --marker a=0,0 --marker b=2000,0 --marker c=2000,1500
       locatk calibrate scene -o scene.toml --wizard /dev/ttyACM0 --x-distance 1000
       locatk solve later.mcap -o solved.mcap --artifact scene.toml
@@ -183,13 +183,16 @@ def command(
     from locatk.formats.pipeline import SolveRequest
 
     if port is not None:
+        if points["markers"]:
+            raise click.UsageError("--wizard guides to points of the floor. Leave out --marker.")
         points["floor"] = True
     setup = scene_setup(**points)
+    artifacts = [] if artifact is None else [artifact]
     if port is not None:
         session = session or output.with_suffix(".mcap")
+        options.guard_output(output, overwrite=overwrite, inputs=artifacts)
         setup = record_with_guide(
             session,
-            output,
             setup,
             port=port,
             device=port_device or "auto",
@@ -208,16 +211,13 @@ def command(
         if session is None:
             raise click.UsageError("Missing argument 'SESSION'.")
         options.must_exist([session])
-        options.guard_output(
-            output, overwrite=overwrite, inputs=[session, *([artifact] if artifact else [])]
-        )
+        options.guard_output(output, overwrite=overwrite, inputs=[session, *artifacts])
     request = SolveRequest(method=method, scene=scene, artifact=artifact, setup=setup)
     solve_scene(session, output, request, overwrite=overwrite, as_json=as_json)
 
 
 def record_with_guide(
     session: Path,
-    output: Path,
     setup: SceneSetup,
     *,
     port: str,
@@ -241,7 +241,6 @@ def record_with_guide(
     if setup.origin or setup.x_axis or setup.ignored or setup.device:
         raise click.UsageError("--wizard finds the points itself: leave out their numbers.")
     options.check_ending(session, (".mcap",))
-    options.guard_output(output, overwrite=overwrite)
     guide = SceneGuide(floor_points, setup.x_distance_m)
     stop = threading.Event()
     with capture_text.live() as live, asked_to_stop(stop.set):
@@ -293,6 +292,9 @@ def scene_setup(
     if not (markers or has_floor) and (ignore or height):
         option = "--ignore" if ignore else "--height"
         raise click.UsageError(f"{option} needs --marker or --floor.")
+    for number in (origin, x_axis):
+        if number is not None and number in ignore:
+            raise click.UsageError(f"Standstill {number} is a point of the floor and ignored.")
     names = [name for name, _ in markers]
     if len(set(names)) < len(names):
         raise click.UsageError("Two markers have the same name.")

@@ -169,7 +169,7 @@ class SceneGuide:
         Raises
         ------
         InputError
-            The recording lacks one of them.
+            The recording lacks one of them, or two are the same.
         """
         device = self.accepted[0].device
         rests = [each for each in find_standstills(sweeps) if each.device == device]
@@ -184,6 +184,11 @@ class SceneGuide:
                     f"the rest at the {point.role} is not in the recording",
                     hint="give the points by --origin, --x-axis and --ignore",
                 )
+        if len(numbers) < len(self.accepted):
+            raise InputError(
+                "two of the points are one standstill in the recording",
+                hint="give the points by --origin, --x-axis and --ignore",
+            )
         by_role = {role: number for number, role in numbers.items()}
         return SceneSetup(
             has_floor=True,

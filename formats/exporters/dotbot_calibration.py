@@ -86,6 +86,9 @@ GRID_POINTS_PER_AXIS = 25
 MIN_VISIBLE_FRACTION = 0.1
 """Smallest fraction of the floor that a station has to see."""
 
+MAX_USEFUL_ERROR_MM = 50.0
+"""Largest error (rms) with which a robot can drive: its radius."""
+
 MAX_AZIMUTH_RAD = np.deg2rad(75.0)
 MAX_ELEVATION_RAD = np.deg2rad(55.0)
 """Field of view of a station, 150 by 110 degrees (Valve, SteamVR Base Station 2.0)."""

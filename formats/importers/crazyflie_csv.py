@@ -35,8 +35,7 @@ from locatk.formats.importers.crazyflie_usd.variables import (
     USED_VARIABLES,
     LogBlock,
     list_names,
-    read_imu,
-    read_onboard_track,
+    read_device_data,
 )
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.tables.delimited import Table, read_table
@@ -62,9 +61,12 @@ TICK_BITS = 24
 """Width of the time stamp of a log packet, which counts milliseconds (crazyflie-firmware
 ``log.c``). It wraps after 4 h 39 min 37 s."""
 
-MIN_STEPS = (("s", 0.0), ("ms", 5.0), ("us", 5e3), ("ns", 5e6))
-"""Units of time, and the smallest step of samples in them. The periods of log blocks are 10 ms to
-2.55 s (crazyflie-firmware ``log.c``)."""
+MAX_STEP_NS = 2_550_000_000
+"""Longest period of a log block (crazyflie-firmware ``log.c``); the shortest is 10 ms."""
+
+LARGE_STEP_QUANTILE = 0.95
+"""Quantile of the steps of time by which the unit of times is found. If one file has several
+blocks, sampled at different times, most steps are shorter than the period of a block."""
 
 MAX_VALUE = 1e10
 """Largest value of a variable; a packed quaternion is less than 2^32."""
@@ -72,8 +74,8 @@ MAX_VALUE = 1e10
 MAX_BACK_STEP_NS = 1_000_000_000
 """Largest step back of the times of packets; a larger one is a restart of the Crazyflie."""
 
-FIRST_DATE_NS = 1_000_000_000_000_000_000
-"""Smallest time that is taken for a date, in 2001. Earlier times count from an unknown start."""
+FIRST_DATE_NS, LAST_DATE_NS = 1_000_000_000_000_000_000, 4_000_000_000_000_000_000
+"""Times that are taken for dates, from 2001 to 2096. Others count from an unknown start."""
 
 
 @dataclass(frozen=True)
@@ -128,25 +130,19 @@ def read_crazyflie_csv(
     _align_wraps(files)
     _check_overlap(files)
     start_ns = min(int(each.time_ns.min()) for each in files)
-    shift_ns = 0 if start_ns >= FIRST_DATE_NS else UNDATED_START_NS - start_ns
-    blocks: list[LogBlock] = []
-    repeated = 0
-    for each in files:
-        block, count = LogBlock.ascending(each.time_ns + shift_ns, each.series)
-        blocks.append(block)
-        repeated += count
-    imu, track = read_imu(blocks, device), read_onboard_track(blocks, device)
-    sweeps, dropped = _sweeps(blocks, device)
+    is_dated = start_ns >= FIRST_DATE_NS
+    shift_ns = 0 if is_dated else UNDATED_START_NS - start_ns
+    data = read_device_data([(each.time_ns + shift_ns, each.series) for each in files], device)
+    sweeps, dropped = _sweeps(data.blocks, device)
     scene, warnings = read_scene(config, stations)
     if not len(sweeps):
         warnings.append("no angles of Lighthouse stations: the session cannot be solved")
-    if repeated:
-        warnings.append(f"{repeated} samples repeat the time of another one and are left out")
+    warnings += data.warnings
     omitted = sum(each.omitted for each in files)
     facts = {
         "format": "crazyflie-csv",
         "files": ", ".join(each.path.name for each in files),
-        "clock": "dates of the files" if shift_ns == 0 else "since the first sample",
+        "clock": "dates of the files" if is_dated else "since the first sample",
         "variables": list_names(names, len(names)),
     }
     if unused := {name for each in files for name in each.unused}:
@@ -164,8 +160,8 @@ def read_crazyflie_csv(
         "imported"
         if omitted
         else None,
-        imu=() if imu is None else (imu,),
-        onboard=() if track is None else (track,),
+        imu=data.imu,
+        onboard=data.onboard,
     )
 
 
@@ -273,10 +269,15 @@ def _times_ns(table: Table, name: str) -> IntArray:
 
 
 def _infer_unit(numbers: Array) -> str:
-    """Return the unit of times by the usual step between different ones."""
+    """Return the unit in which times are dates, or else the largest one with possible steps."""
     steps = np.diff(np.unique(numbers))
-    step = float(np.median(steps)) if len(steps) else 0.0
-    return [unit for unit, least in MIN_STEPS if step >= least][-1]
+    step = float(np.quantile(steps, LARGE_STEP_QUANTILE, method="lower")) if len(steps) else 0.0
+    possible = [unit for unit, size_ns in UNITS["time"].items() if step * size_ns <= MAX_STEP_NS]
+    first = float(numbers.min())
+    dates = [
+        unit for unit in possible if FIRST_DATE_NS <= first * UNITS["time"][unit] < LAST_DATE_NS
+    ]
+    return (dates or possible or ["ns"])[0]
 
 
 def _longest_run(time_ns: IntArray) -> tuple[IntArray, slice]:
@@ -314,23 +315,28 @@ def _check_overlap(files: Sequence[_LogFile]) -> None:
 
 
 def _sweeps(blocks: Sequence[LogBlock], device: str) -> tuple[Sweeps, int]:
-    """Return the logged rotor angles, and the number of samples that repeat one."""
+    """Return the logged rotor angles, and the number of samples that repeat one.
+
+    Of an angle in several blocks, the one with the most samples is used.
+    """
     parts: list[tuple[IntArray, IntArray, IntArray, Array]] = []
     repeated = 0
-    for block in blocks:
-        for name in ANGLES.keys() & block.columns.keys():
-            station, plane = ANGLES[name]
-            is_logged = np.isfinite(block.columns[name])
-            angle = block.columns[name][is_logged]
-            turns = (angle - ROTOR_ZERO_RAD[plane]) / (2 * np.pi)
-            is_new = np.diff(angle, prepend=np.nan) != 0
-            # The firmware's angles are 0 until the first light.
-            is_angle = (turns >= 0) & (turns < 1) & (angle != 0)
-            repeated += int(np.count_nonzero(is_angle & ~is_new))
-            rows = np.flatnonzero(is_angle & is_new)
-            counts = turns[rows] * period_counts(station + 1)
-            labels = (np.full(len(rows), station + 1), np.full(len(rows), plane))
-            parts.append((block.time_ns[is_logged][rows], *labels, counts))
+    for name, (station, plane) in ANGLES.items():
+        owners = [block for block in blocks if name in block.columns]
+        if not owners:
+            continue
+        block = max(owners, key=lambda block: len(block.time_ns))
+        is_logged = np.isfinite(block.columns[name])
+        angle = block.columns[name][is_logged]
+        turns = (angle - ROTOR_ZERO_RAD[plane]) / (2 * np.pi)
+        is_new = np.diff(angle, prepend=np.nan) != 0
+        # The firmware's angles are 0 until the first light.
+        is_angle = (turns >= 0) & (turns < 1) & (angle != 0)
+        repeated += int(np.count_nonzero(is_angle & ~is_new))
+        rows = np.flatnonzero(is_angle & is_new)
+        counts = turns[rows] * period_counts(station + 1)
+        labels = (np.full(len(rows), station + 1), np.full(len(rows), plane))
+        parts.append((block.time_ns[is_logged][rows], *labels, counts))
     if not parts:
         parts = [(np.zeros(0, np.int64), np.zeros(0, int), np.zeros(0, int), np.zeros(0))]
     columns = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -131,7 +131,7 @@ def _names(session: Session) -> dict[str, tuple[str, ...]]:
         record = json.loads(data)
         is_newer = record["version"] > FRAMES_VERSION
         names = {str(key): tuple(map(str, value)) for key, value in record["names"].items()}
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise FormatError("damaged names", file=session.path, where=FRAMES_FILE) from None
     if is_newer:
         raise FormatError(

@@ -214,7 +214,7 @@ def read_solution(path: str | os.PathLike[str]) -> Solution:
         )
     except LocatkError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise FormatError("damaged solution", file=path, where=SOLUTION_FILE) from None
 
 

@@ -47,10 +47,9 @@ def test_every_help_has_valid_examples(
     result = locatk(*path, "--help")
     assert result.exit_code == 0
     assert "Examples:" in result.stdout
-    text = result.stdout.split("Examples:")[1].replace("\\\n", " ")
-    examples = [line.strip() for line in text.splitlines()]
-    examples = [line for line in examples if line.startswith("locatk ")]
-    assert examples
+    block = result.stdout.split("Examples:\n")[1].split("\n\n")[0]
+    examples = [line.strip() for line in block.replace("\\\n", " ").splitlines()]
+    assert [line for line in examples if not line.startswith("locatk ")] == []
     assert any(line.startswith("locatk " + " ".join(path)) for line in examples)
     monkeypatch.setattr(Path, "exists", lambda self, **_: True)
     monkeypatch.delenv("LOCATK_DATA", raising=False)

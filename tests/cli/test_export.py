@@ -323,6 +323,11 @@ def test_a_calibration_for_dotbots(locatk, tmp_path: Path) -> None:
     assert [sorted(each) for each in file["stations"]] == [
         ["channel", "max_mm", "rms_mm", "visible_fraction"]
     ] * 2
+    assert "one homography is not enough" not in result.stderr
+    result = locatk(*scene, "--area", "0,0,2000,-1000", "--overwrite")
+    assert "reports (x +0, 0 - y) mm" in result.stdout
+    result = locatk(*scene, "--area", "-20000,-20000,20000,20000", "--overwrite")
+    assert "one homography is not enough for this floor and channel" in result.stderr
     for wrong in ("1,2,3", "0,0,50,50", "a,b,c,d", "nan,0,1000,1000"):
         assert locatk(*scene, "--area", wrong, "--overwrite").exit_code == 2
     assert locatk(*scene, "--frame", "as-is", "--overwrite").exit_code == 2

@@ -41,7 +41,11 @@ CRC_BYTES = 4
 
 MAX_STEP_S = 60.0
 """Longest time between two events of a file without a correct checksum [s]. A larger step is damage
-that led to a wrong event; the firmware buffers a few seconds at most."""
+that led to a wrong event, unless the next events follow it: a log of sweeps alone has a gap if
+there is no light."""
+
+FOLLOWING_EVENTS = 3
+"""Number of events that must follow a larger step."""
 
 MAX_BACK_STEP_S = 1.0
 """Largest step back of the timestamps [s]. Events of several tasks are out of order by 0.2 ms; a
@@ -242,6 +246,19 @@ def _find_events(
     resets: list[int] = []
     last: int | None = None
     position, end = 0, len(body)
+
+    def follows(position: int, time: int) -> bool:
+        """Return whether events of about this time are behind the one at a position."""
+        for _ in range(FOLLOWING_EVENTS):
+            position += sizes[int.from_bytes(body[position : position + 2], "little")]
+            size = sizes.get(int.from_bytes(body[position : position + 2], "little"))
+            if size is None or position + size > end:
+                return False
+            following = int.from_bytes(body[position + 2 : position + time_end], "little")
+            if not -max_back_step <= following - time <= max_step:
+                return False
+        return True
+
     while position + 2 <= end:
         number = body[position] | body[position + 1] << 8
         size = sizes.get(number)
@@ -251,7 +268,8 @@ def _find_events(
         if last is not None and not -max_back_step <= time - last <= max_step:
             # Zeros behind the end of a log are no event: the clock has microseconds.
             is_reset = 0 < time < last and time <= max_step and version > 1
-            if check_times and not is_reset:
+            is_gap = time > last and follows(position, time)
+            if check_times and not is_reset and not is_gap:
                 break
             if time < last:
                 resets.append(position)

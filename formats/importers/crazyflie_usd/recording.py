@@ -15,7 +15,7 @@ rate is estimated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +39,8 @@ from locatk.formats.importers.crazyflie_usd.sweeps import (
 )
 from locatk.formats.importers.crazyflie_usd.variables import (
     USED_VARIABLES,
-    LogBlock,
     list_names,
-    read_imu,
-    read_onboard_track,
+    read_device_data,
 )
 from locatk.formats.importers.imported_session import ImportedSession
 from locatk.formats.tables.timestamps import UNDATED_START_NS
@@ -157,8 +155,7 @@ def read_crazyflie_usd(
         )
     warnings += problems
     start_s = _start_s(log, logged)
-    blocks, repeated = _log_blocks(log, logged.clock, start_s)
-    imu, track = read_imu(blocks, device), read_onboard_track(blocks, device)
+    data = read_device_data(_find_variables(log, logged.clock, start_s), device)
     if not logged.clock.is_estimated:
         warnings.append(
             "the log is too short to determine the rate of the Crazyflie's clock: times are off by "
@@ -167,8 +164,7 @@ def read_crazyflie_usd(
     unused = sum(logged.rejected.values())
     if unused > MAX_USUAL_REJECTIONS * (len(logged) + unused):
         warnings.append(f"sweeps are missing: {describe_rejected(logged.rejected)}")
-    if repeated:
-        warnings.append(f"{repeated} samples repeat the time of another one and are left out")
+    warnings += data.warnings
     lost = [] if log.damage is None else [log.damage]
     if log.omitted:
         lost.append(
@@ -184,8 +180,8 @@ def read_crazyflie_usd(
         warnings,
         receivers={device: read_mounted_receiver(receiver, mounting)},
         lost="; ".join(lost) or None,
-        imu=() if imu is None else (imu,),
-        onboard=() if track is None else (track,),
+        imu=data.imu,
+        onboard=data.onboard,
     )
 
 
@@ -255,9 +251,8 @@ def _candidate_sources(
 
 def _read_sweeps(log: UsdLog, event: Event, source: str) -> LoggedSweeps | None:
     """Return the sweeps of a source; None if none is usable."""
-    if source == "uart":
-        return read_uart_frames(event, log.resolution_s)
-    return read_angles(event, clock_rates(log), log.resolution_s)
+    read = read_uart_frames if source == "uart" else read_angles
+    return read(event, clock_rates(log), log.resolution_s)
 
 
 def clock_rates(log: UsdLog) -> list[tuple[float, float]]:
@@ -275,19 +270,15 @@ def clock_rates(log: UsdLog) -> list[tuple[float, float]]:
     return [NOMINAL_RATES, SLOW_RATES]
 
 
-def _log_blocks(log: UsdLog, clock: ClockLine, start_s: float) -> tuple[list[LogBlock], int]:
-    """Return the variables of each event that are imported, and the number of repeated times."""
-    blocks = []
-    repeated = 0
+def _find_variables(
+    log: UsdLog, clock: ClockLine, start_s: float
+) -> Iterator[tuple[IntArray, dict[str, Array]]]:
+    """Yield the times and the values of the variables of each event that are imported."""
     for event in log.events.values():
         names = USED_VARIABLES & event.columns.keys()
         if names and len(event):
-            columns = {name: event.floats(name) for name in names}
             time_ns = _to_ns(clock.to_reference(event.time_s), start_s)
-            block, count = LogBlock.ascending(time_ns, columns)
-            blocks.append(block)
-            repeated += count
-    return blocks, repeated
+            yield time_ns, {name: event.floats(name) for name in names}
 
 
 def _start_s(log: UsdLog, logged: LoggedSweeps) -> float:

@@ -37,6 +37,9 @@ STATION_LIMITS = (2, 4, 16)
 """Numbers of stations for which firmware is built. A frame of an unknown channel has this number
 as its station (``pulse_processor.h``, ``lighthouse_core.c``)."""
 
+MIN_OFFSET_FRACTION = 0.05
+"""Smallest fraction of the frames of a station that have an offset; fewer are wrong ones."""
+
 SWEEP_EVENTS = {
     "uart": ("lhUartFrame", ("sensor", "basestation", "offset", "timestampfpga"), ()),
     "lhangle": ("lhAngle", ("sensor", "basestation", "sweep"), ("angle",)),
@@ -84,25 +87,31 @@ class LoggedSweeps:
         return len(self.time_s)
 
 
-def read_uart_frames(event: Event, resolution_s: float) -> LoggedSweeps | None:
+def read_uart_frames(
+    event: Event, rates: Sequence[tuple[float, float]], resolution_s: float
+) -> LoggedSweeps | None:
     """Return the sweeps of the frames of a Lighthouse deck; None if none is usable.
 
-    ``resolution_s`` is that of the Crazyflie's stamps.
+    ``rates`` are the possible rates of the Crazyflie's clock, ``resolution_s`` that of its stamps.
     """
     columns = event.columns
     station, offset = columns["basestation"].astype(np.int64), columns["offset"].astype(np.int64)
     sensor = columns["sensor"].astype(np.int64)
-    has_long_counter = "timestamp2fpga" in columns and columns["timestamp2fpga"].dtype.kind in "iu"
-    bits, name = (32, "timestamp2fpga") if has_long_counter else (24, "timestampfpga")
-    tick = unwrap_counter(columns[name].astype(np.int64), event.time_s, PULSE_HZ, bits)
-    clock = fit_clock_line(tick / PULSE_HZ, event.time_s, resolution_s=resolution_s)
-    if clock is None:
+    fits = [
+        fit
+        for limits in rates
+        if (fit := _fit_counter(event, float(np.mean(limits)), resolution_s)) is not None
+    ]
+    if not fits:
         return None
+    # A counter of 24 bits wraps every 0.7 s: with a wrong rate, a gap of 30 s has too many or few.
+    tick, clock = min(
+        fits, key=lambda fit: float(np.mean(np.abs(_delay_s(event.time_s, *fit)).clip(max=1.0)))
+    )
     clock = ClockLine(clock.offset_s - FRAME_S * clock.rate, clock.rate, clock.is_estimated)
     is_usable = (station >= 0) & (station < len(CHANNELS)) & (station != unknown_station(event))
     channel = np.where(is_usable, station + CHANNELS[0], UNKNOWN)
-    delay_s = clock.to_reference(event.time_s) - tick / PULSE_HZ
-    is_timed = np.abs(delay_s) <= MAX_TIME_ERROR_S
+    is_timed = np.abs(_delay_s(event.time_s, tick, clock)) <= MAX_TIME_ERROR_S
     is_timed &= (sensor >= 0) & (sensor < SENSOR_COUNT)
     rows = np.flatnonzero(is_timed)
     labelled = label_pulses(tick[rows], sensor[rows], channel[rows], offset[rows])
@@ -124,6 +133,23 @@ def read_uart_frames(event: Event, resolution_s: float) -> LoggedSweeps | None:
     )
 
 
+def _fit_counter(
+    event: Event, rate: float, resolution_s: float
+) -> tuple[IntArray, ClockLine] | None:
+    """Return the deck's counter without wraps, and the Crazyflie's clock of about this rate."""
+    columns = event.columns
+    has_long_counter = "timestamp2fpga" in columns and columns["timestamp2fpga"].dtype.kind in "iu"
+    bits, name = (32, "timestamp2fpga") if has_long_counter else (24, "timestampfpga")
+    tick = unwrap_counter(columns[name].astype(np.int64), event.time_s / rate, PULSE_HZ, bits)
+    clock = fit_clock_line(tick / PULSE_HZ, event.time_s, resolution_s=resolution_s)
+    return None if clock is None else (tick, clock)
+
+
+def _delay_s(time_s: Array, tick: IntArray, clock: ClockLine) -> Array:
+    """Return the times from the counter to the stamps of the Crazyflie, by the deck's clock."""
+    return clock.to_reference(time_s) - tick / PULSE_HZ
+
+
 def find_sources(events: Mapping[str, Event]) -> list[str]:
     """Return the sources of sweeps in a log, the best first."""
     sources = []
@@ -140,13 +166,13 @@ def find_sources(events: Mapping[str, Event]) -> list[str]:
 def unknown_station(event: Event) -> int:
     """Return the station of frames of an unknown channel, -1 if there are none.
 
-    It is the largest station, of which no frame has an offset: the offset is found only of pulses
-    with a known channel.
+    It is the largest station, of which hardly any frame has an offset: the offset is found only of
+    pulses with a known channel, of four in ten of these.
     """
     station, offset = event.columns["basestation"], event.columns["offset"]
     largest = int(station.max(initial=0))
-    has_offset = bool(np.any(offset[station == largest] > 0))
-    return largest if largest in STATION_LIMITS and not has_offset else -1
+    fraction = float(np.mean(offset[station == largest] > 0)) if len(station) else 0.0
+    return largest if largest in STATION_LIMITS and fraction < MIN_OFFSET_FRACTION else -1
 
 
 def read_angles(

@@ -40,6 +40,10 @@ USED_VARIABLES = frozenset(
 MAX_JOIN_GAP_NS = 200_000_000
 """Longest time between two samples of a variable that are interpolated to the times of another."""
 
+MAX_USUAL_LOSS = 0.02
+"""Fraction of the positions without an orientation up to which there is no warning: blocks do not
+begin and end at the same time."""
+
 
 @dataclass(frozen=True)
 class LogBlock:
@@ -76,6 +80,56 @@ class LogBlock:
         return cls(unique, merged), repeated
 
 
+@dataclass(frozen=True)
+class DeviceData:
+    """IMU and on-board poses of a log.
+
+    Attributes
+    ----------
+    blocks : list of LogBlock
+        The variables in order of time.
+    imu : tuple of InertialSamples
+        One, or none if neither accelerometer nor gyroscope was logged.
+    onboard : tuple of Trajectory
+        The poses that the Crazyflie estimated, or none if they were not logged.
+    warnings : list of str
+        Losses, one line each.
+    """
+
+    blocks: list[LogBlock]
+    imu: tuple[InertialSamples, ...]
+    onboard: tuple[Trajectory, ...]
+    warnings: list[str]
+
+
+def read_device_data(
+    samples: Iterable[tuple[NDArray[np.int64], dict[str, Array]]], device: str
+) -> DeviceData:
+    """Return IMU and on-board poses, given the times and the variables of each block."""
+    blocks: list[LogBlock] = []
+    repeated = 0
+    for time_ns, columns in samples:
+        block, count = LogBlock.ascending(time_ns, columns)
+        blocks.append(block)
+        repeated += count
+    warnings = []
+    if repeated:
+        warnings.append(f"{repeated} samples repeat the time of another one and are left out")
+    imu = read_imu(blocks, device)
+    track, without_orientation = read_onboard_track(blocks, device)
+    if track is not None and without_orientation > MAX_USUAL_LOSS * len(track):
+        warnings.append(
+            f"{without_orientation} on-board positions are left out: no orientation was logged "
+            f"within {MAX_JOIN_GAP_NS // 1_000_000} ms"
+        )
+    return DeviceData(
+        blocks,
+        () if imu is None else (imu,),
+        () if track is None else (track,),
+        warnings,
+    )
+
+
 def read_imu(blocks: Sequence[LogBlock], device: str) -> InertialSamples | None:
     """Return the samples of accelerometer and gyroscope; None if neither was logged."""
     sources = [_find(blocks, names) for names in (ACCELERATION, ANGULAR_RATE)]
@@ -92,41 +146,36 @@ def read_imu(blocks: Sequence[LogBlock], device: str) -> InertialSamples | None:
     return InertialSamples(device, time_ns, *samples)
 
 
-def read_onboard_track(blocks: Sequence[LogBlock], device: str) -> Trajectory | None:
-    """Return the poses that the Crazyflie estimated; None if they were not logged.
+def read_onboard_track(blocks: Sequence[LogBlock], device: str) -> tuple[Trajectory | None, int]:
+    """Return the poses that the Crazyflie estimated, and the number of positions left out.
 
-    The orientation is the quaternion if it was logged, else roll, pitch and yaw. The estimates have
-    no covariance.
+    They are None if no position was logged. The orientation is the quaternion if it was logged,
+    else roll, pitch and yaw; positions of an unknown one are left out, unless it is unknown of all.
+    The estimates have no covariance.
     """
-    for position_names, unit, quaternion_names in (
-        (POSITION, 1.0, QUATERNION),
-        (COMPRESSED_POSITION, 1e-3, COMPRESSED_QUATERNION),
-    ):
+    for position_names, unit in ((POSITION, 1.0), (COMPRESSED_POSITION, 1e-3)):
         source = _find(blocks, position_names)
         if source is None:
             continue
         time_ns, position = source[0], unit * source[1]
-        quaternion = _orientations(blocks, quaternion_names, time_ns)
-        if quaternion is None:
-            return Trajectory.from_positions(device, FRAME, time_ns, position)
+        quaternion = _orientations(blocks, time_ns)
         is_known = ~np.isnan(quaternion).any(axis=1)
-        return Trajectory(
-            device,
-            FRAME,
-            time_ns[is_known],
-            position[is_known],
-            quaternion[is_known],
-            np.full((int(is_known.sum()), 6, 6), np.nan),
-        )
-    return None
+        count = int(is_known.sum())
+        if not count:
+            return Trajectory.from_positions(device, FRAME, time_ns, position), 0
+        covariance = np.full((count, 6, 6), np.nan)
+        poses = time_ns[is_known], position[is_known], quaternion[is_known]
+        return Trajectory(device, FRAME, *poses, covariance), len(time_ns) - count
+    return None, 0
 
 
 def _find(
-    blocks: Sequence[LogBlock], names: tuple[str, ...]
+    blocks: Sequence[LogBlock], names: tuple[str, ...], *, period: float | None = None
 ) -> tuple[NDArray[np.int64], Array] | None:
     """Return times (n,) and finite values (n, k) of variables; None if one was not logged.
 
-    Variables of different blocks are interpolated to the times of the first.
+    Variables of different blocks are interpolated to the times of the first. ``period`` is that of
+    variables that wrap.
     """
     complete = [block for block in blocks if all(name in block.columns for name in names)]
     if complete:
@@ -135,13 +184,13 @@ def _find(
         values = np.column_stack([block.columns[name] for name in names])
     else:
         owners = [next((b for b in blocks if name in b.columns), None) for name in names]
-        if any(owner is None for owner in owners):
-            return None
         found = [owner for owner in owners if owner is not None]
+        if len(found) < len(names):
+            return None
         time_ns = found[0].time_ns
         values = np.column_stack(
             [
-                interpolate(owner.time_ns, owner.columns[name][:, None], time_ns)[:, 0]
+                _interpolate_variable(owner, name, time_ns, period)
                 for owner, name in zip(found, names, strict=True)
             ]
         )
@@ -149,20 +198,32 @@ def _find(
     return (time_ns[is_finite], values[is_finite]) if is_finite.any() else None
 
 
-def _orientations(
-    blocks: Sequence[LogBlock], quaternion_names: tuple[str, ...], time_ns: NDArray[np.int64]
-) -> Array | None:
-    """Return quaternions (n, 4) at the times; ``nan`` if unknown, None if none was logged."""
-    source = _find(blocks, quaternion_names)
-    if source is not None and len(quaternion_names) == 1:
-        quaternion = decompress_quaternions(source[1][:, 0].astype(np.uint32))
-    elif source is not None:
+def _interpolate_variable(
+    block: LogBlock, name: str, time_ns: NDArray[np.int64], period: float | None
+) -> Array:
+    """Interpolate one variable to other times (m,)."""
+    is_known = np.isfinite(block.columns[name])
+    values = block.columns[name][is_known]
+    if not len(values):
+        return np.full(len(time_ns), np.nan)
+    if period is not None:
+        values = np.unwrap(values, period=period)
+    return interpolate(block.time_ns[is_known], values[:, None], time_ns)[:, 0]
+
+
+def _orientations(blocks: Sequence[LogBlock], time_ns: NDArray[np.int64]) -> Array:
+    """Return quaternions (n, 4) at the times; ``nan`` if unknown."""
+    if (source := _find(blocks, QUATERNION)) is not None:
         quaternion = source[1]
-    else:
-        source = _find(blocks, EULER_ANGLES)
-        if source is None:
-            return None
+    elif (source := _find(blocks, COMPRESSED_QUATERNION)) is not None:
+        packed = source[1][:, 0]
+        is_valid = (packed >= 0) & (packed < 2**32)
+        quaternion = decompress_quaternions(np.where(is_valid, packed, 0).astype(np.uint32))
+        quaternion[~is_valid] = np.nan
+    elif (source := _find(blocks, EULER_ANGLES, period=360.0)) is not None:
         quaternion = quaternions_from_euler(np.deg2rad(source[1]))
+    else:
+        return np.full((len(time_ns), 4), np.nan)
     # Opposite quaternions are the same rotation; neighbours must not be opposite.
     flips = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
     quaternion = quaternion * np.where(np.cumsum(np.append(False, flips)) % 2, -1.0, 1.0)[:, None]

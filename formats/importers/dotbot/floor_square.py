@@ -65,6 +65,9 @@ MAX_FLOOR_SLOPE = 0.05
 """Largest difference of the heights of corners on one floor, relative to their distance. Averaging
 the heights changes lengths by half of its square, 0.1 %."""
 
+MAX_COORDINATE = 1e7
+"""Largest coordinate of a corner: 10 km in millimetres."""
+
 MAX_PIXELS = 1e5
 """Largest coordinate in a video: no frame is that wide."""
 
@@ -207,6 +210,8 @@ def _read_entries(path: Path) -> dict[str, Any]:
         ) from error
     except RecursionError:
         raise FormatError("not a calibration: nested too deeply", file=path) from None
+    except ValueError:  # An integer of more than 4300 digits.
+        raise FormatError("not a calibration: a number is too long", file=path) from None
     if not isinstance(content, dict):
         raise FormatError("not a calibration: should be an object", file=path)
     entries = {"": content} if any(key in content for key in METRES) else content
@@ -236,17 +241,17 @@ def _parse_square(path: Path, name: str, video: Any) -> FloorSquare:
         return {corner: point[:2] for corner, point in points(key).items()}
 
     floor_m = {corner: METRES[unit] * point for corner, point in points(unit).items()}
-    axes = "axes as given"
+    changes = []
     corners_m = np.array(list(floor_m.values()))
     relief_m = np.ptp(corners_m[:, 2]) if len(corners_m) else 0.0
     if 0 < relief_m <= MAX_FLOOR_SLOPE * np.ptp(corners_m[:, :2], axis=0).max():
-        axes = f"heights averaged over {1e3 * relief_m:.0f} mm"
+        changes.append(f"heights averaged over {1e3 * relief_m:.0f} mm")
         floor_m = {c: np.append(p[:2], corners_m[:, 2].mean()) for c, p in floor_m.items()}
     if all(corner in floor_m for corner in CLOCKWISE):
         x, y, _ = np.array([floor_m[corner] for corner in CLOCKWISE]).T
         if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) > 0:
             floor_m = {corner: value * [1.0, -1.0, 1.0] for corner, value in floor_m.items()}
-            axes += ", y negated, so that z is up"
+            changes.append("y negated, so that z is up")
     stays = {
         corner: _stay(value, path, f"timestamps_lh2.{corner}")
         for corner, value in _object(
@@ -261,7 +266,7 @@ def _parse_square(path: Path, name: str, video: Any) -> FloorSquare:
         planar_points("corners_px"),
         planar_points("corners_lh2"),
         stays,
-        axes,
+        ", ".join(changes) or "axes as given",
         f"{number} circles" if number else "",
     )
     for part in (square.pixels, square.plane, square.stays):
@@ -279,11 +284,18 @@ def _object(value: Any, path: Path, where: str) -> dict[str, Any]:
 
 def _point(value: Any, path: Path, where: str) -> Array:
     """Return the two or three numbers of a list as a point (3,); z is zero if it is missing."""
-    is_valid = isinstance(value, list) and len(value) in (2, 3)
-    if is_valid:
-        is_valid = all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
-    if not is_valid or not np.all(np.isfinite(np.array(value, float))):
-        raise FormatError(f"{str(value)[:40]} should be two finite numbers", file=path, where=where)
+    is_valid = (
+        isinstance(value, list)
+        and len(value) in (2, 3)
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+        and all(abs(v) <= MAX_COORDINATE for v in value)
+    )
+    if not is_valid:
+        raise FormatError(
+            f"{repr(value)[:40]} should be two numbers up to {MAX_COORDINATE:.0e}",
+            file=path,
+            where=where,
+        )
     return np.array([*value, 0.0][:3], float)
 
 

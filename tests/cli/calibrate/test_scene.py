@@ -212,6 +212,8 @@ def test_factory_calibrations_of_an_artifact_and_standstills(
         ((*MARKERS, "--floor"), 2, "Give one of them"),
         (("--height", 5), 2, "--height needs --marker or --floor"),
         (("--ignore", 1), 2, "--ignore needs"),
+        (("--floor", "--origin", 2, "--ignore", 2), 2, "Standstill 2 is"),
+        (("--floor", "--x-axis", 1, "--ignore", 1), 2, "Standstill 1 is"),
         (("--x-distance", -1), 2, "x>0"),
         (("--floor", "--device", "x"), 1, "device 'x' did not rest"),
         (("--floor", "--origin", 99), 1, "no standstill 99"),

@@ -103,7 +103,7 @@ def test_a_port_without_light(
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (("--marker", "a=0,0", "--marker", "b=1,0", "--marker", "c=0,1"), "Give one of them"),
+        (("--marker", "a=0,0", "--marker", "b=1,0", "--marker", "c=0,1"), "Leave out --marker"),
         (("--origin", 1), "leave out their numbers"),
         (("run.txt",), "ends in '.txt'"),
     ],
@@ -128,4 +128,7 @@ def test_options_of_the_wizard_need_it(locatk: Callable[..., Any], tmp_path: Pat
     result = locatk("calibrate", "scene", "-o", out, "--wizard", tmp_path / "none")
     assert result.exit_code == 1
     assert out.read_text() == "mine"
+    args = ("--wizard", tmp_path / "none", "--artifact", out, "--overwrite")
+    result = locatk("calibrate", "scene", "-o", out, *args)
+    assert "the output is one of the inputs" in result.stderr
     assert not out.with_suffix(".mcap").exists()

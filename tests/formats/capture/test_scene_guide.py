@@ -144,3 +144,11 @@ def test_a_point_that_is_not_in_the_recording(recorded: Sweeps) -> None:
     first_ns = int(recorded.time_ns.min())
     with pytest.raises(InputError, match="the rest at the origin is not in the recording"):
         guide.setup(recorded.take(recorded.time_ns > first_ns + 2 * S), None, 0.0)
+
+
+def test_two_points_in_one_standstill(recorded: Sweeps) -> None:
+    guide = SceneGuide(floor_points=0, motion_s=1.0)
+    follow(guide, recorded)
+    guide.accepted[1] = replace(guide.accepted[0], role=guide.accepted[1].role)
+    with pytest.raises(InputError, match="one standstill"):
+        guide.setup(recorded, None, 0.0)

@@ -162,45 +162,23 @@ def test_sweeps_refer_to_the_starts_of_pulses(delays: list[int], half_width: int
     assert columns["count"].tolist() == [40_000 + (d - half_width) / 4 for d in delays]
 
 
-PUBLISHED_FRAMES = """
-    1 5431ed 13d None     0 128aa
-    0 543291 141    0 28992 1a639
-    3 5436c4 147    0     0 1f5dc
-    2 543769 140    0     0 026f3
-    0 56bcd9 120 None     0 1b903
-    1 56be78 110    0 70714 175a5
-    2 56c094 113    0     0 05879
-    3 56c21a 12a    0     0 1c094
-    1 5b82f5 13f None     0 0debe
-    0 5b8395 144    1 28992 11c42
-    3 5b87c8 146    1     0 194c5
-    2 5b8870 144    1     0 19e30
-    0 5e0dcf 118 None     0 19864
-    1 5e0f71 119    1 70711 1511f
-    2 5e1189 113    1     0 0d239
-    3 5e1314 127    1     0 08c31
-"""
-"""Sensor, time, width, polynomial, offset and beam word of frames that a deck sent: readme of
-bitcraze/lighthouse-fpga."""
-
-
-def test_published_frames_give_the_same_sweeps_by_wire_and_by_radio() -> None:
+def test_published_frames_give_the_same_sweeps_by_wire_and_by_radio(
+    published_frames: list[dict[str, Any]],
+) -> None:
     wire, packets = b"\xff" * 12, []
     delays: dict[int, tuple[int, int]] = {}
     channel, reference, offset = -1, 0, 0
-    for line in PUBLISHED_FRAMES.split("\n")[1:-1]:
-        sensor, tick, width, polynomial, position, word = line.split()
-        number = None if polynomial == "None" else int(polynomial)
+    for each in published_frames:
+        sensor, tick, width, number, position, word = each.values()
         head = 0xFC if number is None else number << 2
-        fields = ((head | int(sensor), 1), (int(width, 16), 2), (int(position), 3))
-        fields = (*fields, (int(word, 16), 3), (int(tick, 16), 3))
+        fields = ((head | sensor, 1), (width, 2), (position, 3), (word, 3), (tick, 3))
         wire += b"".join(value.to_bytes(size, "little") for value, size in fields)
         # As lighthouse_transmit.c: a record when all four photodiodes were lit.
-        delays[int(sensor)] = int(tick, 16), int(width, 16) // 2
+        delays[sensor] = tick, width // 2
         if number is not None and channel < 0:
-            channel, reference = number, int(tick, 16)
-        if int(position):
-            reference, offset = int(tick, 16), int(position)
+            channel, reference = number, tick
+        if position:
+            reference, offset = tick, position
         if len(delays) == 4:
             sent = {key: start + half - reference for key, (start, half) in delays.items()}
             packets.append(passage(channel // 2 + 1, channel % 2, offset, reference, sent))

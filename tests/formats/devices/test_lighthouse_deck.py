@@ -29,27 +29,6 @@ from locatk.formats.devices.lighthouse_deck import (
 )
 from locatk.formats.importers.dotbot.recording import read_dotbot
 
-README = """
-    1 5431ed 13d None     0 128aa
-    0 543291 141    0 28992 1a639
-    3 5436c4 147    0     0 1f5dc
-    2 543769 140    0     0 026f3
-    0 56bcd9 120 None     0 1b903
-    1 56be78 110    0 70714 175a5
-    2 56c094 113    0     0 05879
-    3 56c21a 12a    0     0 1c094
-    1 5b82f5 13f None     0 0debe
-    0 5b8395 144    1 28992 11c42
-    3 5b87c8 146    1     0 194c5
-    2 5b8870 144    1     0 19e30
-    0 5e0dcf 118 None     0 19864
-    1 5e0f71 119    1 70711 1511f
-    2 5e1189 113    1     0 0d239
-    3 5e1314 127    1     0 08c31
-"""
-"""Sensor, TS, Width, polynomial of Mode, SyncTime and BeamWord of frames that a deck sent:
-readme of bitcraze/lighthouse-fpga, ``print_frame.py``."""
-
 
 def frame(
     sensor: int,
@@ -64,15 +43,10 @@ def frame(
     return b"".join(value.to_bytes(size, "little") for value, size in fields)
 
 
-def published() -> bytes:
-    frames = []
-    for line in README.split("\n")[1:-1]:
-        sensor, tick, width, polynomial, offset, word = line.split()
-        number = None if polynomial == "None" else int(polynomial)
-        frames.append(
-            frame(int(sensor), int(tick, 16), number, int(offset), int(word, 16), int(width, 16))
-        )
-    return b"".join(frames)
+@pytest.fixture
+def published(published_frames: list[dict[str, Any]]) -> bytes:
+    """Bytes of frames that a deck sent."""
+    return b"".join(frame(**each) for each in published_frames)
 
 
 def word(count: int, polynomial: int) -> int:
@@ -145,8 +119,8 @@ EXPECTED, _CLEAN_DECODER = decode(CLEAN)
 EXPECTED_COUNTS = _CLEAN_DECODER.counts
 
 
-def test_frames_that_a_deck_sent() -> None:
-    got, decoder = decode(SYNC_FRAME + published() + SYNC_FRAME)
+def test_frames_that_a_deck_sent(published: bytes) -> None:
+    got, decoder = decode(SYNC_FRAME + published + SYNC_FRAME)
     assert got["sensor"].tolist() == [1, 0, 3, 2, 0, 1, 2, 3, 1, 0, 3, 2, 0, 1, 2, 3]
     assert got["polynomial"].tolist() == [0] * 8 + [1] * 8
     assert set(got["channel"]) == {1}
@@ -159,9 +133,11 @@ def test_frames_that_a_deck_sent() -> None:
     assert (decoder.counts.frames, decoder.counts.bad, decoder.remarks) == (18, 0, [])
 
 
-def test_beam_words_that_a_deck_sent_stand_where_time_says() -> None:
-    got, _ = decode(SYNC_FRAME + published())
-    words = [int(line.split()[5], 16) for line in README.split("\n")[1:-1]]
+def test_beam_words_that_a_deck_sent_stand_where_time_says(
+    published: bytes, published_frames: list[dict[str, Any]]
+) -> None:
+    got, _ = decode(SYNC_FRAME + published)
+    words = [each["word"] for each in published_frames]
     index = lfsr.indices(words, got["polynomial"].astype(int))
     assert np.abs(index - got["count"]).max() <= 0.75 < MAX_COUNT_DIFFERENCE
 
@@ -461,9 +437,9 @@ def test_words_that_say_nothing_are_not_used(words: int) -> None:
     assert decoder.counts.bad == 0
 
 
-def test_sweeps_come_with_the_next_passage_or_in_the_dark() -> None:
+def test_sweeps_come_with_the_next_passage_or_in_the_dark(published: bytes) -> None:
     passages = [
-        published()[k : k + 4 * FRAME_BYTES] for k in range(0, 16 * FRAME_BYTES, 4 * FRAME_BYTES)
+        published[k : k + 4 * FRAME_BYTES] for k in range(0, 16 * FRAME_BYTES, 4 * FRAME_BYTES)
     ] * 2
     decoder = DeckDecoder(Options())
     given = [sum(map(len, decoder.feed(data))) for data in (SYNC_FRAME, *passages)]

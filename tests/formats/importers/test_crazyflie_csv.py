@@ -132,6 +132,28 @@ def test_rows_of_single_values_are_collected(crazyflie: ModuleType, tmp_path: Pa
     check(read_crazyflie_csv([path]), flight, t)
 
 
+@pytest.mark.parametrize(
+    ("unit_s", "start_s"),
+    [(1e-3, 12.5), (1e-3, 1_717_156_981.0), (1e-6, 1_717_156_981.0), (1e-6, 2.0), (1.0, 12.5)],
+)
+def test_units_are_recognised_if_blocks_are_sampled_in_turn(
+    tmp_path: Path, unit_s: float, start_s: float
+) -> None:
+    """Most steps of time are then a tenth of the period of a block."""
+    groups = (IMU[:3], IMU[3:], POSITION)
+    rows = [
+        (round((start_s + 0.01 * k + 0.001 * phase) / unit_s, 4), name, 1.0)
+        for k in range(100)
+        for phase, names in enumerate(groups)
+        for name in names
+    ]
+    session = read_crazyflie_csv([write(tmp_path / "log.csv", ["time", "name", "value"], rows)])
+    [track] = session.onboard
+    assert 1e-9 * (track.time_ns[-1] - track.time_ns[0]) == pytest.approx(0.99, abs=1e-6)
+    is_dated = start_s > 1e9
+    assert 1e-9 * track.time_ns[0] == pytest.approx(start_s + 0.002 if is_dated else 1.002)
+
+
 def test_rows_may_lack_the_values_of_other_blocks(crazyflie: ModuleType, tmp_path: Path) -> None:
     flight, t = crazyflie.Flight(), np.arange(0, 1, 0.02)
     column = values(flight, crazyflie, t)
@@ -142,6 +164,51 @@ def test_rows_may_lack_the_values_of_other_blocks(crazyflie: ModuleType, tmp_pat
     session = read_crazyflie_csv([write(tmp_path / "log.csv", ["Timestamp", *column], rows)])
     check(session, flight, t)
     assert session.warnings == ["no angles of Lighthouse stations: the session cannot be solved"]
+
+
+def test_angles_of_two_blocks_are_joined_over_180_degrees(tmp_path: Path) -> None:
+    ms = 10 * np.arange(100)
+    yaw = (150 + ms / 10 + 180) % 360 - 180
+    names = ["Timestamp", *POSITION, "stateEstimate.roll", "stateEstimate.pitch"]
+    poses = write(tmp_path / "poses.csv", names, [(t, 0, 0, 1, 0, 0) for t in ms])
+    angles = write(
+        tmp_path / "yaw.csv", ["Timestamp", "stateEstimate.yaw"], zip(ms + 5, yaw, strict=True)
+    )
+    session = read_crazyflie_csv([poses, angles])
+    [track] = session.onboard
+    heading = np.unwrap(np.arctan2(*matrix_from_quaternion(track.quaternion)[:, [1, 0], 0].T))
+    np.testing.assert_allclose(np.rad2deg(heading), 149.5 + np.arange(1, 100), atol=1e-9)
+    assert not [line for line in session.warnings if "on-board" in line]  # The first one only.
+
+
+@pytest.mark.parametrize(
+    ("known_ms", "expected", "lost"),
+    [(range(0, 501, 100), 51, ["49"]), ((1, 999), 100, [])],  # Until 0.5 s; never near enough.
+)
+def test_positions_without_an_orientation_are_not_lost_silently(
+    tmp_path: Path, known_ms: Sequence[int], expected: int, lost: list[str]
+) -> None:
+    ms = np.arange(0, 1000, 10)
+    positions = write(
+        tmp_path / "a.csv", ["Timestamp", *POSITION], [(t, t / 1000, 0, 1) for t in ms]
+    )
+    rotations = write(
+        tmp_path / "b.csv", ["Timestamp", *QUATERNION], [(t, 0, 0, 0, 1) for t in known_ms]
+    )
+    session = read_crazyflie_csv([positions, rotations])
+    [track] = session.onboard
+    assert len(track) == expected
+    losses = [line for line in session.warnings if "on-board positions are left out" in line]
+    assert [line.split()[0] for line in losses] == lost
+
+
+def test_a_position_and_a_packed_orientation_belong_together(tmp_path: Path) -> None:
+    header = ["Timestamp", *POSITION, "stateEstimateZ.quat"]
+    packed = 3 << 30 | 255 << 20  # x is half of sqrt(1/2), and w is the largest.
+    rows = [(10 * k, 0, 0, 1, packed if k < 4 else 2**33) for k in range(5)]
+    [track] = read_crazyflie_csv([write(tmp_path / "log.csv", header, rows)]).onboard
+    assert len(track) == 4  # A number of 33 bits is no orientation.
+    np.testing.assert_allclose(track.quaternion[:, 0], np.sqrt(0.5) * 255 / 511)
 
 
 def test_dates_of_the_computer_are_kept(tmp_path: Path) -> None:
@@ -175,6 +242,10 @@ def test_sampled_angles_become_sweeps(tmp_path: Path) -> None:
     np.testing.assert_allclose(turns, expected, atol=1e-12)
     assert len(session.receivers["crazyflie"]) == 4
     assert "3 samples repeat one" in session.facts["sweeps"]
+    assert session.facts["clock"] == "since the first sample"
+    # An angle of two blocks is used once.
+    again = write(tmp_path / "again.csv", ["Timestamp", names[1]], [(1005, 0.2), (1015, 0.21)])
+    assert len(read_crazyflie_csv([again, path]).sweeps) == len(sweeps)
 
 
 def test_a_restart_is_reported(tmp_path: Path) -> None:

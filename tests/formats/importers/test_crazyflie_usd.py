@@ -141,6 +141,21 @@ def test_the_part_behind_a_damaged_time_is_not_read(crazyflie: ModuleType) -> No
     assert len(read.events["estDistance"]) <= 4
 
 
+def test_a_torn_log_of_sweeps_continues_after_a_long_gap(crazyflie: ModuleType) -> None:
+    log = crazyflie.UsdWriter()
+    log.event_type(7, "estSweepAngle", "sweepAngle:f")
+    for k, time in enumerate([5.0, 5.1, 5.2, 505.2, 505.3, 505.4, 505.5]):
+        log.add(time, 7, k)
+    read = parse_usd_log(log.data(crc=False), PATH)
+    assert len(read.events["estSweepAngle"]) == 7
+    assert read.damage is not None
+    assert "no complete event" not in read.damage
+    # The time of one event is damaged: those behind it do not follow it.
+    log.events[3] = (90_000.0, 7, (3,))
+    read = parse_usd_log(log.data(crc=False, in_order=False), PATH)
+    assert len(read.events["estSweepAngle"]) == 3
+
+
 def test_zeros_behind_a_log_are_no_events(crazyflie: ModuleType) -> None:
     """A file system may have reserved space; 0 is also the number of an event."""
     log = small_log(crazyflie)
@@ -364,6 +379,37 @@ def test_unknown_stations_have_the_number_of_the_build(
     session = read_crazyflie_usd([write(log, tmp_path)])
     assert set(session.sweeps.channel.tolist()) == {1, 2}
     check_sweeps(session, flight, tolerance_s=1e-3)
+
+
+def test_one_wrong_offset_of_an_unknown_station_does_no_harm(
+    crazyflie: ModuleType, tmp_path: Path
+) -> None:
+    log = crazyflie.write_flight(crazyflie.Flight(3.0), np.random.default_rng(4))
+    frames = [k for k, event in enumerate(log.events) if event[1] == 11]
+    first = next(k for k in frames if log.events[k][2][1] == 4)
+    time_s, number, values = log.events[first]
+    log.events[first] = (time_s, number, (*values[:2], 4000, *values[3:]))
+    session = read_crazyflie_usd([write(log, tmp_path)])
+    assert len(session.sweeps) > 0.95 * len(frames)
+
+
+@pytest.mark.parametrize("rate", [84 / 85, 0.98906, 1.0])
+def test_a_gap_of_many_wraps_of_the_short_counter(
+    crazyflie: ModuleType, tmp_path: Path, rate: float
+) -> None:
+    """A clock that is 1.2 % slow is wrong by more than half of a wrap after 30 s."""
+    flight = crazyflie.Flight(60.0)
+    log = crazyflie.write_flight(flight, np.random.default_rng(4), rate=rate, imu_hz=100)
+    name, variables = log.types[11]
+    log.types[11] = (name, [each for each in variables if each[0] != "timestamp2FPGA"])
+    gap = range(round(31.7 + 5 * rate), round(31.7 + 55 * rate))
+    log.events = [
+        (time_s, number, values if number != 11 else (*values[:4], values[5]))
+        for time_s, number, values in log.events
+        if number != 11 or int(time_s) not in gap
+    ]
+    session = read_crazyflie_usd([write(log, tmp_path)])
+    check_sweeps(session, flight, tolerance_s=1e-4)
 
 
 def test_a_station_with_the_largest_number_is_one(crazyflie: ModuleType, tmp_path: Path) -> None:

@@ -397,7 +397,9 @@ def stays() -> dict:
 def test_truth_in_floor_metres_with_z_up(write: Write) -> None:
     write(json.dumps({"video.mp4": SQUARE}), "calibration.json")
     recording, track = write(TWO + ROW), write(TRACK, "1_blender.csv")
-    (truth,) = read_dotbot([recording], [track]).truth
+    session = read_dotbot([recording], [track])
+    assert session.facts["calibration"].endswith("(y negated, so that z is up)")
+    (truth,) = session.truth
     assert isinstance(truth, Trajectory)
     assert truth.device == "R"
     np.testing.assert_allclose(truth.position, [[0.8, -0.8, 0], [1.0, -1.0, 0]], atol=1e-12)
@@ -461,9 +463,12 @@ def test_markers_name_the_device_that_stood_there(write: Write) -> None:
         ("{}", "no entries"),
         (json.dumps({"a": SQUARE, "b": SQUARE}), "2 entries (a, b), of which none"),
         (json.dumps({"a": {}}), "corners_cm"),
-        (json.dumps({"a": {"corners_cm": {"tl": [1, "x"]}}}), "finite"),
-        (json.dumps({"a": {"corners_cm": {"tl": [1, float("nan")]}}}), "finite"),
-        (json.dumps({"a": {"corners_cm": {"tl": [1]}}}), "finite"),
+        (json.dumps({"a": {"corners_cm": {"tl": [1, "x"]}}}), "two numbers"),
+        (json.dumps({"a": {"corners_cm": {"tl": [1, float("nan")]}}}), "two numbers"),
+        (json.dumps({"a": {"corners_mm": {"tl": [1, 10**400]}}}), "two numbers"),
+        (json.dumps({"a": {"corners_mm": {"tl": [1, 1e308]}}}), "two numbers"),
+        ('{"corners_mm": {"tl": [1, ' + 5000 * "1" + "]}}", "too long"),
+        (json.dumps({"a": {"corners_cm": {"tl": [1]}}}), "two numbers"),
         (json.dumps({"a": {"corners_cm": [1, 2]}}), "object"),
         (json.dumps({"a": {**SQUARE, "corners_px": {"top": [1, 2]}}}), "'top'"),
         (json.dumps({"a": {**stays(), "timestamps_lh2": {"tl": ["now", "later"]}}}), "times"),
