@@ -20,6 +20,11 @@ from hypothesis import settings
 # long. Before anything imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Also if PYTHONDONTWRITEBYTECODE is set, as in many containers: without a cache, each process takes
+# 12 s longer to rewrite the assertions, and each command in a process of its own is compiled again.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # Little of what is made until the tests begin is garbage: thousands of searches for it are a third
 # of the time that each process takes to collect the tests.
 gc.disable()

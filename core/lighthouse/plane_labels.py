@@ -105,8 +105,12 @@ PREDICTION_TOLERANCE_RAD = 1e-3
 LIKELY_ACCELERATION_RAD_S2 = 10.0
 MAX_ACCELERATION_RAD_S2 = 50.0
 """Angular acceleration seen from a station: likely (10 m/s^2 at 1 m), and at most (20 m/s^2 at
-0.4 m). A pulse that only its angle assigns to a station must agree within the likely one, which a
-stray pulse does by chance in 1e-3 of the cases for each plane and neighbours a rotation away."""
+0.4 m). A pulse that only its angle assigns to a station must agree within the likely one."""
+
+MAX_LONE_SPAN_ROTATIONS = 3
+"""Largest distance between the neighbours of such a pulse. A stray pulse agrees by chance with a
+plane in 1.0e-3 of the cases if they are 2 rotations apart, and in 1.6e-3 if they are 3. At 10, it
+would be 1.6e-2."""
 
 
 @dataclass(frozen=True)
@@ -133,12 +137,16 @@ class RotorTrack:
         """Return the times of a rotor zero, up to whole periods, that hold at ``tick`` (n,).
 
         They are ``nan`` if the rotor was not observed at about this time, or if its phase changed
-        abruptly.
+        faster than it wanders.
         """
         right = np.searchsorted(self.tick, tick)
         left, right = np.clip(right - 1, 0, None), np.clip(right, None, len(self.tick) - 1)
         distance = np.minimum(np.abs(tick - self.tick[left]), np.abs(tick - self.tick[right]))
-        jumps = np.abs(self.phase[right] - self.phase[left]) > MAX_ZERO_ERROR_TICKS
+        # In a pause the wander accumulates, and the error of the rate. Near its ends the
+        # interpolation is still right if the phase changes slowly.
+        pause_s = np.maximum((self.tick[right] - self.tick[left]) / PULSE_HZ, MAX_EXTRAPOLATION_S)
+        max_change = MAX_ZERO_ERROR_TICKS * pause_s / MAX_EXTRAPOLATION_S
+        jumps = np.abs(self.phase[right] - self.phase[left]) > max_change
         phase = np.interp(tick, self.tick, self.phase) + self.rate * tick
         is_known = (distance <= MAX_EXTRAPOLATION_S * PULSE_HZ) & ~jumps
         return np.where(is_known, phase, np.nan)
@@ -486,9 +494,6 @@ class _Pulses:
             rotation, phase = self._compute_rotor_angles(rotor, rest)
             for plane in (0, 1):
                 is_in_passage = passage_label == 2 * channel + plane
-                acceleration = np.where(
-                    is_in_passage, MAX_ACCELERATION_RAD_S2, LIKELY_ACCELERATION_RAD_S2
-                )
                 for sensor in np.unique(self.sensor[rest]).tolist():
                     is_candidate = (self.sensor[rest] == sensor) & ~np.isnan(phase)
                     path = self._find_path(channel, plane, sensor)
@@ -502,7 +507,7 @@ class _Pulses:
                         np.concatenate([self.phase[path], phase[companions]]),
                         rotation[candidates],
                         phase[candidates],
-                        acceleration[candidates],
+                        is_in_passage[candidates],
                         rotor.period,
                     )
                     # Of several pulses in one rotation, the nearest to the path is its sweep.
@@ -540,12 +545,12 @@ def _compute_path_errors(
     known_phase: Array,
     rotation: IntArray,
     phase: Array,
-    acceleration_rad_s2: Array,
+    is_in_passage: Mask,
     period: float,
 ) -> tuple[Array, Array]:
     """Return the deviation of pulses from the path of a photodiode, and its limit [rotations].
 
-    The deviation is ``nan`` without a neighbour in the rotations on both sides.
+    The deviation is ``nan`` without near neighbours in the rotations on both sides.
     """
     if not len(known):
         return np.full(len(rotation), np.nan), np.zeros(len(rotation))
@@ -555,6 +560,8 @@ def _compute_path_errors(
     before = known[np.clip(np.searchsorted(known, rotation, side="left") - 1, 0, None)]
     after = known[np.clip(np.searchsorted(known, rotation, side="right"), None, len(known) - 1)]
     turn_s = period / PULSE_HZ
-    curvature = acceleration_rad_s2 / 2 * (rotation - before) * (after - rotation) * turn_s**2
+    acceleration = np.where(is_in_passage, MAX_ACCELERATION_RAD_S2, LIKELY_ACCELERATION_RAD_S2)
+    curvature = acceleration / 2 * (rotation - before) * (after - rotation) * turn_s**2
     limit = (PREDICTION_TOLERANCE_RAD + np.maximum(curvature, 0.0)) / (2 * np.pi)
-    return np.abs(phase - expected[:, 0]), limit
+    is_near = is_in_passage | (after - before <= MAX_LONE_SPAN_ROTATIONS)
+    return np.where(is_near, np.abs(phase - expected[:, 0]), np.nan), limit

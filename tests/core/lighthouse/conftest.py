@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -319,6 +320,17 @@ def world() -> type[World]:
 def recordings(data: Path) -> Path:
     """Folder of the published Lighthouse recordings."""
     return data / "lighthouse"
+
+
+@pytest.fixture(scope="session")
+def recorded_tracker(recordings: Path) -> Any:
+    """Published recording of a tracker under four stations, with libsurvive's poses."""
+    from locatk.formats.importers.libsurvive.recording import read_libsurvive
+
+    path = recordings / "libsurvive" / "tracker-cal-attempt.rec.gz"
+    if not path.exists():
+        pytest.skip(f"{path} is absent")
+    return read_libsurvive([path], stations=True)
 
 
 # ---- light

@@ -42,11 +42,18 @@ def mixed(world: Any) -> tuple[Any, Any, Scene]:
     lamps = world.lamps(1, 2, 5)
     drive = world.drive(lamps, world.curve(200, flat=False))
     scene = solve(drive.sweeps, Scene(markers=world.markers_of(lamps, world.square))).artifact
-    rigid = world.stream(lamps, position_at, 2.0, sensors=SPAN)
-    single = world.stream(lamps, position_at, 2.0, seed=2)
+    rigid = world.stream(lamps, position_at, 1.2, sensors=SPAN)
+    single = world.stream(lamps, position_at, 1.2, seed=2)
     single = replace(single, device=np.ones(len(single), np.int32))
     both = world.join(rigid, single)
     return replace(both, devices=("rigid", "single")), lamps, scene
+
+
+@pytest.fixture(scope="module")
+def alone(mixed: Any) -> Solution:
+    """Return the solution of the rigid device without the other."""
+    sweeps, _, scene = mixed
+    return solve(sweeps.take(sweeps.device == 0), scene, receivers={"rigid": RIGID})
 
 
 def test_devices_in_the_recording_with_three_photodiodes_are_rigid(mixed: Any) -> None:
@@ -57,7 +64,7 @@ def test_devices_in_the_recording_with_three_photodiodes_are_rigid(mixed: Any) -
 
 
 @pytest.mark.slow
-def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any) -> None:
+def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any, alone: Solution) -> None:
     sweeps, _, scene = mixed
     solution = solve(sweeps, scene, receivers={"rigid": RIGID})
     tracks = {t.device: t for t in solution.trajectories}
@@ -76,9 +83,7 @@ def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any) -> None:
     assert [row["station"] for row in rows] == [0, 1, 2]
     assert "verification" in facts_of(solution)
     assert facts_of(solution)["rigid"]
-    rigid_rows = detections_as_json(
-        solve(sweeps.take(sweeps.device == 0), scene, receivers={"rigid": RIGID})
-    )
+    rigid_rows = detections_as_json(alone)
     single_rows = detections_as_json(solve(sweeps.take(sweeps.device == 1), scene))
     for merged, first, second in zip(rows, rigid_rows, single_rows, strict=True):
         assert merged["sweeps"] == first["sweeps"] + second["sweeps"]
@@ -86,12 +91,9 @@ def test_rigid_devices_and_single_photodiodes_share_a_scene(mixed: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_rigid_device_needs_no_single_photodiode(mixed: Any, world: Any) -> None:
-    sweeps, _, scene = mixed
-    alone = world.take(sweeps, np.flatnonzero(sweeps.device == 0))
-    solution = solve(alone, scene, receivers={"rigid": RIGID})
-    assert [t.device for t in solution.trajectories] == ["rigid"]
-    assert [row["station"] for row in detections_as_json(solution)] == [0, 1, 2]
+def test_a_rigid_device_needs_no_single_photodiode(alone: Solution) -> None:
+    assert [t.device for t in alone.trajectories] == ["rigid"]
+    assert [row["station"] for row in detections_as_json(alone)] == [0, 1, 2]
 
 
 def test_without_receivers_each_photodiode_has_a_trajectory(mixed: Any) -> None:
@@ -110,7 +112,7 @@ def test_the_papers_method_warns_that_it_ignores_receivers(world: Any) -> None:
 
 
 POSITIONS = np.array([[0.5, 0.5, 0.0], [-0.5, 0.5, 0.2], [-0.5, -0.5, 0.0], [0.5, -0.5, 0.1]])
-REST_S, PERIOD_S = 0.7, 1.0
+REST_S, PERIOD_S = 0.4, 0.65
 
 
 def on_markers(t: Any) -> Any:
@@ -134,8 +136,8 @@ def marked(world: Any, count: int, seconds: float) -> tuple[Any, Any, tuple[Mark
             (
                 MarkerVisit(
                     "robot",
-                    start + round((PERIOD_S * k + 0.1) * 1e9),
-                    start + round((PERIOD_S * k + 0.6) * 1e9),
+                    start + round((PERIOD_S * k + 0.05) * 1e9),
+                    start + round((PERIOD_S * k + 0.35) * 1e9),
                 ),
             ),
         )
@@ -146,7 +148,7 @@ def marked(world: Any, count: int, seconds: float) -> tuple[Any, Any, tuple[Mark
 
 @pytest.mark.slow
 def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> None:
-    lamps, sweeps, markers = marked(world, 4, 4.5)
+    lamps, sweeps, markers = marked(world, 4, 2.9)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     scene = solution.artifact
     assert (scene.scale, scene.frame) == ("markers", "floor")
@@ -166,11 +168,12 @@ def test_markers_give_frame_and_scale_of_a_scene_from_a_device(world: Any) -> No
 
 
 @pytest.mark.slow
-def test_a_photodiode_without_a_station_leaves_rigid_devices_their_poses(mixed: Any) -> None:
+def test_a_photodiode_without_a_station_leaves_rigid_devices_their_poses(
+    mixed: Any, alone: Solution
+) -> None:
     sweeps, _, scene = mixed
     sweeps = sweeps.take((sweeps.device == 0) | (np.arange(len(sweeps)) % 5 == 0))
     is_single = sweeps.device == 1
-    alone = solve(sweeps.take(~is_single), scene, receivers={"rigid": RIGID})
     for channel, reason in ((9, "station_not_in_scene"), (77, "unknown_channel")):
         unseen = replace(sweeps, channel=np.where(is_single, channel, sweeps.channel))
         solution = solve(unseen, scene, receivers={"rigid": RIGID})
@@ -186,7 +189,7 @@ def test_a_photodiode_without_a_station_leaves_rigid_devices_their_poses(mixed: 
 
 @pytest.mark.slow
 def test_two_markers_determine_no_frame(world: Any) -> None:
-    _, sweeps, markers = marked(world, 2, 2.5)
+    _, sweeps, markers = marked(world, 2, 1.6)
     solution = solve(sweeps, Scene(markers=markers), receivers={"robot": RIGID})
     assert solution.artifact.scale == "device"
     assert {"too_few_markers", "device_scale"} <= codes(solution)
@@ -194,7 +197,7 @@ def test_two_markers_determine_no_frame(world: Any) -> None:
 
 @pytest.mark.slow
 def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
-    _, sweeps, markers = marked(world, 4, 4.0)
+    _, sweeps, markers = marked(world, 4, 2.6)
     wrong = replace(markers[3], position=markers[3].position + [0.15, 0.0, 0.0])
     solution = solve(sweeps, Scene(markers=(*markers[:3], wrong)), receivers={"robot": RIGID})
     assert "marker_misfit" in codes(solution)
@@ -204,7 +207,7 @@ def test_a_marker_that_was_measured_wrong_is_reported(world: Any) -> None:
 @pytest.mark.slow
 def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps, position_at, 3.0, sensors=SPAN)
+    sweeps = world.stream(lamps, position_at, 2.2, sensors=SPAN)
     checks = facts_of(solve(sweeps, scene, receivers={"robot": RIGID}))["verification"]
     assert checks["held_out"]
     assert [check["channel"] for check in checks["stations"]] == [1, 2, 5]
@@ -217,7 +220,7 @@ def test_each_station_is_verified_against_the_others(mixed: Any, world: Any) -> 
 @pytest.mark.slow
 def test_a_station_that_was_moved_is_the_one_that_disagrees(mixed: Any, world: Any) -> None:
     _, lamps, scene = mixed
-    sweeps = world.stream(lamps, position_at, 3.0, sensors=SPAN)
+    sweeps = world.stream(lamps, position_at, 2.2, sensors=SPAN)
     first, second, third = scene.stations
     moved = replace(second, position=second.position + [0.0, 0.0, 0.08])
     solution = solve(

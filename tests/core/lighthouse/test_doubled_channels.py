@@ -19,7 +19,6 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.formats.importers.dotbot.recording import read_dotbot
-from locatk.formats.importers.libsurvive.recording import read_libsurvive
 
 Array = NDArray[np.float64]
 
@@ -272,7 +271,7 @@ def test_published_counts(recordings: Path) -> None:
 
 
 @pytest.mark.slow
-def test_published_times(recordings: Path) -> None:
-    sweeps = read_libsurvive([recordings / "libsurvive/tracker-cal-attempt.rec.gz"]).sweeps
+def test_published_times(recorded_tracker: Any) -> None:
+    sweeps = recorded_tracker.sweeps
     assert find_doubled_channels(sweeps) == NONE
     assert find_doubled_channels(on_channel_1(sweeps)) == DoubledChannels((1,), ())

@@ -168,6 +168,126 @@ def test_the_phase_of_a_rotor_is_followed(
     assert np.abs(error).max() < 4  # 0.2 us, 50 urad
 
 
+# ---- pauses and stray pulses, by a simulation of regular passages
+
+
+def intermittent(
+    rng: np.random.Generator, starts_s: np.ndarray, seconds: float, channels: tuple[int, ...]
+) -> Columns:
+    """Frames of a moving deck that receives light for ``seconds`` from each of ``starts_s``.
+
+    The rotors wander by 12 to 32 ticks of 24 MHz within a minute.
+    """
+    parts = []
+    for channel in channels:
+        period = {1: 479_500, 2: 478_500, 3: 476_500, 4: 474_500}[channel]
+        turns = [np.arange(int(s * 24e6 / period), int((s + seconds) * 24e6 / period))
+                 for s in starts_s]  # fmt: skip
+        turn = np.concatenate(turns)
+        t = turn * period / 24e6
+        ppm, begin, minute = rng.uniform(-1e-4, 1e-4), rng.uniform(0, 6.28), rng.uniform(40, 80)
+        zero = rng.uniform(0, period) + turn * period * (1 + ppm)
+        zero += rng.uniform(12, 32) * np.sin(2 * np.pi * t / minute + begin)
+        for plane in (0, 1):
+            is_hidden = rng.random(len(turn)) < 0.05
+            for sensor in range(4):
+                path = 0.04 * np.sin(t + begin) + (-1) ** plane * 0.02 * np.sin(1.3 * t)
+                fraction = (1 + plane) / 3 + path + 0.0007 * sensor
+                light = zero + fraction * period * (1 + ppm) + rng.normal(0, 1.5, len(turn))
+                row = np.ones(len(turn), np.int64)
+                columns = (np.rint(light), sensor * row, channel * row, plane * row, fraction)
+                is_received = ~is_hidden & (rng.random(len(turn)) >= 0.03)
+                parts.append(np.column_stack(columns)[is_received])
+    table = np.concatenate(parts)
+    table = table[np.argsort(table[:, 0])]
+    tick, sensor, channel, plane = table[:, :4].astype(np.int64).T
+    group = np.cumsum(np.diff(tick, prepend=tick[0]) > 10_000)
+    is_known = (np.diff(group, prepend=-1) == 0) & (rng.random(len(tick)) < 0.7)
+    offset = np.zeros(len(tick), np.int64)
+    for each in channels:
+        mine = np.flatnonzero(is_known & (channel == each))
+        chosen = mine[np.unique(group[mine], return_index=True)[1]]
+        nominal = {1: 119_875, 2: 119_625, 3: 119_125, 4: 118_625}[each]
+        offset[chosen] = 4 * np.rint(table[chosen, 4] * nominal)
+    return {
+        "tick": tick, "sensor": sensor, "channel": np.where(is_known, channel, -1),
+        "offset": offset, "true_channel": channel, "plane": plane, "fraction": table[:, 4],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize(("seconds", "pause_s"), [(3, 1), (0.3, 5), (0.7, 20), (0.3, 60), (3, 60)])
+def test_light_is_labelled_before_and_after_a_pause(
+    seconds: float, pause_s: float, count: int
+) -> None:
+    """In a pause the phase of a rotor changes by more than between two averages."""
+    starts_s = np.arange(5) * (seconds + pause_s)
+    channels = tuple(range(1, count + 1))
+    frames = intermittent(np.random.default_rng(20), starts_s, seconds, channels)
+    labels = label(frames)
+    is_right, angle = errors(frames, labels)
+    assert labels.rejected.get("rotor_unknown", 0) == 0
+    assert len(labels.row) >= 0.85 * len(frames["tick"])
+    assert np.mean(~is_right) <= 2e-3
+    assert np.abs(angle).max() < 200e-6
+
+
+@pytest.mark.parametrize("restart_ticks", [123_456, 200])
+def test_a_rotor_that_restarts_in_a_pause_has_no_wrong_phase(restart_ticks: int) -> None:
+    """A shift by chance of a few microseconds is not noticed, and does no harm."""
+    frames = intermittent(np.random.default_rng(21), np.array([0.0, 7.0]), 2.0, (1,))
+    frames["tick"] = frames["tick"] + np.where(frames["tick"] > 5 * 24e6, restart_ticks, 0)
+    labels = label(frames)
+    is_right, angle = errors(frames, labels)
+    assert is_right.all()
+    assert np.abs(angle).max() < 250e-6
+    assert len(labels.row) >= 0.8 * len(frames["tick"])
+
+
+@pytest.mark.parametrize(("span", "most"), [(2, 1.0e-3), (3, 1.6e-3), (4, 0.0), (10, 0.0)])
+def test_chance_agreements_of_a_stray_pulse_are_few(span: int, most: float) -> None:
+    """A photodiode is hit in each ``span``-th rotation, and by other light in between."""
+    rng = np.random.default_rng(22)
+    n, period = 4000, 479_500
+    zero = np.arange(n) * span * period
+    offset = np.tile([4 * 40_000, 4 * 80_000], n)
+    tick = np.repeat(zero, 2) + offset
+    stray = zero + rng.integers(period, span * period, n)
+    nothing = np.zeros(3 * n, np.int64)
+    labels = label_pulses(
+        np.concatenate([tick, stray]),
+        nothing,
+        np.repeat([1, 1, -1], n),
+        np.concatenate([offset, np.zeros(n, np.int64)]),
+    )
+    assert np.count_nonzero(labels.row < 2 * n) == 2 * n
+    chance = np.count_nonzero(labels.row >= 2 * n) / n / 2
+    assert chance <= most + 3 * np.sqrt(most / n / 2)
+
+
+def test_one_pulse_of_a_photodiode_is_labelled_in_a_rotation() -> None:
+    """Of several ones of unknown channel in a passage, it is the nearest to the path."""
+    n, period = 40, 479_500
+    turn = np.repeat(np.arange(n), 8)
+    sensor, plane = np.tile(np.arange(4), 2 * n), np.tile(np.repeat([0, 1], 4), n)
+    offset = 4 * (40_000 + 40_000 * plane + 100 * sensor)
+    tick = turn * period + offset
+    channel = np.ones(8 * n, np.int64)
+    lost = np.flatnonzero((turn == 20) & (sensor == 2) & (plane == 1))
+    channel[lost], offset[lost] = -1, 0
+    more = tick[lost] + np.array([-60, 90, 2_000])  # 0.8 to 26 mrad away
+    unknown = np.full(3, -1)
+    labels = label_pulses(
+        np.append(tick, more),
+        np.append(sensor, [2, 2, 2]),
+        np.append(channel, unknown),
+        np.append(offset, np.zeros(3, np.int64)),
+    )
+    np.testing.assert_array_equal(labels.row, np.arange(8 * n))
+    np.testing.assert_array_equal(labels.plane, plane)
+    assert labels.rejected == {"channel_unknown": 3}
+
+
 # ---- planes
 
 

@@ -172,9 +172,9 @@ def test_the_covariance_is_that_of_repeated_trials() -> None:
             position,
             rotation,
         )[0]
-        for _ in range(30)
+        for _ in range(20)
     ]
-    # The mean of a chi-square of 6 over 30 trials has a standard deviation of 0.63.
+    # The mean of a chi-square of 6 over 20 trials has a standard deviation of 0.77.
     assert 4.0 < np.mean(distances) < 8.0
 
 

@@ -34,12 +34,11 @@ def test_covariances_are_those_of_transformed_samples() -> None:
     errors = samples.copy()
     for k, (before, after) in enumerate(zip(stations, moved.stations, strict=True)):
         column = k * JOINT_PARAMETERS
-        for row, sample in zip(errors, samples[:, column : column + 6], strict=True):
-            position = TO.apply(before.position + sample[:3])
-            rotation = TO.rotation @ rotation_exp(sample[3:]) @ before.rotation
-            row[column : column + 3] = position - after.position
-            turned = quaternion_from_matrix(rotation @ after.rotation.T)
-            row[column + 3 : column + 6] = rotation_vector_from_quaternion(turned)
+        moves, turns = samples[:, column : column + 3], samples[:, column + 3 : column + 6]
+        errors[:, column : column + 3] = TO.apply(before.position + moves) - after.position
+        rotation = TO.rotation @ rotation_exp(turns) @ before.rotation @ after.rotation.T
+        turned = rotation_vector_from_quaternion(quaternion_from_matrix(rotation))
+        errors[:, column + 3 : column + 6] = turned
     expected = errors.T @ errors / len(errors)
     assert moved.covariance is not None
     sigma = np.sqrt(np.diagonal(expected))

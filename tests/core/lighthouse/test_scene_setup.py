@@ -193,7 +193,7 @@ TOUR = (
     Stay((-0.7, 0.6, 0.0)),
     *(
         Stay(point, 0.05, 1.2)
-        for point in np.random.default_rng(4).uniform([-1, -1, 0.1], [1, 1, 1.3], (25, 3)).tolist()
+        for point in np.random.default_rng(4).uniform([-1, -1, 0.1], [1, 1, 1.3], (15, 3)).tolist()
     ),
     Stay((0.0, 0.0, 0.5), 0.05),
 )
