@@ -36,6 +36,11 @@ MIN_REDUNDANCY = 0.02
 """Part of the variance of an angle that the path must not have absorbed for a test."""
 
 
+MODEL_SIGMA_RAD = 1e-4
+"""Standard deviation of what the common parameters may still explain of an angle: a sweep within a
+few of these is no reflection, and harmless if it is one."""
+
+
 @dataclass(frozen=True)
 class Consistency:
     """Prediction of each sweep by the path.
@@ -79,7 +84,7 @@ def leverage(
     variance = np.zeros(len(sweeps))
     variance[index[is_sweep]] = np.einsum("kii->ki", covariance)[is_sweep]
     residual = np.where(is_finite, residuals.residual, 0.0)
-    remaining = np.maximum(sigma**2 - variance, MIN_REDUNDANCY * sigma**2)
+    remaining = np.maximum(sigma**2 - variance, MIN_REDUNDANCY * sigma**2) + MODEL_SIGMA_RAD**2
     ratio = np.abs(residual) / np.sqrt(remaining)
     padded_residual = np.append(residual, 0.0)[index]
     padded_used = np.append(is_used & is_finite, False)[index]
@@ -94,10 +99,11 @@ def leverage(
         total = np.abs(np.sum(padded_residual[rows] * member, axis=1))
         absorbed = np.einsum("ki,kij,kj->k", member, covariance[rows], member)
         own = size * sigma**2
-        group_ratio = total / np.sqrt(np.maximum(own - absorbed, MIN_REDUNDANCY * own))
+        remaining = np.maximum(own - absorbed, MIN_REDUNDANCY * own) + (size * MODEL_SIGMA_RAD) ** 2
+        group_ratio = total / np.sqrt(remaining)
         chosen = index[rows][member]
         ratio[chosen] = np.maximum(ratio[chosen], np.repeat(group_ratio, size))
-    innovation = np.abs(residual) / np.sqrt(sigma**2 + variance)
+    innovation = np.abs(residual) / np.sqrt(sigma**2 + variance + 2 * MODEL_SIGMA_RAD**2)
     innovation[~is_finite] = np.inf
     return Consistency(variance, ratio, innovation)
 

@@ -25,6 +25,10 @@ WEAK_RATE_SIGMA = np.repeat([30.0, 100.0], 3)
 """Standard deviations of velocity [m/s] and angular velocity [rad/s] before any sweep."""
 
 
+MAX_STEP = 1.0
+"""Standard deviation of a step of a pose in m and rad: it keeps the states determined at which all
+sweeps are rejected."""
+
 FLOOR_SIGMA_M = 1e-5
 """Standard deviation of the height over a floor: it is a known plane."""
 
@@ -262,6 +266,7 @@ def prior_equations(path: Path, power: Array) -> tuple[Array, Array, Array]:
         push = (block @ error[:, :, axis, None])[..., 0]
         gradient[:-1, :, axis] += push[:, :2]
         gradient[1:, :, axis] += push[:, 2:]
+        diagonal[:, 0, axis, 0, axis] += MAX_STEP**-2
         weak = WEAK_RATE_SIGMA[axis] ** -2.0
         diagonal[:, 1, axis, 1, axis] += weak
         rate = path.velocity if axis < 3 else path.spin

@@ -77,6 +77,9 @@ GIVEN_POSITION_SIGMA_M, GIVEN_ROTATION_SIGMA_RAD = 0.01, 3e-3
 """Standard deviations of stations that are given without a covariance, along and about each axis:
 of a geometry that was estimated from a few points."""
 
+HELD_FACTOR = 1e6
+"""Factor of the information of parameters that are held."""
+
 FREE_SIGMA = 1.0
 """Standard deviation of the pose of an unknown station, relative to the size of the scene, and in
 radians: it only bounds what no sweep determines."""
@@ -155,6 +158,14 @@ class CommonParameters:
     def _by_station(self) -> Array:
         count = len(self.positions)
         return self.value[: count * STATION_PARAMETERS].reshape(count, STATION_PARAMETERS)
+
+    def only_poses(self) -> CommonParameters:
+        """Return the parameters with light planes and photodiodes held: only stations move."""
+        count = len(self.positions) * STATION_PARAMETERS
+        is_pose = np.arange(len(self.value)) % STATION_PARAMETERS < 6
+        is_pose[count:] = False
+        held = np.where(is_pose, 0.0, HELD_FACTOR * np.diagonal(self.information))
+        return replace(self, information=self.information + np.diag(held))
 
     def stepped(self, change: Array) -> CommonParameters:
         """Return the parameters after a change (k,)."""

@@ -12,12 +12,13 @@ Every sweep is a measurement at its own time. :func:`estimate_paths` refines rou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from locatk.core.errors import DegenerateError
 from locatk.core.geometry import (
     matrix_from_quaternion,
     quaternion_angle,
@@ -46,6 +47,9 @@ Mask = NDArray[np.bool_]
 MAX_PAUSE_S = 1.0
 """Longest pause of the sweeps over which a path continues."""
 
+MAX_GAP_S = 0.3
+"""Longest gap without sweeps in which a path has knots."""
+
 MAX_START_GAP_S = 0.25
 """Longest time from a sweep to the nearest pose of the rough trajectory."""
 
@@ -59,7 +63,7 @@ START_POWER = np.array([0.5, 30.0])
 """Power of the motion at the start: of the position, relative to the square of the distance of the
 stations in metres, and of the rotation in rad^2/s^3. Those of an agile flight."""
 
-MIN_POWER, MAX_POWER = np.array([1e-6, 1e-4]), np.array([5.0, 1e3])
+MIN_POWER, MAX_POWER = np.array([1e-5, 1e-3]), np.array([5.0, 1e3])
 """Smallest and largest power of the motion, in the same units: at rest, and thrown or shaken. With
 more, a path could follow wrong sweeps."""
 
@@ -158,7 +162,7 @@ def estimate_paths(
     Returns
     -------
     PathEstimate or None
-        None if no device has a sweep near a pose.
+        None if no device has a sweep near a pose, or if the sweeps do not determine the paths.
     """
     layout = _lay_out(
         sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0
@@ -166,10 +170,13 @@ def estimate_paths(
     if layout is None:
         return None
     problem = _Problem(layout.sweeps, common, layout.path, floor_z)
-    problem.fit_robustly()
-    problem.reject_contradictions()
-    problem.finish()
-    return problem.estimate(layout)
+    try:
+        problem.fit_robustly()
+        problem.reject_contradictions()
+        problem.finish()
+        return problem.estimate(layout)
+    except DegenerateError:
+        return None
 
 
 # ---- knots
@@ -202,7 +209,7 @@ def _lay_out(
         near = _near(own.time_ns, rough.time_ns)
         if len(near):
             cell, of_sweep = np.unique(own.time_ns[near] // knot_ns, return_inverse=True)
-            edge = np.unique(np.concatenate([cell, cell + 1]))
+            edge = _fill_gaps(np.unique(np.concatenate([cell, cell + 1])), knot_ns)
             time_ns = edge * knot_ns
             times_ns.append(time_ns)
             devices.append(np.full(len(edge), number))
@@ -241,6 +248,15 @@ def _lay_out(
         PathSweeps(knot, weights, station, plane, photodiode, angle),
         sweep,
     )
+
+
+def _fill_gaps(edge: IntArray, knot_ns: int) -> IntArray:
+    """Add the knots in short gaps to ascending multiples of ``knot_ns``."""
+    gap = np.diff(edge)
+    missing = np.where(gap * knot_ns < MAX_GAP_S * 1e9, gap - 1, 0)
+    first = np.repeat(edge[:-1], missing)
+    number = np.arange(len(first)) - np.repeat(np.cumsum(missing) - missing, missing)
+    return np.sort(np.concatenate([edge, first + 1 + number]))
 
 
 def without_flips(trajectory: Trajectory) -> Trajectory:
@@ -377,7 +393,12 @@ class _Problem:
         return float(np.max(np.abs(change[:, :3]))) / self.size_m
 
     def fit_robustly(self) -> None:
-        """Fit the paths with a Cauchy loss that narrows from the gate to the noise."""
+        """Fit the paths with a Cauchy loss that narrows from the gate to the noise.
+
+        Light planes and photodiodes are held, so that wrong sweeps cannot bend them.
+        """
+        common = self.common
+        self.common = common.only_poses()
         for iteration in range(ROBUST_ITERATIONS):
             residual = self.residuals.residual
             spread = max(robust_sigma(residual), self.sigma)
@@ -394,6 +415,7 @@ class _Problem:
             spread = robust_sigma(self.residuals.residual)
             self.is_used = np.abs(self.residuals.residual) < max(6 * spread, 10 * self.sigma)
         self.is_used &= ~self.is_left_out
+        self.common = replace(common, value=self.common.value)
         self.update_sigma()
 
     def leave_out_stations(self) -> None:
