@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from locatk.core.block_tridiagonal import BlockTridiagonal
 from locatk.core.lighthouse.motion.equations import PathSweeps, Residuals, interval_rows
@@ -35,6 +35,11 @@ may be its consequence."""
 MIN_REDUNDANCY = 0.02
 """Part of the variance of an angle that the path must not have absorbed for a test."""
 
+
+CONTESTED_KNOTS = 20
+MAX_REJECTED_FRACTION = 0.35
+"""Width of the stretches around a contradiction in knots, and the largest fraction of their sweeps
+that may be rejected: wrong sweeps come singly, reflections in runs."""
 
 MODEL_SIGMA_RAD = 1e-4
 """Standard deviation of what the common parameters may still explain of an angle: a sweep within a
@@ -119,3 +124,30 @@ def find_contradictions(
     leaves = is_used & (ratio > REJECTED_SIGMAS) & (ratio > 0.7 * nearby[sweeps.knot])
     comes = ~is_used & (consistency.innovation < ACCEPTED_SIGMAS)
     return leaves, comes
+
+
+def find_contested(sweeps: PathSweeps, is_used: Mask) -> Mask:
+    """Return the sweeps (n,) in stretches of which many sweeps are rejected."""
+    share = _used_share(sweeps.knot, is_used, CONTESTED_KNOTS)
+    is_contested = share < 1.0 - MAX_REJECTED_FRACTION
+    wide = maximum_filter1d(is_contested.astype(np.int8), CONTESTED_KNOTS) > 0
+    return np.asarray(wide[sweeps.knot])
+
+
+def agrees_with_most(sweeps: PathSweeps, agrees: Mask) -> Mask:
+    """Return the sweeps (n,) whose station agrees with the path in most sweeps around them."""
+    result = np.zeros(len(sweeps), bool)
+    for station in np.unique(sweeps.station):
+        rows = np.flatnonzero(sweeps.station == station)
+        share = _used_share(sweeps.knot[rows], agrees[rows], NEIGHBOUR_KNOTS)
+        result[rows] = share[sweeps.knot[rows]] >= 0.5
+    return result
+
+
+def _used_share(knot: IntArray, is_used: Mask, width: int) -> Array:
+    """Return the fraction of sweeps that are used around each knot; 1 where there are none."""
+    count = np.bincount(knot).astype(float)
+    used = np.bincount(knot, is_used, len(count))
+    total = uniform_filter1d(count, width, mode="constant")
+    share = uniform_filter1d(used, width, mode="constant") / np.maximum(total, 1e-9)
+    return np.where(total > 1e-9, share, 1.0)

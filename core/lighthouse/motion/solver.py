@@ -27,7 +27,13 @@ from locatk.core.geometry import (
     slerp,
 )
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps
-from locatk.core.lighthouse.motion.consistency import Consistency, find_contradictions, leverage
+from locatk.core.lighthouse.motion.consistency import (
+    Consistency,
+    agrees_with_most,
+    find_contested,
+    find_contradictions,
+    leverage,
+)
 from locatk.core.lighthouse.motion.equations import (
     NormalEquations,
     PathSweeps,
@@ -79,6 +85,13 @@ ROBUST_ITERATIONS = 8
 MAX_ROUNDS = 20
 FINAL_ITERATIONS = 4
 """Iterations with the robust loss, of the search for outliers, and after it."""
+
+STRETCH_PASSES, STRETCH_ITERATIONS = 2, 4
+"""Passes over stretches in which many sweeps are rejected, and iterations after each."""
+
+MAX_PREDICTION_SIGMA_RAD = 5e-3
+"""Largest standard deviation of a predicted angle with which a sweep is taken back: with more,
+reflections agree by chance."""
 
 STATION_GATE_SIGMAS = 6.0
 """Median residual of a station that contradicts the others, in standard deviations of its pose."""
@@ -173,6 +186,7 @@ def estimate_paths(
     try:
         problem.fit_robustly()
         problem.reject_contradictions()
+        problem.resolve_stretches()
         problem.finish()
         return problem.estimate(layout)
     except DegenerateError:
@@ -456,6 +470,43 @@ class _Problem:
             self.is_used = (self.is_used & ~leaves) | comes
             if number >= 5 and with_common and np.sum(leaves) + np.sum(comes) == 0:
                 break
+
+    def resolve_stretches(self) -> None:
+        """Estimate again where many sweeps contradict the path, from both ends inwards.
+
+        Reflections of both stations at a time agree with each other and bend the path to them. All
+        sweeps of such a stretch are left out, and those are taken back that agree with the motion
+        before and after it.
+        """
+        for _ in range(STRETCH_PASSES):
+            is_contested = find_contested(self.sweeps, self.is_used | self.is_left_out)
+            if not np.any(is_contested):
+                return
+            self.is_used &= ~is_contested
+            self.take_back(is_contested)
+            for _ in range(STRETCH_ITERATIONS):
+                equations = self.equations(self.weight, with_common=True)
+                self.move(equations, with_common=True)
+                consistency = self.check(equations)
+                self.update_power(equations)
+                self.update_sigma(consistency)
+                leaves, _ = find_contradictions(self.sweeps, consistency, self.is_used)
+                self.is_used &= ~leaves
+
+    def take_back(self, candidates: Mask) -> None:
+        """Take back sweeps that agree with the path, as far as it predicts them."""
+        for _ in range(MAX_ROUNDS):
+            for _ in range(2):
+                equations = self.equations(self.weight)
+                self.move(equations, with_common=False)
+            consistency = self.check(equations)
+            leaves, comes = find_contradictions(self.sweeps, consistency, self.is_used)
+            comes &= candidates & ~self.is_left_out
+            comes &= consistency.variance < MAX_PREDICTION_SIGMA_RAD**2
+            comes &= agrees_with_most(self.sweeps, comes | self.is_used)
+            self.is_used = (self.is_used & ~leaves) | comes
+            if not np.any(comes & ~leaves):
+                return
 
     def finish(self) -> None:
         """Converge with the accepted sweeps."""
