@@ -99,8 +99,12 @@ STATION_GATE_SIGMAS = 6.0
 LOSS_SIGMAS = 3.0
 """Scale of the Cauchy loss in standard deviations."""
 
-MIN_SIGMA_RAD = 2e-5
-"""Smallest standard deviation of an angle, that of rounding to an LFSR step."""
+MIN_SIGMA_RAD, MAX_SIGMA_RAD = 2e-5, 1e-3
+"""Smallest standard deviation of an angle, that of rounding to an LFSR step, and the largest."""
+
+STEP_LENGTHS = (1.0, 0.5, 0.25, 0.125)
+MAX_GROWTH = 2.0
+"""Lengths of a step that are tried, and the largest growth of the median residual."""
 
 
 @dataclass(frozen=True)
@@ -396,15 +400,29 @@ class _Problem:
         )
 
     def move(self, equations: NormalEquations, *, with_common: bool) -> float:
-        """Take a step; return its largest change of a position, relative to the scene."""
+        """Take a step; return its largest change of a position, relative to the scene.
+
+        The step is shortened if the residuals grow by more than their noise explains.
+        """
+        shared = np.zeros(len(self.common.value))
         if with_common:
             change, shared = equations.step()
-            self.common = self.common.stepped(shared)
         else:
             change = equations.states_step()
-        self.path = self.path.stepped(change)
-        self.residuals = linearize(self.sweeps, self.path, self.common)
-        return float(np.max(np.abs(change[:, :3]))) / self.size_m
+        path, common = self.path, self.common
+        limit = max(MAX_GROWTH * self._usual_residual(), 5 * self.sigma)
+        for length in STEP_LENGTHS:
+            self.path = path.stepped(length * change)
+            self.common = common.stepped(length * shared)
+            self.residuals = linearize(self.sweeps, self.path, self.common)
+            if self._usual_residual() <= limit:
+                break
+        return length * float(np.max(np.abs(change[:, :3]))) / self.size_m
+
+    def _usual_residual(self) -> float:
+        """Return the median residual of the accepted sweeps; infinite if most have none."""
+        residual = np.abs(self.residuals.residual[self.is_used])
+        return float(np.median(np.nan_to_num(residual, nan=np.inf))) if len(residual) else 0.0
 
     def fit_robustly(self) -> None:
         """Fit the paths with a Cauchy loss that narrows from the gate to the noise.
@@ -415,10 +433,10 @@ class _Problem:
         self.common = common.only_poses()
         for iteration in range(ROBUST_ITERATIONS):
             residual = self.residuals.residual
-            spread = max(robust_sigma(residual), self.sigma)
+            spread = float(np.clip(robust_sigma(residual), self.sigma, INLIER_GATE_RAD))
             scale = np.clip(LOSS_SIGMAS * spread, LOSS_SIGMAS * self.sigma, INLIER_GATE_RAD)
             with np.errstate(invalid="ignore"):
-                weight = self.sigma**-2.0 / (1.0 + (residual / scale) ** 2)
+                weight = spread**-2.0 / (1.0 + (residual / scale) ** 2)
             with_common = iteration > ROBUST_ITERATIONS // 2
             if iteration == ROBUST_ITERATIONS // 2:
                 self.leave_out_stations()
@@ -526,7 +544,7 @@ class _Problem:
             share = 1.0 - consistency.variance[self.is_used] / self.sigma**2
             residual = residual[share > 0.1] / np.sqrt(share[share > 0.1])
         if len(residual):
-            self.sigma = max(MIN_SIGMA_RAD, robust_sigma(residual))
+            self.sigma = float(np.clip(robust_sigma(residual), MIN_SIGMA_RAD, MAX_SIGMA_RAD))
 
     def update_power(self, equations: NormalEquations) -> None:
         """Estimate the power of the motion, locally and in all (MacKay 1992).
