@@ -10,6 +10,7 @@ import numpy as np
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.lighthouse.devices.solver import (
     merge_solutions,
+    paths_warning,
     select_rigid_receivers,
     solve_devices,
 )
@@ -33,6 +34,7 @@ from locatk.core.lighthouse.scene.estimation import (
     resolve_scene_kind,
     use_given_scene,
 )
+from locatk.core.lighthouse.scene.frame import marker_angles
 from locatk.core.lighthouse.scene.model import stack_stations
 from locatk.core.lighthouse.scene.verification import (
     inconsistent_station_warnings,
@@ -218,7 +220,14 @@ def _locate_and_verify(
     tracks = track_photodiodes(estimate.epochs, scene)
     channels = tracks.epochs.channels.tolist()
     trajectories, rejected, sigma_rad = tracks.trajectories, tracks.rejected, tracks.angle_sigma_rad
-    paths = refine_photodiodes(sweeps, channels, trajectories, scene, is_estimated=is_estimated)
+    markers = marker_angles(scene.markers, tracks.epochs, rotor_angles(tracks.epochs))
+    paths, path_warnings = None, []
+    try:
+        paths = refine_photodiodes(
+            sweeps, channels, trajectories, scene, markers, is_estimated=is_estimated
+        )
+    except DegenerateError as error:
+        path_warnings.append(paths_warning(error))
     if paths is not None:
         scene, trajectories, sigma_rad = paths.scene, paths.trajectories, paths.sigma_rad
         rejected = add_counts(rejected, paths.rejected)
@@ -256,6 +265,7 @@ def _locate_and_verify(
         warnings=(
             *estimate.warnings,
             *tracks.warnings,
+            *path_warnings,
             *inconsistent_station_warnings(verification),
         ),
     )

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import DegenerateError
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.devices.alignment import (
     align_to_markers,
@@ -107,19 +108,25 @@ def solve_devices(
     if not scene.stations:
         estimate = _estimate_scene(sweeps, receivers, scene)
     tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
-    refined, tracked = refine_tracks(
-        tracked,
-        receivers,
-        estimate.scene,
-        is_estimated=not scene.stations,
-        interval_ns=None if interval_s is None else max(1, round(interval_s * 1e9)),
-    )
-    estimate = replace(estimate, scene=refined)
+    path_warnings = []
+    try:
+        refined, tracked = refine_tracks(
+            tracked,
+            receivers,
+            estimate.scene,
+            is_estimated=not scene.stations,
+            interval_ns=None if interval_s is None else max(1, round(interval_s * 1e9)),
+        )
+        estimate = replace(estimate, scene=refined)
+    except DegenerateError as error:
+        if any(len(device.trajectory) for device in tracked):
+            path_warnings.append(paths_warning(error))
     trajectories = tuple(device.trajectory for device in tracked)
     detections = station_detections(tracked, estimate.scene)
     facts = _tracking_facts(estimate.facts, tracked, estimate.scene, detections)
     warnings = [
         *estimate.warnings,
+        *path_warnings,
         *device_warnings(tracked),
         *contradiction_warnings(detections, trajectories),
     ]
@@ -137,7 +144,8 @@ def solve_devices(
                 frame_source="markers",
             )
             trajectories = tuple(
-                transform_trajectory(t, transform, scene.frame) for t in trajectories
+                alignment.add_uncertainty(transform_trajectory(t, transform, scene.frame))
+                for t in trajectories
             )
             warnings.extend(unused_visits_warnings(scene.markers, alignment.visits))
             facts = replace(facts, marker_misfit_m=alignment.misfit_m, marker_scale=transform.scale)
@@ -319,6 +327,15 @@ def device_warnings(tracked: Sequence[TrackedDevice]) -> list[SolverWarning]:
                 )
             )
     return warnings
+
+
+def paths_warning(error: DegenerateError) -> SolverWarning:
+    """Return the warning for poses that are not on estimated paths."""
+    return SolverWarning(
+        "paths_not_estimated",
+        f"{error}: each pose is estimated from the sweeps around it, and its covariance contains no "
+        "errors of the stations",
+    )
 
 
 def contradiction_warnings(

@@ -55,6 +55,11 @@ def refine_tracks(
         True if the scene was estimated from the same sweeps. Otherwise it is returned unchanged.
     interval_ns : int, optional
         Time from pose to pose; by default, a rotation of the fastest station.
+
+    Raises
+    ------
+    DegenerateError
+        See :func:`~locatk.core.lighthouse.motion.solver.estimate_paths`.
     """
     channels = tracked[0].channels
     levers = [receivers[device.trajectory.device].position_m for device in tracked]
@@ -74,8 +79,6 @@ def refine_tracks(
         common,
         fastest_ns // 2,
     )
-    if estimate is None:
-        return scene, tuple(tracked)
     to_frame = Similarity.identity()
     if is_estimated:
         on_marker = _marker_knots(estimate, scene, tracked)

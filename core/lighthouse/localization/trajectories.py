@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import Similarity, umeyama
+from locatk.core.lighthouse.devices.alignment import align_points
 from locatk.core.lighthouse.devices.device_sweeps import (
     DeviceSweeps,
     rotation_limits_ns,
     select_device_sweeps,
 )
+from locatk.core.lighthouse.localization.positions import estimate_positions
 from locatk.core.lighthouse.motion.frames import fix_frame
 from locatk.core.lighthouse.motion.parameters import make_parameters
 from locatk.core.lighthouse.motion.results import (
@@ -27,7 +29,7 @@ from locatk.core.lighthouse.motion.results import (
     pose_covariances,
     refined_scene,
 )
-from locatk.core.lighthouse.motion.solver import estimate_paths
+from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -71,6 +73,7 @@ def refine_photodiodes(
     channels: Sequence[int],
     rough: Sequence[Trajectory],
     scene: Scene,
+    markers: tuple[Array, Array],
     *,
     is_estimated: bool,
 ) -> PhotodiodePaths | None:
@@ -84,6 +87,10 @@ def refine_photodiodes(
     rough : sequence of Trajectory
         Of all photodiodes.
     scene : Scene
+    markers : ((k, 3) ndarray, (k, s, 2) ndarray)
+        Positions and angles of visits of markers
+        (:func:`~locatk.core.lighthouse.scene.frame.marker_angles`). They define the frame if it is
+        that of markers.
     is_estimated : bool
         True if the scene was estimated from the same sweeps. Otherwise it is returned unchanged.
 
@@ -91,6 +98,11 @@ def refine_photodiodes(
     -------
     PhotodiodePaths or None
         None if a photodiode does not move on a path.
+
+    Raises
+    ------
+    DegenerateError
+        See :func:`~locatk.core.lighthouse.motion.solver.estimate_paths`.
     """
     if len(channels) < 2:
         return None
@@ -111,21 +123,14 @@ def refine_photodiodes(
     estimate = estimate_paths(
         parts, [0] * len(parts), rough, common, fastest_ns // 2, floor_z=floor_z
     )
-    if estimate is None:
-        return None
-    to_frame = Similarity.identity()
+    to_frame, alignment = Similarity.identity(), None
     if is_estimated:
         estimate = fix_frame(estimate, np.ones(len(estimate.path), bool), with_scale=True)
-        to_frame = _rough_frame(
-            [
-                (
-                    t,
-                    estimate.time_ns[estimate.device == k],
-                    estimate.path.position[estimate.device == k],
-                )
-                for k, t in enumerate(rough)
-            ]
-        )
+        if scene.frame_source == "markers":
+            points, angles = markers
+            position = estimate_positions(angles, *estimate.common.stations, floor_z=floor_z)
+            alignment = align_points(position.position, points)
+        to_frame = alignment.transform if alignment else _rough_frame(estimate, rough)
         scene = refined_scene(scene, channels, estimate).transformed(to_frame)
     covariance = pose_covariances(estimate)
     made = [
@@ -136,9 +141,12 @@ def refine_photodiodes(
         "sweep_contradicts_pose": int(np.count_nonzero(~estimate.is_used)),
         "pose_not_determined": sum(part.undetermined for part in made),
     }
+    trajectories = [transform_trajectory(p.trajectory, to_frame, scene.frame) for p in made]
+    if alignment is not None:
+        trajectories = [alignment.add_uncertainty(t) for t in trajectories]
     return PhotodiodePaths(
         scene,
-        tuple(transform_trajectory(part.trajectory, to_frame, scene.frame) for part in made),
+        tuple(trajectories),
         {reason: count for reason, count in rejected.items() if count},
         estimate.sigma_rad,
     )
@@ -169,15 +177,16 @@ def _is_path(own: DeviceSweeps, rough: Trajectory) -> bool:
     )
 
 
-def _rough_frame(parts: Sequence[tuple[Trajectory, NDArray[np.int64], Array]]) -> Similarity:
-    """Return the transform to the frame of the rough trajectories: their median is kept."""
+def _rough_frame(estimate: PathEstimate, rough: Sequence[Trajectory]) -> Similarity:
+    """Return the transform of paths to the frame of the rough trajectories."""
     source, target = [], []
-    for rough, time_ns, position in parts:
-        index = np.clip(np.searchsorted(time_ns, rough.time_ns), 0, len(time_ns) - 1)
-        source.append(position[index])
-        target.append(rough.position)
+    for device, trajectory in enumerate(rough):
+        knots = np.flatnonzero(estimate.device == device)
+        if len(knots):
+            nearest = np.searchsorted(estimate.time_ns[knots], trajectory.time_ns)
+            source.append(estimate.path.position[knots[np.minimum(nearest, len(knots) - 1)]])
+            target.append(trajectory.position)
     a, b = np.concatenate(source), np.concatenate(target)
-    transform = umeyama(a, b)
-    distance = np.linalg.norm(transform.apply(a) - b, axis=1)
+    distance = np.linalg.norm(umeyama(a, b).apply(a) - b, axis=1)
     is_close = distance <= 3 * np.median(distance)
     return umeyama(a[is_close], b[is_close])

@@ -31,7 +31,7 @@ def fix_frame(estimate: PathEstimate, is_fixed: Mask, *, with_scale: bool) -> Pa
         True if they define the scale, too.
     """
     centre = estimate.path.position[is_fixed].mean(axis=0)
-    by_motion = _motions(estimate.path.position - centre, with_scale)
+    by_motion = common_motions(estimate.path.position - centre, with_scale)
     fixed = by_motion[is_fixed].reshape(-1, by_motion.shape[2])
     response = estimate.response[is_fixed, :3].reshape(len(fixed), -1)
     motion = np.linalg.lstsq(fixed, response, rcond=None)[0]
@@ -40,7 +40,7 @@ def fix_frame(estimate: PathEstimate, is_fixed: Mask, *, with_scale: bool) -> Pa
     if estimate.path.rotation is not None:
         parts.append(estimate.response[:, 3:] - estimate.path.rotation.mT @ motion[3:6])
     common = np.eye(len(estimate.common.value))
-    stations = _motions(estimate.common.stations[0] - centre, with_scale)
+    stations = common_motions(estimate.common.stations[0] - centre, with_scale)
     for i, by_station in enumerate(stations):
         row = i * STATION_PARAMETERS
         common[row : row + 3] -= by_station @ motion
@@ -52,8 +52,11 @@ def fix_frame(estimate: PathEstimate, is_fixed: Mask, *, with_scale: bool) -> Pa
     )
 
 
-def _motions(offset: Array, with_scale: bool) -> Array:
-    """Return the change (n, 3, g) of points by a translation, a rotation and a change of scale."""
+def common_motions(offset: Array, with_scale: bool = True) -> Array:
+    """Return the change (n, 3, 7) of points by a translation, a rotation and a change of scale.
+
+    ``offset`` (n, 3) is from the centre of the motion. Without scale, the result is (n, 3, 6).
+    """
     motions = np.zeros((len(offset), 3, 7 if with_scale else 6))
     motions[:, range(3), range(3)] = 1.0
     motions[:, :, 3:6] = np.cross(np.eye(3)[None], offset[:, None, :]).swapaxes(1, 2)

@@ -86,6 +86,12 @@ MAX_ROUNDS = 20
 FINAL_ITERATIONS = 4
 """Iterations with the robust loss, of the search for outliers, and after it."""
 
+MAX_KNOTS = 40_000
+"""Largest number of knots, which bounds the memory to about 2 GB: of a device for 400 s."""
+
+MIN_USED_FRACTION = 0.3
+"""Smallest fraction of accepted sweeps of a path that is trusted."""
+
 STRETCH_PASSES, STRETCH_ITERATIONS = 2, 4
 """Passes over stretches in which many sweeps are rejected, and iterations after each."""
 
@@ -158,7 +164,7 @@ def estimate_paths(
     knot_ns: int,
     *,
     floor_z: float | None = None,
-) -> PathEstimate | None:
+) -> PathEstimate:
     """Estimate the paths of the devices of a recording.
 
     Parameters
@@ -176,25 +182,32 @@ def estimate_paths(
     floor_z : float, optional
         Height of single photodiodes on a floor.
 
-    Returns
-    -------
-    PathEstimate or None
-        None if no device has a sweep near a pose, or if the sweeps do not determine the paths.
+    Raises
+    ------
+    DegenerateError
+        No device has a sweep near a pose, the sweeps do not determine the paths, or the recording
+        is too long.
     """
     layout = _lay_out(
         sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0
     )
     if layout is None:
-        return None
+        raise DegenerateError("no sweep is near a pose")
+    if len(layout.path) > MAX_KNOTS:
+        raise DegenerateError(
+            f"the devices move for {1e-9 * knot_ns * len(layout.path):.0f} s in all, and paths are "
+            f"estimated for up to {1e-9 * knot_ns * MAX_KNOTS:.0f} s"
+        )
     problem = _Problem(layout.sweeps, common, layout.path, floor_z)
-    try:
-        problem.fit_robustly()
-        problem.reject_contradictions()
-        problem.resolve_stretches()
-        problem.finish()
-        return problem.estimate(layout)
-    except DegenerateError:
-        return None
+    problem.fit_robustly()
+    problem.reject_contradictions()
+    problem.resolve_stretches()
+    problem.finish()
+    if np.mean(problem.is_used) < MIN_USED_FRACTION:
+        raise DegenerateError(
+            f"{1 - np.mean(problem.is_used):.0%} of the sweeps contradict every path"
+        )
+    return problem.estimate(layout)
 
 
 # ---- knots
@@ -241,7 +254,7 @@ def _lay_out(
     time_ns, device = np.concatenate(times_ns), np.concatenate(devices)
     sweep, knot = np.concatenate(rows), np.concatenate(knots)
     start_ns = int(time_ns.min())
-    time_s = (time_ns - start_ns) * 1e-9
+    time_s = np.asarray((time_ns - start_ns) * 1e-9, np.float64)
     position = np.concatenate([p for p, _ in poses])
     quaternion = np.concatenate([q for _, q in poses])
     is_linked = (np.diff(device) == 0) & (np.abs(np.diff(time_s)) < MAX_PAUSE_S)

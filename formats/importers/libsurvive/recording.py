@@ -50,6 +50,9 @@ EXTERNAL = "libsurvive-external"
 REPLAYED_PREFIX = "replay_"
 """Prefix of a device in poses that an earlier run of libsurvive solved."""
 
+STATION_SIGMA_M, STATION_SIGMA_RAD = 3e-3, 1e-3
+"""Standard deviations of the stations that libsurvive solved, from all sweeps of a tracker."""
+
 MIN_QUATERNION_LENGTH = 1e-3
 """Recorded quaternions that are shorter have no direction."""
 
@@ -252,7 +255,8 @@ def _scene(
 def _station(
     channel: int, pose: NDArray[np.float64], calibration: Calibration, number: int | None
 ) -> Station:
-    return Station(channel, pose[1:4], station_rotation(pose[4:]), calibration, number)
+    covariance = np.diag(np.repeat([STATION_SIGMA_M, STATION_SIGMA_RAD], 3) ** 2)
+    return Station(channel, pose[1:4], station_rotation(pose[4:]), calibration, number, covariance)
 
 
 def _in_imu(recording: RecFile) -> bool:
