@@ -288,3 +288,97 @@ def test_the_crazyflie_model_ignores_curve_and_ogee() -> None:
         cal.predict_angles(points, cal.Calibration(sweeps, "factory", "crazyflie")),
         cal.predict_angles(points, cal.IDEAL_CALIBRATION),
     )
+
+
+# ---- single sweeps with derivatives by all parameters
+
+
+def with_columns(calibration: cal.Calibration, **columns: float) -> cal.Calibration:
+    """Return a calibration with some parameters of both planes replaced."""
+    sweeps = calibration.sweeps.copy()
+    for name, value in columns.items():
+        sweeps[:, cal.PARAMETERS.index(name)] = value
+    return dataclasses.replace(calibration, sweeps=sweeps)
+
+
+CALIBRATIONS = {
+    "unit": cal.Calibration(
+        np.array(
+            [
+                [0.0, -0.05, 0.4, 0.02, 2.2, 0.5, 1.4],
+                [-0.006, 0.046, -0.3, 0.03, -0.5, 0.4, -2.6],
+            ]
+        ),
+        "factory",
+    ),
+    "ideal": cal.IDEAL_CALIBRATION,
+    "without gib": with_columns(GENERIC_CALIBRATION, gibmag=0.0),
+    "without ogee": with_columns(GENERIC_CALIBRATION, ogeemag=0.0),
+    "without curve": with_columns(GENERIC_CALIBRATION, curve=0.0, ogeemag=0.0),
+}
+
+
+@pytest.mark.parametrize("model", cal.MODELS)
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_derivatives_of_sweeps_are_those_of_small_steps(name: str, model: str) -> None:
+    calibration = dataclasses.replace(CALIBRATIONS[name], model=model)
+    points = field_points(40)
+    plane = np.random.default_rng(0).integers(0, 2, len(points))
+    rows, step = np.arange(len(points)), 1e-6
+    angle, by_point, by_parameters = cal.predict_sweeps(points, plane, calibration)
+    np.testing.assert_array_equal(angle, cal.predict_angles(points, calibration)[rows, plane])
+
+    def angles(points: Array, parameters: Array) -> Array:
+        other = calibration.with_linear_parameters(parameters)
+        return cal.predict_angles(points, other)[rows, plane]
+
+    start = calibration.linear_parameters()
+    for axis in range(3):
+        move = step * np.eye(3)[axis]
+        numeric = (angles(points + move, start) - angles(points - move, start)) / (2 * step)
+        np.testing.assert_allclose(by_point[:, axis], numeric, atol=2e-8)
+    for k in range(7):
+        move = step * np.eye(7)[k]
+        numeric = (angles(points, start + move) - angles(points, start - move)) / (2 * step)
+        np.testing.assert_allclose(by_parameters[:, k], numeric, atol=2e-8, err_msg=str(k))
+
+
+def test_only_the_plane_of_a_sweep_counts() -> None:
+    points = np.array([[2.0, 0.3, 0.4], [2.0, 0.3, 0.4], [0.1, 0.0, 2.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        angle, by_point, by_parameters = cal.predict_sweeps(
+            points, np.array([0, 1, 1]), GENERIC_CALIBRATION
+        )
+    both = cal.predict_angles(points[:1], GENERIC_CALIBRATION)[0]
+    np.testing.assert_array_equal(angle, [both[0], both[1], np.nan])
+    assert by_point.shape == (3, 3)
+    assert by_parameters.shape == (3, 7)
+
+
+@pytest.mark.parametrize("name", CALIBRATIONS)
+def test_linear_parameters_describe_the_same_planes(name: str) -> None:
+    calibration = dataclasses.replace(CALIBRATIONS[name], model="crazyflie")
+    parameters = calibration.linear_parameters()
+    again = calibration.with_linear_parameters(parameters)
+    assert (again.source, again.model) == (calibration.source, "crazyflie")
+    np.testing.assert_allclose(again.linear_parameters(), parameters, atol=1e-15)
+    for model in cal.MODELS:
+        np.testing.assert_allclose(
+            cal.predict_angles(field_points(20), dataclasses.replace(again, model=model)),
+            cal.predict_angles(field_points(20), dataclasses.replace(calibration, model=model)),
+            atol=1e-14,
+        )
+
+
+def test_linear_parameters_are_phasors() -> None:
+    sweeps = np.array([[1.0, 2.0, 3.0, 2.0, np.pi / 2, 4.0, np.pi], np.zeros(7)])
+    calibration = cal.Calibration(sweeps.copy(), "factory")
+    np.testing.assert_allclose(
+        calibration.linear_parameters(), [[1, 2, 3, 0, 2, -4, 0], np.zeros(7)], atol=1e-15
+    )
+    # Neither direction changes its input.
+    parameters = np.arange(14.0).reshape(2, 7)
+    calibration.with_linear_parameters(parameters)
+    np.testing.assert_array_equal(parameters, np.arange(14.0).reshape(2, 7))
+    np.testing.assert_array_equal(calibration.sweeps, sweeps)
