@@ -333,8 +333,8 @@ def paths_warning(error: DegenerateError) -> SolverWarning:
     """Return the warning for poses that are not on estimated paths."""
     return SolverWarning(
         "paths_not_estimated",
-        f"{error}: each pose is estimated from the sweeps around it, and its covariance contains no "
-        "errors of the stations",
+        f"{error}: each pose is estimated from the sweeps around it, and its covariance contains "
+        "no errors of the stations",
     )
 
 

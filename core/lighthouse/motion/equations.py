@@ -25,7 +25,7 @@ WEAK_RATE_SIGMA = np.repeat([30.0, 100.0], 3)
 """Standard deviations of velocity [m/s] and angular velocity [rad/s] before any sweep."""
 
 
-MAX_STEP = 1.0
+MAX_STEP = 30.0
 """Standard deviation of a step of a pose in m and rad: it keeps the states determined at which all
 sweeps are rejected."""
 

@@ -48,7 +48,7 @@ def fix_frame(estimate: PathEstimate, is_fixed: Mask, *, with_scale: bool) -> Pa
     return replace(
         estimate,
         response=np.concatenate(parts, axis=1),
-        common_covariance=common @ estimate.common_covariance @ common.T,
+        station_covariance=common @ estimate.common_covariance @ common.T,
     )
 
 

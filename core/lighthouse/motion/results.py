@@ -100,12 +100,12 @@ def refined_scene(scene: Scene, channels: Sequence[int], estimate: PathEstimate)
                 position=positions[i],
                 rotation=rotations[i],
                 calibration=calibration,
-                covariance=estimate.common_covariance[pose, pose],
+                covariance=estimate.station_covariance[pose, pose],
             )
         )
         rows.append(first + np.arange(JOINT_PARAMETERS))
     index = np.concatenate(rows)
-    joint = estimate.common_covariance[np.ix_(index, index)]
+    joint = estimate.station_covariance[np.ix_(index, index)]
     return replace(scene, stations=tuple(stations), covariance=joint)
 
 

@@ -126,7 +126,9 @@ class PathEstimate:
         Of the knots.
     common : CommonParameters
     common_covariance : (m, m) ndarray
-        Of the common parameters.
+        Of the common parameters, for the poses.
+    station_covariance : (m, m) ndarray
+        The same in the frame in which the covariances of the poses hold, for the stations.
     pose_covariance : (k, n, n) ndarray
         Of the pose at each knot while the common parameters are known.
     response : (k, n, m) ndarray
@@ -147,6 +149,7 @@ class PathEstimate:
     time_ns: IntArray
     common: CommonParameters
     common_covariance: Array
+    station_covariance: Array
     pose_covariance: Array
     response: Array
     sweep: IntArray
@@ -606,6 +609,7 @@ class _Problem:
             layout.device,
             layout.time_ns,
             self.common,
+            common_covariance,
             common_covariance,
             diagonal[:, :n, :n],
             response[:, :n],

@@ -481,6 +481,7 @@ def moved() -> tuple[PathEstimate, PathEstimate, Mask]:
         np.arange(k, dtype=np.int64),
         problem.common,
         covariance,
+        covariance,
         equations.states.inverse_blocks[0][:, :6, :6],
         response[:, :6],
         np.arange(count),
@@ -525,7 +526,7 @@ def test_shape_keeps_its_variance(moved: tuple[PathEstimate, PathEstimate, Mask]
             turns = [rotation[k] @ estimate.response[k, 3:] for k in (i, j)]
             rows += list(turns[0] - turns[1])
         variance = np.array([row @ covariance @ row for row in rows])
-        own = estimate.common_covariance
+        own = estimate.station_covariance
         between = own[:3, :3] + own[34:37, 34:37] - own[:3, 34:37] - own[34:37, :3]
         unit = (stations[0] - stations[1]) / np.linalg.norm(stations[0] - stations[1])
         return np.sqrt(np.append(variance, unit @ between @ unit))
@@ -533,17 +534,19 @@ def test_shape_keeps_its_variance(moved: tuple[PathEstimate, PathEstimate, Mask]
     np.testing.assert_allclose(shape_sigmas(after), shape_sigmas(before), rtol=1e-4, atol=1e-9)
 
 
-def test_poses_and_stations_are_in_one_frame(
-    moved: tuple[PathEstimate, PathEstimate, Mask],
+@pytest.mark.parametrize("with_scale", [False, True])
+def test_covariances_in_another_frame_are_those_of_the_same_estimate(
+    moved: tuple[PathEstimate, PathEstimate, Mask], with_scale: bool
 ) -> None:
-    # The covariances of both use the parameters in the new frame; poses depend on their shape only.
-    before, after, _ = moved
-    expected = after.response @ before.common_covariance @ after.response.mT
-    found = after.response @ after.common_covariance @ after.response.mT
-    sigma = np.sqrt(np.einsum("kii->ki", expected))
-    difference = (found - expected) / sigma[:, :, None] / sigma[:, None, :]
-    assert np.abs(difference).max() < 1e-2
+    before, _, is_fixed = moved
+    after = fix_frame(before, is_fixed, with_scale=with_scale)
+    shared = after.response @ before.common_covariance @ after.response.mT
     covariance = pose_covariances(after)
+    turn = np.zeros_like(covariance)
+    assert after.path.rotation is not None
+    turn[:, :3, :3], turn[:, 3:, 3:] = np.eye(3), after.path.rotation
+    expected = turn @ (before.pose_covariance + shared) @ turn.mT
+    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-12)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
     assert np.trace(covariance[4, :3, :3]) < np.trace(pose_covariances(before)[4, :3, :3])
 
