@@ -612,6 +612,10 @@ def _random_turn(rng: np.random.Generator, sigma_rad: float) -> Array:
     return np.asarray(Rotation.from_rotvec(rng.normal(0.0, sigma_rad, 3)).as_matrix())
 
 
+EXACT_COVARIANCE = 1e-12 * np.eye(6)
+"""Covariance of stations whose true poses are given."""
+
+
 def _known_scene(
     units: tuple[Unit, ...], options: FlightOptions, visits_s: Array, rng: np.random.Generator
 ) -> Scene:
@@ -633,6 +637,7 @@ def _known_scene(
             u.position + scale * rng.normal(0.0, GEOMETRY_M, 3),
             u.rotation @ _random_turn(rng, scale * GEOMETRY_RAD),
             calibrations[u.channel],
+            covariance=None if scale else EXACT_COVARIANCE,
         )
         for u in units
         if is_known

@@ -264,7 +264,7 @@ def test_a_capture_becomes_poses(locatk, minute: tuple[Path, Places], tmp_path: 
     [entry] = answer(locatk("solve", run, "-o", solved, *options, "--json"))["sessions"]
     assert {each["calibration"] for each in entry["detections"]} == {"factory"}
     off = errors(solved, where)
-    assert np.median(off) < 5e-4
+    assert np.median(off) < 1e-3
     assert np.quantile(off, 0.99) < 3e-3
     known = answer(locatk("info", solved, "--json"))
     for lamp, station in zip(LAMPS, known["stations"], strict=True):
