@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.devices.alignment import (
     align_to_markers,
@@ -72,6 +73,7 @@ def solve_devices(
     scene: Scene | None = None,
     *,
     interval_s: float | None = None,
+    imu: Sequence[InertialSamples] = (),
 ) -> Solution:
     """Solve the rigid devices of a recording.
 
@@ -88,6 +90,8 @@ def solve_devices(
         of the first station.
     interval_s : float, optional
         Time from pose to pose in seconds; by default, a rotation of the fastest station.
+    imu : sequence of InertialSamples
+        Of any of the devices. An IMU that contradicts the light is left out with a warning.
 
     Returns
     -------
@@ -107,12 +111,13 @@ def solve_devices(
     if not scene.stations:
         estimate = _estimate_scene(sweeps, receivers, scene)
     tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
-    refined, tracked = refine_tracks(
+    refined, tracked, contradicting_imus = refine_tracks(
         tracked,
         receivers,
         estimate.scene,
         is_estimated=not scene.stations,
         interval_ns=None if interval_s is None else max(1, round(interval_s * 1e9)),
+        imu=imu,
     )
     estimate = replace(estimate, scene=refined)
     trajectories = tuple(device.trajectory for device in tracked)
@@ -121,6 +126,7 @@ def solve_devices(
     warnings = [
         *estimate.warnings,
         *device_warnings(tracked),
+        *map(_imu_warning, contradicting_imus),
         *contradiction_warnings(detections, trajectories),
     ]
 
@@ -319,6 +325,14 @@ def device_warnings(tracked: Sequence[TrackedDevice]) -> list[SolverWarning]:
                 )
             )
     return warnings
+
+
+def _imu_warning(device: str) -> SolverWarning:
+    return SolverWarning(
+        "imu_contradicts_light",
+        f"{device}: its IMU measures another motion than the sweeps and was not used: its axes or "
+        "units differ from those of the device, or its time stamps are wrong",
+    )
 
 
 def contradiction_warnings(

@@ -25,6 +25,7 @@ from locatk.core.geometry import (
     quaternion_multiply,
     slerp,
 )
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps
 from locatk.core.lighthouse.motion.consistency import Consistency, find_contradictions, leverage
 from locatk.core.lighthouse.motion.equations import (
@@ -33,6 +34,7 @@ from locatk.core.lighthouse.motion.equations import (
     assemble,
     linearize,
 )
+from locatk.core.lighthouse.motion.inertial import InertialFactors, make_factors
 from locatk.core.lighthouse.motion.parameters import STATION_PARAMETERS, CommonParameters
 from locatk.core.lighthouse.motion.path import Path, prior_information
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD, INLIER_GATE_RAD
@@ -112,6 +114,8 @@ class PathEstimate:
         Knot before each of them.
     sigma_rad : float
         Standard deviation of an angle.
+    contradicting_imus : tuple of str
+        Devices whose IMU contradicts the light and was left out.
     """
 
     path: Path
@@ -126,6 +130,7 @@ class PathEstimate:
     is_used: Mask
     knot: IntArray
     sigma_rad: float
+    contradicting_imus: tuple[str, ...] = ()
 
 
 def estimate_paths(
@@ -134,6 +139,7 @@ def estimate_paths(
     start: Sequence[Trajectory],
     common: CommonParameters,
     knot_ns: int,
+    imu: Sequence[InertialSamples | None] = (),
 ) -> PathEstimate | None:
     """Estimate the paths of the devices of a recording.
 
@@ -149,6 +155,8 @@ def estimate_paths(
         Without photodiodes if the devices have single ones.
     knot_ns : int
         Time from knot to knot.
+    imu : sequence of InertialSamples or None
+        By device; empty without any. Of single photodiodes, they are not used.
 
     Returns
     -------
@@ -156,13 +164,14 @@ def estimate_paths(
         None if no device has a sweep near a pose.
     """
     layout = _lay_out(
-        sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0
+        sweeps, first_photodiode, start, knot_ns, imu, is_rigid=len(common.photodiodes) > 0
     )
     if layout is None:
         return None
     problem = _Problem(layout.sweeps, common, layout.path)
     problem.fit_robustly()
     problem.reject_contradictions()
+    problem.add_imus(imu, layout)
     problem.finish()
     return problem.estimate(layout)
 
@@ -186,10 +195,14 @@ def _lay_out(
     first_photodiode: Sequence[int],
     start: Sequence[Trajectory],
     knot_ns: int,
+    imu: Sequence[InertialSamples | None],
     *,
     is_rigid: bool,
 ) -> _Layout | None:
-    """Place knots at multiples of ``knot_ns`` on both sides of each sweep near a rough pose."""
+    """Place knots at multiples of ``knot_ns`` on both sides of each sweep near a rough pose.
+
+    Devices with an IMU have knots in pauses as well.
+    """
     times_ns, devices, knots, rows, poses = [], [], [], [], []
     count = offset = 0
     for number, (own, rough) in enumerate(zip(sweeps, start, strict=True)):
@@ -198,6 +211,8 @@ def _lay_out(
         if len(near):
             cell, of_sweep = np.unique(own.time_ns[near] // knot_ns, return_inverse=True)
             edge = np.unique(np.concatenate([cell, cell + 1]))
+            if imu and imu[number] is not None:
+                edge = _fill_pauses(edge, round(MAX_PAUSE_S * 1e9) // knot_ns)
             time_ns = edge * knot_ns
             times_ns.append(time_ns)
             devices.append(np.full(len(edge), number))
@@ -236,6 +251,15 @@ def _lay_out(
         PathSweeps(knot, weights, station, plane, photodiode, angle),
         sweep,
     )
+
+
+def _fill_pauses(edge: IntArray, max_count: int) -> IntArray:
+    """Return ascending numbers of knots with those in pauses of up to ``max_count``."""
+    gap = np.diff(edge)
+    steps = np.where(gap <= max_count, gap, 1)
+    start = np.repeat(edge[:-1], steps)
+    step = np.arange(len(start)) - np.repeat(np.cumsum(steps) - steps, steps)
+    return np.append(start + step, edge[-1])
 
 
 def without_flips(trajectory: Trajectory) -> Trajectory:
@@ -313,6 +337,8 @@ class _Problem:
         self.residuals = linearize(sweeps, path, common)
         self.is_used = np.isfinite(self.residuals.residual)
         self.is_left_out = np.zeros(len(sweeps), bool)
+        self.inertial: InertialFactors | None = None
+        self.contradicting_imus: tuple[str, ...] = ()
 
     @property
     def weight(self) -> Array:
@@ -328,6 +354,7 @@ class _Problem:
             self.power,
             self.common,
             with_common=with_common,
+            inertial=self.inertial,
         )
         if with_common:
             self._hold_scale(equations)
@@ -418,12 +445,25 @@ class _Problem:
             consistency = self.check(equations)
             self.update_power(equations)
             self.update_sigma(consistency)
+            if self.inertial is not None:
+                self.inertial.update_density(self.path, self.common, equations.states)
             leaves, comes = find_contradictions(self.sweeps, consistency, self.is_used)
             comes &= (returns < 2) & ~self.is_left_out
             returns += comes
             self.is_used = (self.is_used & ~leaves) | comes
             if number >= 5 and with_common and np.sum(leaves) + np.sum(comes) == 0:
                 break
+
+    def add_imus(self, imu: Sequence[InertialSamples | None], layout: _Layout) -> None:
+        """Estimate the paths with the IMUs that agree with the light."""
+        if self.path.rotation is None:
+            return
+        samples = [(s, layout.device == k) for k, s in enumerate(imu) if s is not None]
+        start_ns = int(layout.time_ns.min())
+        made = make_factors(samples, self.path, self.common, start_ns)
+        self.inertial, self.common, self.contradicting_imus = made
+        if self.inertial is not None:
+            self.reject_contradictions()
 
     def finish(self) -> None:
         """Converge with the accepted sweeps."""
@@ -499,4 +539,5 @@ class _Problem:
             self.is_used,
             self.sweeps.knot,
             self.sigma,
+            self.contradicting_imus,
         )
