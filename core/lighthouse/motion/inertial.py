@@ -35,17 +35,15 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-GYRO_BIAS, FORCE_BIAS, MOUNTING, GYRO_SCALE, FORCE_SCALE = (
-    slice(3 * k, 3 * k + 3) for k in range(5)
-)
-DELAY = 15
-IMU_PARAMETERS = 16
-"""Biases in rad/s and m/s^2, rotation of the IMU against the photodiodes, relative errors of the
-scales along each axis, and the delay of the samples in seconds."""
+GYRO_BIAS, FORCE_BIAS, MOUNTING = slice(0, 3), slice(3, 6), slice(6, 9)
+DELAY = 9
+IMU_PARAMETERS = 10
+"""Biases in rad/s and m/s^2, rotation of the IMU against the photodiodes, and the delay of the
+samples in seconds. Scales are not estimated: noise of the samples biases them towards zero."""
 
-PARAMETER_SIGMA = np.repeat([0.05, 0.5, 0.03, 0.01, 0.01, 0.004], [3, 3, 3, 3, 3, 1])
-"""Standard deviations of these parameters. Those of common sensors (BMI088, data sheet) are 0.017
-rad/s, 0.2 m/s^2 and 1 %; low-pass filters of 30 to 100 Hz delay samples by 2 to 8 ms."""
+PARAMETER_SIGMA = np.repeat([0.05, 0.5, 0.02, 0.004], [3, 3, 3, 1])
+"""Standard deviations of these parameters. Biases of common sensors (BMI088, data sheet) are 0.017
+rad/s and 0.2 m/s^2; low-pass filters of 30 to 100 Hz delay samples by 2 to 8 ms."""
 
 GRAVITY_SIGMA_M_S2 = 0.03
 """Standard deviation of the strength of gravity: its range on the surface of the earth."""
@@ -62,17 +60,19 @@ WINDOW_S = 0.2
 NOISE_WINDOW_S = 1.0
 """Time over which the density of the noise is averaged."""
 
-MAX_MISFIT = 0.5
-"""Largest residual of the IMU, relative to the motion that IMU and path measure."""
+MAX_MISFIT = np.array([0.8, 1.5])
+"""Largest residual of gyroscope and accelerometer, relative to the motion of the path."""
 
-MIN_MISFIT = np.array([0.1, 0.6])
-"""Residual below which no IMU contradicts the light, in rad/s and m/s^2: of the biases, and of a
-path in poor light."""
+MIN_MISFIT = np.array([0.04, 0.15])
+"""Residual below which no IMU contradicts the light, in rad/s and m/s^2."""
 
 MIN_COMPARED_WINDOWS = 10
 
 MIN_DENSITY = np.array([1e-8, 1e-6])
 """Smallest power spectral density of the noise in rad^2/s and m^2/s^3, of the best sensors."""
+
+RELEASE = 1e3
+"""Power of the motion where the acceleration is measured, relative to the density of its noise."""
 
 GYRO_ROWS, POSITION_ROWS, VELOCITY_ROWS = slice(0, 3), slice(3, 6), slice(6, 9)
 
@@ -126,6 +126,20 @@ class SampleIntegral:
         twice = self.twice[row] + since_s * self.once[row] + since_s**2 / 2 * start
         return start + since_s * slope, once, twice + since_s**3 / 6 * slope
 
+    def noise_density(self, time_s: Array) -> Array:
+        """Return the power spectral density (n,) of the noise around times (n,).
+
+        It is that of white noise with the third differences of the samples, in which slow motion
+        cancels. A filter of the sensor makes it too small.
+        """
+        if len(self.time_s) < 4:
+            return np.zeros(len(time_s))
+        spacing_s = float(np.median(np.diff(self.time_s)))
+        variance = np.mean(np.diff(self.value, 3, axis=0) ** 2, axis=1) / 20
+        window = max(1, round(NOISE_WINDOW_S / spacing_s))
+        smooth = uniform_filter1d(variance, window, mode="nearest")
+        return np.interp(time_s, self.time_s[1:-2], smooth * spacing_s)
+
     def noise_reduction(self, start_s: Array, end_s: Array) -> float:
         """Return the variance of integrals over intervals relative to that of white noise.
 
@@ -173,7 +187,7 @@ class InertialResiduals:
         Of rotation, position and velocity; 0 if not measured.
     by_states : (n, 9, 24) ndarray
         Derivatives by the states at both knots.
-    by_common : (n, 9, 19) ndarray
+    by_common : (n, 9, 13) ndarray
         Derivatives by gravity and the parameters of the IMU.
     """
 
@@ -189,7 +203,7 @@ def select_intervals(
 
     ``is_own`` (k,) are the knots of the device, and ``start_ns`` is the zero of the path's times.
     """
-    time_s = (samples.time_ns - start_ns) * 1e-9
+    time_s: Array = (samples.time_ns - start_ns) * 1e-9
     interval = np.flatnonzero(path.is_linked & is_own[:-1])
     start_s, end_s = path.time_s[interval], path.time_s[interval + 1]
     integrals, covered = [], []
@@ -215,7 +229,7 @@ def select_intervals(
 
 
 def linearize_imu(imu: ImuIntervals, path: Path, gravity: Array, value: Array) -> InertialResiduals:
-    """Return the residuals of an IMU with parameters ``value`` (16,), and their derivatives."""
+    """Return the residuals of an IMU with parameters ``value`` (10,), and their derivatives."""
     assert path.rotation is not None
     n, k = len(imu.interval), imu.interval
     span_s = (imu.end_s - imu.start_s)[:, None]
@@ -223,7 +237,7 @@ def linearize_imu(imu: ImuIntervals, path: Path, gravity: Array, value: Array) -
     by_common = np.zeros((n, 9, 3 + IMU_PARAMETERS))
     of_imu = by_common[:, :, 3:]
     turn = path.turns()[k]
-    correction = skew(value[MOUNTING]) + np.diag(value[GYRO_SCALE]) + np.eye(3)
+    correction = skew(value[MOUNTING]) + np.eye(3)
     start_s, end_s = imu.start_s + value[DELAY], imu.end_s + value[DELAY]
     identity = np.eye(3)
     if imu.gyro is not None:
@@ -235,14 +249,13 @@ def linearize_imu(imu: ImuIntervals, path: Path, gravity: Array, value: Array) -
         by_states[:, GYRO_ROWS, 15:18] = identity + half + square
         of_imu[:, GYRO_ROWS, GYRO_BIAS] = span_s[:, :, None] * identity
         of_imu[:, GYRO_ROWS, MOUNTING] = skew(theta)
-        of_imu[:, GYRO_ROWS, GYRO_SCALE] = -theta[:, :, None] * identity
         of_imu[:, GYRO_ROWS, DELAY] = -(next_rate - rate) @ correction.T
         _clear(imu.has_gyro, GYRO_ROWS, residual, by_states, by_common)
     if imu.force is not None:
         first, last = imu.force.at(start_s), imu.force.at(end_s)
         velocity = path.velocity[k]
         step = path.position[k + 1] - path.position[k] - span_s * velocity
-        correction = skew(value[MOUNTING]) + np.diag(value[FORCE_SCALE]) + identity
+        correction = skew(value[MOUNTING]) + identity
         parts = (
             # Position: the force counts with the time that remains, so that its centre is early.
             (
@@ -273,7 +286,6 @@ def linearize_imu(imu: ImuIntervals, path: Path, gravity: Array, value: Array) -
             by_common[:, rows, :3] = -factor[:, :, None] * identity
             of_imu[:, rows, FORCE_BIAS] = factor[:, :, None] * rotation
             of_imu[:, rows, MOUNTING] = rotation @ skew(measured)
-            of_imu[:, rows, FORCE_SCALE] = -rotation * measured[:, None, :]
             of_imu[:, rows, DELAY] = -(rotation @ (correction @ by_delay[:, :, None]))[..., 0]
         by_states[:, POSITION_ROWS, 0:3] = -identity
         by_states[:, POSITION_ROWS, 6:9] = -span_s[:, :, None] * identity
@@ -303,14 +315,27 @@ class InertialFactors:
     density : list of (n, 2) ndarray
         Power spectral density of the noise of gyroscope and accelerometer in each interval of each
         IMU, in rad^2/s and m^2/s^3.
+    reduction : list of (2,) ndarray
+        Factor by which interpolation reduces the variance of integrals.
+    min_density : list of (n, 2) ndarray
+        Smallest density: that of the samples. The path follows a precise IMU, so that residuals
+        alone would make it more precise from round to round.
     """
 
     imus: tuple[ImuIntervals, ...]
     first: int
     density: list[Array]
     reduction: list[Array] = field(default_factory=list)
+    min_density: list[Array] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        for imu in self.imus:
+            floor = np.tile(MIN_DENSITY, (len(imu.interval), 1))
+            for part, integral in enumerate((imu.gyro, imu.force)):
+                if integral is not None:
+                    noise = integral.noise_density(imu.start_s)
+                    floor[:, part] = np.maximum(floor[:, part], noise)
+            self.min_density.append(floor)
         self.reduction = [
             np.array(
                 [
@@ -321,8 +346,13 @@ class InertialFactors:
             for imu in self.imus
         ]
 
+    @property
+    def has_force(self) -> bool:
+        """True if an accelerometer is used."""
+        return any(bool(np.any(imu.has_force)) for imu in self.imus)
+
     def columns(self, number: int) -> IntArray:
-        """Return the indices (19,) of gravity and the parameters of an IMU."""
+        """Return the indices (13,) of gravity and the parameters of an IMU."""
         own = self.first + 3 + number * IMU_PARAMETERS + np.arange(IMU_PARAMETERS)
         return np.concatenate([self.first + np.arange(3), own])
 
@@ -370,7 +400,7 @@ class InertialFactors:
             information[np.ix_(column, column)] += flat.T @ flat
             gradient[column] += flat.T @ residual.ravel()
         gravity = slice(self.first, self.first + 3)
-        strength = np.linalg.norm(common.value[gravity])
+        strength = max(float(np.linalg.norm(common.value[gravity])), 1e-3)
         direction = common.value[gravity] / strength
         weight = GRAVITY_SIGMA_M_S2**-2.0
         information[gravity, gravity] += weight * np.outer(direction, direction)
@@ -394,6 +424,15 @@ class InertialFactors:
             rows[:, VELOCITY_ROWS] = velocity / np.sqrt(of_force * span_s)[:, None, None]
             arrays.append(rows)
         return arrays[0][..., 0], arrays[1], arrays[2]
+
+    def release_positions(self, power: Array) -> None:
+        """Raise the power (k - 1, 2) of positions whose acceleration is measured.
+
+        A prior of similar strength would pull accelerations, and thereby the scale, towards zero.
+        """
+        for imu, density in zip(self.imus, self.density, strict=True):
+            rows = imu.interval[imu.has_force]
+            power[rows, 0] = np.maximum(power[rows, 0], RELEASE * density[imu.has_force, 1])
 
     def update_density(
         self, path: Path, common: CommonParameters, states: BlockTridiagonal
@@ -425,7 +464,7 @@ class InertialFactors:
                 extra = 10.0 / window
                 local = (smooth[0] + extra * usual) / (smooth[1] + extra)
                 local /= self.reduction[number][part]
-                self.density[number][:, part] = np.maximum(local, MIN_DENSITY[part])
+                self.density[number][:, part] = np.maximum(local, self.min_density[number][:, part])
 
 
 def make_factors(
@@ -433,6 +472,8 @@ def make_factors(
     path: Path,
     common: CommonParameters,
     start_ns: int,
+    *,
+    with_force: bool,
 ) -> tuple[InertialFactors | None, CommonParameters, tuple[str, ...]]:
     """Compare IMUs with the path, and make factors of those that agree with it.
 
@@ -445,6 +486,8 @@ def make_factors(
     common : CommonParameters
     start_ns : int
         Zero of the times of the path.
+    with_force : bool
+        False if the accelerometers are compared, but not used.
 
     Returns
     -------
@@ -464,7 +507,7 @@ def make_factors(
         if not is_consistent:
             contradicting.append(imu.device)
             continue
-        imus.append(imu)
+        imus.append(imu if with_force else replace(imu, has_force=np.zeros_like(imu.has_force)))
         starts.append(value)
         densities.append(np.tile(np.maximum(density, MIN_DENSITY), (len(imu.interval), 1)))
         gravities.append(gravity)
@@ -489,7 +532,7 @@ def compare(imu: ImuIntervals, path: Path) -> tuple[Array, Array, Array, bool]:
     Returns
     -------
     gravity : (3,) ndarray
-    value : (16,) ndarray
+    value : (10,) ndarray
         Start of the parameters.
     density : (2,) ndarray
         Of the noise of IMU and path together.
@@ -515,9 +558,8 @@ def compare(imu: ImuIntervals, path: Path) -> tuple[Array, Array, Array, bool]:
         else:
             gravity = offset
         misfit = robust_sigma(residual - offset)
-        of_imu = of_path - residual
-        size = max(robust_sigma(s - np.median(s, axis=0)) for s in (of_path, of_imu))
-        is_consistent &= misfit < max(MIN_MISFIT[part], MAX_MISFIT * size)
+        size = robust_sigma(of_path - np.median(of_path, axis=0))
+        is_consistent &= misfit < max(MIN_MISFIT[part], MAX_MISFIT[part] * size)
         if part == 0:
             is_consistent &= bool(np.all(np.abs(offset) < 6 * PARAMETER_SIGMA[GYRO_BIAS]))
         else:
@@ -529,6 +571,6 @@ def compare(imu: ImuIntervals, path: Path) -> tuple[Array, Array, Array, bool]:
 
 def _window_means(values: Array, span_s: Array, is_measured: Mask, window: int) -> Array:
     """Return the means per second (m, 3) of sums of neighbouring intervals, without overlap."""
-    rows = np.flatnonzero(is_measured)
-    rows = rows[: len(rows) // window * window].reshape(-1, window)
+    measured = np.flatnonzero(is_measured)
+    rows = measured[: len(measured) // window * window].reshape(-1, window)
     return np.asarray(values[rows].sum(axis=1) / span_s[rows].sum(axis=1)[:, None])

@@ -356,7 +356,7 @@ class _Problem:
             with_common=with_common,
             inertial=self.inertial,
         )
-        if with_common:
+        if with_common and (self.inertial is None or not self.inertial.has_force):
             self._hold_scale(equations)
         return equations
 
@@ -447,6 +447,7 @@ class _Problem:
             self.update_sigma(consistency)
             if self.inertial is not None:
                 self.inertial.update_density(self.path, self.common, equations.states)
+                self.inertial.release_positions(self.power)
             leaves, comes = find_contradictions(self.sweeps, consistency, self.is_used)
             comes &= (returns < 2) & ~self.is_left_out
             returns += comes
@@ -460,9 +461,17 @@ class _Problem:
             return
         samples = [(s, layout.device == k) for k, s in enumerate(imu) if s is not None]
         start_ns = int(layout.time_ns.min())
-        made = make_factors(samples, self.path, self.common, start_ns)
+        # With several stations, the accelerometer biases the scale of an estimated scene.
+        made = make_factors(
+            samples,
+            self.path,
+            self.common,
+            start_ns,
+            with_force=len(self.common.positions) == 1,
+        )
         self.inertial, self.common, self.contradicting_imus = made
         if self.inertial is not None:
+            self.inertial.release_positions(self.power)
             self.reject_contradictions()
 
     def finish(self) -> None:
