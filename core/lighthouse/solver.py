@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from locatk.core.errors import DegenerateError, InputError
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.solver import (
     merge_solutions,
     paths_warning,
@@ -83,6 +84,7 @@ def solve(
     options: SolveOptions | None = None,
     odometry: Sequence[Trajectory] = (),
     receivers: Mapping[str, Receiver] | None = None,
+    imu: Sequence[InertialSamples] = (),
 ) -> Solution:
     """Estimate the poses of all photodiodes and rigid devices of a recording.
 
@@ -98,6 +100,8 @@ def solve(
     receivers : mapping of str to Receiver, optional
         By device. Devices with three or more photodiodes of known position get full poses, and
         a scene without stations is estimated from them. The others are located in that scene.
+    imu : sequence of InertialSamples
+        Of rigid devices; those of others are not used.
 
     Returns
     -------
@@ -122,7 +126,7 @@ def solve(
     sweeps = sweeps.take(~is_doubled)
     rigid = select_rigid_receivers(sweeps, receivers) if receivers else {}
     if rigid and options.method == "bundle":
-        solution = solve_devices(sweeps, rigid, scene)
+        solution = solve_devices(sweeps, rigid, scene, imu=imu)
         single = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
         rows = np.flatnonzero(np.isin(sweeps.device, single))
         if len(rows):

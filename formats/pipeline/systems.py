@@ -168,7 +168,7 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     odometry = observations.read_odometry(session)
     imus = observations.read_imu(session)
     receivers = _rigid_devices(sweeps, observations.read_receivers(session))
-    more: dict[str, Any] = {"receivers": receivers} if receivers else {}
+    more: dict[str, Any] = {"receivers": receivers, "imu": imus} if receivers else {}
     options = _solver_options(lighthouse.SolveOptions, method=request.method, scene=request.scene)
     conflicts += [
         SolverWarning("other_station_id", message)

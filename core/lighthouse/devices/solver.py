@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.devices.alignment import (
     align_to_markers,
@@ -73,6 +74,7 @@ def solve_devices(
     scene: Scene | None = None,
     *,
     interval_s: float | None = None,
+    imu: Sequence[InertialSamples] = (),
 ) -> Solution:
     """Solve the rigid devices of a recording.
 
@@ -89,6 +91,8 @@ def solve_devices(
         of the first station.
     interval_s : float, optional
         Time from pose to pose in seconds; by default, a rotation of the fastest station.
+    imu : sequence of InertialSamples
+        Of any of the devices. An IMU that contradicts the light is left out with a warning.
 
     Returns
     -------
@@ -108,14 +112,16 @@ def solve_devices(
     if not scene.stations:
         estimate = _estimate_scene(sweeps, receivers, scene)
     tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
-    path_warnings = []
+    path_warnings: list[SolverWarning] = []
+    contradicting_imus: tuple[str, ...] = ()
     try:
-        refined, tracked = refine_tracks(
+        refined, tracked, contradicting_imus = refine_tracks(
             tracked,
             receivers,
             estimate.scene,
             is_estimated=not scene.stations,
             interval_ns=None if interval_s is None else max(1, round(interval_s * 1e9)),
+            imu=imu,
         )
         estimate = replace(estimate, scene=refined)
     except DegenerateError as error:
@@ -128,6 +134,7 @@ def solve_devices(
         *estimate.warnings,
         *path_warnings,
         *device_warnings(tracked),
+        *map(_imu_warning, contradicting_imus),
         *contradiction_warnings(detections, trajectories),
     ]
 
@@ -335,6 +342,14 @@ def paths_warning(error: DegenerateError) -> SolverWarning:
         "paths_not_estimated",
         f"{error}: each pose is estimated from the sweeps around it, and its covariance contains "
         "no errors of the stations",
+    )
+
+
+def _imu_warning(device: str) -> SolverWarning:
+    return SolverWarning(
+        "imu_contradicts_light",
+        f"{device}: its IMU measures another motion than the sweeps and was not used: its axes or "
+        "units differ from those of the device, or its time stamps are wrong",
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.geometry import Similarity
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import rotation_limits_ns
 from locatk.core.lighthouse.devices.tracking import TrackedDevice
 from locatk.core.lighthouse.motion.frames import fix_frame
@@ -42,7 +43,8 @@ def refine_tracks(
     *,
     is_estimated: bool,
     interval_ns: int | None = None,
-) -> tuple[Scene, tuple[TrackedDevice, ...]]:
+    imu: Sequence[InertialSamples] = (),
+) -> tuple[Scene, tuple[TrackedDevice, ...], tuple[str, ...]]:
     """Estimate trajectories in continuous time, and the stations with them.
 
     Parameters
@@ -55,6 +57,14 @@ def refine_tracks(
         True if the scene was estimated from the same sweeps. Otherwise it is returned unchanged.
     interval_ns : int, optional
         Time from pose to pose; by default, a rotation of the fastest station.
+    imu : sequence of InertialSamples
+
+    Returns
+    -------
+    scene : Scene
+    tracked : tuple of TrackedDevice
+    contradicting : tuple of str
+        Devices whose IMU contradicts the light and was not used.
 
     Raises
     ------
@@ -72,12 +82,14 @@ def refine_tracks(
         is_estimated=is_estimated,
         size_m=_scene_size(scene, tracked),
     )
+    by_device = {samples.device: samples for samples in imu}
     estimate = estimate_paths(
         [device.sweeps for device in tracked],
         first,
         [device.trajectory for device in tracked],
         common,
         fastest_ns // 2,
+        [by_device.get(device.trajectory.device) for device in tracked],
     )
     to_frame = Similarity.identity()
     if is_estimated:
@@ -120,7 +132,7 @@ def refine_tracks(
                 rejected={reason: count for reason, count in rejected.items() if count},
             )
         )
-    return scene, tuple(refined)
+    return scene, tuple(refined), estimate.contradicting_imus
 
 
 def _scene_size(scene: Scene, tracked: Sequence[TrackedDevice]) -> float:

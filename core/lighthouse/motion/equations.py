@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from locatk.core.block_tridiagonal import BlockTridiagonal
+from locatk.core.lighthouse.motion.inertial import InertialFactors
 from locatk.core.lighthouse.motion.parameters import CommonParameters
 from locatk.core.lighthouse.motion.path import Path, lever_jacobian, prior_information
 
@@ -179,6 +180,7 @@ def assemble(
     *,
     with_common: bool,
     floor_z: float | None = None,
+    inertial: InertialFactors | None = None,
 ) -> NormalEquations:
     """Return the normal equations.
 
@@ -197,6 +199,7 @@ def assemble(
         False if the common parameters are held: their parts are empty.
     floor_z : float, optional
         Height of all poses.
+    inertial : InertialFactors, optional
     """
     k, n = len(path), path.pose_size
     d = 2 * n
@@ -218,6 +221,8 @@ def assemble(
     push = (np.append(residual, 0.0)[index][:, None] @ blocks)[:, 0]
     gradient[:-1] += push[:, :d]
     gradient[1:] += push[:, d:]
+    if inertial is not None:
+        inertial.add_to_states(path, common, diagonal, above, gradient)
     states = BlockTridiagonal(diagonal, above)
     count = len(common.value)
     if not with_common:
@@ -233,14 +238,12 @@ def assemble(
     )
     columns = (sweeps.knot * d)[:, None] + np.arange(2 * d)
     own = csr_array((jacobian.ravel(), columns.ravel(), rows * 2 * d), (len(sweeps), k * d))
-    return NormalEquations(
-        states,
-        gradient,
-        np.asarray((own.T @ shared).toarray()).reshape(k, d, count),
-        (shared.T @ shared).toarray() + common.information,
-        shared.T @ residual + common.information @ common.value,
-        common.gauge,
-    )
+    coupling = np.asarray((own.T @ shared).toarray()).reshape(k, d, count)
+    information = (shared.T @ shared).toarray() + common.information
+    common_gradient = shared.T @ residual + common.information @ common.value
+    if inertial is not None:
+        inertial.add_to_common(path, common, coupling, information, common_gradient)
+    return NormalEquations(states, gradient, coupling, information, common_gradient, common.gauge)
 
 
 def prior_equations(path: Path, power: Array) -> tuple[Array, Array, Array]:

@@ -26,6 +26,7 @@ from locatk.core.geometry import (
     quaternion_multiply,
     slerp,
 )
+from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps
 from locatk.core.lighthouse.motion.consistency import (
     Consistency,
@@ -40,6 +41,7 @@ from locatk.core.lighthouse.motion.equations import (
     assemble,
     linearize,
 )
+from locatk.core.lighthouse.motion.inertial import InertialFactors, make_factors
 from locatk.core.lighthouse.motion.parameters import STATION_PARAMETERS, CommonParameters
 from locatk.core.lighthouse.motion.path import Path, prior_information
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD, INLIER_GATE_RAD
@@ -142,6 +144,8 @@ class PathEstimate:
         Knot before each of them.
     sigma_rad : float
         Standard deviation of an angle.
+    contradicting_imus : tuple of str
+        Devices whose IMU contradicts the light and was left out.
     """
 
     path: Path
@@ -157,6 +161,7 @@ class PathEstimate:
     is_used: Mask
     knot: IntArray
     sigma_rad: float
+    contradicting_imus: tuple[str, ...] = ()
 
 
 def estimate_paths(
@@ -165,6 +170,7 @@ def estimate_paths(
     start: Sequence[Trajectory],
     common: CommonParameters,
     knot_ns: int,
+    imu: Sequence[InertialSamples | None] = (),
     *,
     floor_z: float | None = None,
 ) -> PathEstimate:
@@ -182,6 +188,8 @@ def estimate_paths(
         Without photodiodes if the devices have single ones.
     knot_ns : int
         Time from knot to knot.
+    imu : sequence of InertialSamples or None
+        By device; empty without any. Of single photodiodes, they are not used.
     floor_z : float, optional
         Height of single photodiodes on a floor.
 
@@ -192,7 +200,7 @@ def estimate_paths(
         is too long.
     """
     layout = _lay_out(
-        sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0
+        sweeps, first_photodiode, start, knot_ns, imu, is_rigid=len(common.photodiodes) > 0
     )
     if layout is None:
         raise DegenerateError("no sweep is near a pose")
@@ -205,6 +213,7 @@ def estimate_paths(
     problem.fit_robustly()
     problem.reject_contradictions()
     problem.resolve_stretches()
+    problem.add_imus(imu, layout)
     problem.finish()
     if np.mean(problem.is_used) < MIN_USED_FRACTION:
         raise DegenerateError(
@@ -232,10 +241,14 @@ def _lay_out(
     first_photodiode: Sequence[int],
     start: Sequence[Trajectory],
     knot_ns: int,
+    imu: Sequence[InertialSamples | None],
     *,
     is_rigid: bool,
 ) -> _Layout | None:
-    """Place knots at multiples of ``knot_ns`` on both sides of each sweep near a rough pose."""
+    """Place knots at multiples of ``knot_ns`` on both sides of each sweep near a rough pose.
+
+    Devices with an IMU have knots in pauses as well.
+    """
     times_ns, devices, knots, rows, poses = [], [], [], [], []
     count = offset = 0
     for number, (own, rough) in enumerate(zip(sweeps, start, strict=True)):
@@ -243,7 +256,10 @@ def _lay_out(
         near = _near(own.time_ns, rough.time_ns)
         if len(near):
             cell, of_sweep = np.unique(own.time_ns[near] // knot_ns, return_inverse=True)
-            edge = _fill_gaps(np.unique(np.concatenate([cell, cell + 1])), knot_ns)
+            longest_s = MAX_PAUSE_S if imu and imu[number] is not None else MAX_GAP_S
+            edge = _fill_gaps(
+                np.unique(np.concatenate([cell, cell + 1])), round(longest_s * 1e9) // knot_ns
+            )
             time_ns = edge * knot_ns
             times_ns.append(time_ns)
             devices.append(np.full(len(edge), number))
@@ -284,13 +300,13 @@ def _lay_out(
     )
 
 
-def _fill_gaps(edge: IntArray, knot_ns: int) -> IntArray:
-    """Add the knots in short gaps to ascending multiples of ``knot_ns``."""
+def _fill_gaps(edge: IntArray, max_count: int) -> IntArray:
+    """Return ascending numbers of knots with those in gaps of up to ``max_count``."""
     gap = np.diff(edge)
-    missing = np.where(gap * knot_ns < MAX_GAP_S * 1e9, gap - 1, 0)
-    first = np.repeat(edge[:-1], missing)
-    number = np.arange(len(first)) - np.repeat(np.cumsum(missing) - missing, missing)
-    return np.sort(np.concatenate([edge, first + 1 + number]))
+    steps = np.where(gap <= max_count, gap, 1)
+    start = np.repeat(edge[:-1], steps)
+    step = np.arange(len(start)) - np.repeat(np.cumsum(steps) - steps, steps)
+    return np.append(start + step, edge[-1])
 
 
 def without_flips(trajectory: Trajectory) -> Trajectory:
@@ -374,6 +390,8 @@ class _Problem:
         self.residuals = linearize(sweeps, path, common)
         self.is_used = np.isfinite(self.residuals.residual)
         self.is_left_out = np.zeros(len(sweeps), bool)
+        self.inertial: InertialFactors | None = None
+        self.contradicting_imus: tuple[str, ...] = ()
 
     @property
     def weight(self) -> Array:
@@ -390,8 +408,9 @@ class _Problem:
             self.common,
             with_common=with_common,
             floor_z=self.floor_z,
+            inertial=self.inertial,
         )
-        if with_common:
+        if with_common and (self.inertial is None or not self.inertial.has_force):
             self._hold_scale(equations)
         return equations
 
@@ -498,6 +517,9 @@ class _Problem:
             consistency = self.check(equations)
             self.update_power(equations)
             self.update_sigma(consistency)
+            if self.inertial is not None:
+                self.inertial.update_density(self.path, self.common, equations.states)
+                self.inertial.release_positions(self.power)
             leaves, comes = find_contradictions(self.sweeps, consistency, self.is_used)
             comes &= (returns < 2) & ~self.is_left_out
             returns += comes
@@ -541,6 +563,25 @@ class _Problem:
             self.is_used = (self.is_used & ~leaves) | comes
             if not np.any(comes & ~leaves):
                 return
+
+    def add_imus(self, imu: Sequence[InertialSamples | None], layout: _Layout) -> None:
+        """Estimate the paths with the IMUs that agree with the light."""
+        if self.path.rotation is None:
+            return
+        samples = [(s, layout.device == k) for k, s in enumerate(imu) if s is not None]
+        start_ns = int(layout.time_ns.min())
+        # With several stations, the accelerometer biases the scale of an estimated scene.
+        made = make_factors(
+            samples,
+            self.path,
+            self.common,
+            start_ns,
+            with_force=len(self.common.positions) == 1,
+        )
+        self.inertial, self.common, self.contradicting_imus = made
+        if self.inertial is not None:
+            self.inertial.release_positions(self.power)
+            self.reject_contradictions()
 
     def finish(self) -> None:
         """Converge with the accepted sweeps."""
@@ -618,4 +659,5 @@ class _Problem:
             self.is_used,
             self.sweeps.knot,
             self.sigma,
+            self.contradicting_imus,
         )

@@ -183,7 +183,7 @@ def _score(options: Options, seed: int, case: Case) -> FlightScore:
     if isinstance(options, SimulationOptions):
         return _score_simulated(replace(options, seed=seed))
     flight = make_flight(seed, **{"duration_s": FLIGHT_S, **options})
-    solution = solve(flight.sweeps, flight.scene, receivers=flight.receivers)
+    solution = solve(flight.sweeps, flight.scene, receivers=flight.receivers, imu=[flight.imu])
     with_scale = case.alignment == "similarity"
     (trajectory,) = solution.trajectories
     return score_flight(flight, trajectory, solution.artifact, with_scale=with_scale)

@@ -23,7 +23,7 @@ from locatk.core.lighthouse.calibration import (
 )
 from locatk.core.lighthouse.devices import solver as device_solver
 from locatk.core.lighthouse.devices.tracking import TrackedDevice
-from locatk.core.lighthouse.devices.trajectories import pose_covariances, refine_tracks
+from locatk.core.lighthouse.devices.trajectories import refine_tracks
 from locatk.core.lighthouse.motion.consistency import find_contradictions, leverage
 from locatk.core.lighthouse.motion.equations import (
     WEAK_RATE_SIGMA,
@@ -42,6 +42,7 @@ from locatk.core.lighthouse.motion.parameters import (
     make_parameters,
 )
 from locatk.core.lighthouse.motion.path import Path, prior_information
+from locatk.core.lighthouse.motion.results import pose_covariances
 from locatk.core.lighthouse.motion.solver import PathEstimate, without_flips
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.scene import Scene, Station
@@ -638,10 +639,10 @@ def flown(request: pytest.FixtureRequest) -> tuple[Flight, Trajectory, Scene, Tr
     flight = make_flight(2, motion="slow", duration_s=12.0, geometry="unknown", wrong=request.param)
     tracks: list[TrackedDevice] = []
 
-    def record(*args: Any, **options: Any) -> tuple[Scene, tuple[TrackedDevice, ...]]:
-        scene, tracked = refine_tracks(*args, **options)
-        tracks.extend(tracked)
-        return scene, tracked
+    def record(*args: Any, **options: Any) -> Any:
+        refined = refine_tracks(*args, **options)
+        tracks.extend(refined[1])
+        return refined
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(device_solver, "refine_tracks", record)
