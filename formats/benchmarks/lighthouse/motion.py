@@ -65,7 +65,7 @@ class Case:
     name: str
     how: str
     flights: tuple[Options, ...]
-    nees: str = "station"
+    nees: str = "aligned"
     alignment: str = "rigid"
     is_precise: bool = False
 
