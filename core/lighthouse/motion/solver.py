@@ -200,7 +200,7 @@ def estimate_paths(
         is too long.
     """
     layout = _lay_out(
-        sweeps, first_photodiode, start, knot_ns, imu, is_rigid=len(common.photodiodes) > 0
+        sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0
     )
     if layout is None:
         raise DegenerateError("no sweep is near a pose")
@@ -241,14 +241,10 @@ def _lay_out(
     first_photodiode: Sequence[int],
     start: Sequence[Trajectory],
     knot_ns: int,
-    imu: Sequence[InertialSamples | None],
     *,
     is_rigid: bool,
 ) -> _Layout | None:
-    """Place knots at multiples of ``knot_ns`` on both sides of each sweep near a rough pose.
-
-    Devices with an IMU have knots in pauses as well.
-    """
+    """Place knots at multiples of ``knot_ns`` around each sweep near a rough pose, and in gaps."""
     times_ns, devices, knots, rows, poses = [], [], [], [], []
     count = offset = 0
     for number, (own, rough) in enumerate(zip(sweeps, start, strict=True)):
@@ -256,10 +252,8 @@ def _lay_out(
         near = _near(own.time_ns, rough.time_ns)
         if len(near):
             cell, of_sweep = np.unique(own.time_ns[near] // knot_ns, return_inverse=True)
-            longest_s = MAX_PAUSE_S if imu and imu[number] is not None else MAX_GAP_S
-            edge = _fill_gaps(
-                np.unique(np.concatenate([cell, cell + 1])), round(longest_s * 1e9) // knot_ns
-            )
+            cells = np.unique(np.concatenate([cell, cell + 1]))
+            edge = _fill_gaps(cells, round(MAX_GAP_S * 1e9) // knot_ns)
             time_ns = edge * knot_ns
             times_ns.append(time_ns)
             devices.append(np.full(len(edge), number))
