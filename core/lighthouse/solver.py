@@ -224,7 +224,9 @@ def _locate_and_verify(
     tracks = track_photodiodes(estimate.epochs, scene)
     channels = tracks.epochs.channels.tolist()
     trajectories, rejected, sigma_rad = tracks.trajectories, tracks.rejected, tracks.angle_sigma_rad
-    markers = marker_angles(scene.markers, tracks.epochs, rotor_angles(tracks.epochs))
+    # Visits of a given scene are those of another recording.
+    visited = scene.markers if is_estimated else ()
+    markers = marker_angles(visited, tracks.epochs, rotor_angles(tracks.epochs))
     paths, path_warnings = None, []
     try:
         paths = refine_photodiodes(
