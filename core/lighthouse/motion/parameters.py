@@ -289,7 +289,9 @@ def make_parameters(
     covariance += np.diag(floor + 1e-9 * np.diagonal(covariance))
     gauge = np.zeros((count, 0))
     if is_estimated:
-        gauge = gauge_directions(positions, count, with_scale=photodiodes.size == 0)
+        is_single = photodiodes.size == 0
+        floor_z = scene.floor_z if is_single and scene.planar else None
+        gauge = gauge_directions(positions, count, with_scale=is_single, floor_z=floor_z)
     return CommonParameters(
         positions,
         np.stack([s.rotation for s in stations]),
@@ -305,12 +307,18 @@ def _rows(index: int, size: int) -> slice:
     return slice(index * size, (index + 1) * size)
 
 
-def gauge_directions(positions: Array, count: int, *, with_scale: bool) -> Array:
+def gauge_directions(
+    positions: Array, count: int, *, with_scale: bool, floor_z: float | None = None
+) -> Array:
     """Return orthonormal changes (``count``, g) of all stations that no sweep depends on.
 
-    They are translations and rotations of everything, and a change of scale.
+    They are translations and rotations of everything, and a change of scale; over a floor only
+    those that keep it.
     """
-    centred = positions - positions.mean(axis=0)
+    centre = positions.mean(axis=0)
+    if floor_z is not None:
+        centre[2] = floor_z
+    centred = positions - centre
     size = max(float(np.sqrt(np.mean(np.sum(centred**2, axis=1)))), 1e-9)
     directions = np.zeros((count, 7 if with_scale else 6))
     for i, offset in enumerate(centred):
@@ -321,4 +329,6 @@ def gauge_directions(positions: Array, count: int, *, with_scale: bool) -> Array
             directions[row + 3 + axis, 3 + axis] = 1.0
         if with_scale:
             directions[row : row + 3, 6] = offset / size
+    if floor_z is not None:
+        directions = directions[:, [0, 1, 5, *range(6, directions.shape[1])]]
     return np.linalg.qr(directions)[0]

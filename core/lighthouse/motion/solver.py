@@ -209,7 +209,7 @@ def estimate_paths(
             f"the devices move for {1e-9 * knot_ns * len(layout.path):.0f} s in all, and paths are "
             f"estimated for up to {1e-9 * knot_ns * MAX_KNOTS:.0f} s"
         )
-    problem = _Problem(layout.sweeps, common, layout.path, floor_z)
+    problem = PathProblem(layout.sweeps, common, layout.path, floor_z)
     problem.fit_robustly()
     problem.reject_contradictions()
     problem.resolve_stretches()
@@ -364,7 +364,7 @@ def _interpolate(trajectory: Trajectory, time_ns: IntArray) -> tuple[Array, Arra
 # ---- estimation
 
 
-class _Problem:
+class PathProblem:
     """Paths and common parameters while they are estimated."""
 
     def __init__(
@@ -626,8 +626,10 @@ class _Problem:
             known = np.maximum(6.0 - spread / self.power[:, part], 1e-3) * self.path.is_linked
             energy *= self.path.is_linked
             smooth = uniform_filter1d(np.stack([energy, known]), window, axis=1, mode="nearest")
-            usual = float(np.quantile(smooth[0] / smooth[1], USUAL_POWER_QUANTILE))
-            usual = max(usual, self.min_power[part])
+            # Windows between two paths have no degrees of freedom.
+            known_windows = smooth[:, smooth[1] > 0.0]
+            ratio = known_windows[0] / known_windows[1]
+            usual = max(float(np.quantile(ratio, USUAL_POWER_QUANTILE)), self.min_power[part])
             # One degree of freedom of usual motion keeps windows without sweeps in range.
             local = (smooth[0] + usual / window) / (smooth[1] + 1.0 / window)
             largest = min(MAX_LOCAL_POWER * usual, self.max_power[part])

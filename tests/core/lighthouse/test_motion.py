@@ -39,11 +39,12 @@ from locatk.core.lighthouse.motion.parameters import (
     GIVEN_ROTATION_SIGMA_RAD,
     STATION_PARAMETERS,
     CommonParameters,
+    gauge_directions,
     make_parameters,
 )
 from locatk.core.lighthouse.motion.path import Path, prior_information
 from locatk.core.lighthouse.motion.results import pose_covariances
-from locatk.core.lighthouse.motion.solver import PathEstimate, without_flips
+from locatk.core.lighthouse.motion.solver import PathEstimate, PathProblem, without_flips
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.trajectory import Trajectory
@@ -678,3 +679,44 @@ def test_wrong_sweeps_of_a_flight_are_rejected(
     if flight.options.wrong:
         assert flight.is_wrong.sum() > 500
         assert np.mean(is_used[flight.is_wrong]) < 0.05
+
+
+# ---- guards
+
+
+def test_motions_that_keep_a_floor_are_no_errors_of_a_planar_scene() -> None:
+    positions = np.array([[-1.0, 0.5, 2.0], [1.5, 0.2, 1.7], [0.3, -2.0, 2.2]])
+    count = len(positions) * 34
+    directions = gauge_directions(positions, count, with_scale=True, floor_z=0.4)
+    assert directions.shape == (count, 4)
+
+    def distance(shift: Array, turn: float = 0.0) -> float:
+        """Return the distance of a motion of all stations from the directions."""
+        whole = np.zeros((len(positions), 34))
+        whole[:, :3], whole[:, 5] = shift, turn
+        flat = whole.ravel()
+        return float(np.linalg.norm(directions @ (directions.T @ flat) - flat))
+
+    assert distance(np.array([1.0, 0.0, 0.0])) < 1e-9
+    assert distance(positions - [0.0, 0.0, 0.4]) < 1e-9
+    assert distance(np.cross([0.0, 0.0, 1.0], positions), turn=1.0) < 1e-9
+    # The floor determines heights.
+    assert distance(np.array([0.0, 0.0, 1.0])) > 0.05
+    assert distance(positions) > 0.05
+
+
+def test_a_station_that_contradicts_the_others_is_left_out() -> None:
+    problem = Problem(is_rigid=True, is_estimated=False)
+    estimation = PathProblem(problem.sweeps, problem.common, problem.path)
+    estimation.leave_out_stations()
+    assert not estimation.is_left_out.any()
+    is_first = problem.sweeps.station == 0
+    moved = replace(problem.sweeps, angle=problem.sweeps.angle + 0.2 * is_first)
+    estimation = PathProblem(moved, problem.common, problem.path)
+    estimation.leave_out_stations()
+    assert np.array_equal(estimation.is_left_out, is_first)
+    # If no station agrees with the path, none is accused.
+    lost = replace(problem.sweeps, angle=problem.sweeps.angle + 0.2)
+    estimation = PathProblem(lost, problem.common, problem.path)
+    estimation.leave_out_stations()
+    assert not estimation.is_left_out.any()
