@@ -17,7 +17,7 @@ from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import rotation_limits_ns
 from locatk.core.lighthouse.devices.tracking import TrackedDevice
 from locatk.core.lighthouse.motion.frames import fix_frame
-from locatk.core.lighthouse.motion.parameters import make_parameters
+from locatk.core.lighthouse.motion.parameters import make_parameters, scene_size
 from locatk.core.lighthouse.motion.results import (
     make_trajectory,
     pose_covariances,
@@ -27,6 +27,7 @@ from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.reframing import transform_trajectory
+from locatk.core.solution import add_counts
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -80,7 +81,10 @@ def refine_tracks(
         channels,
         np.nan_to_num(np.concatenate(levers)),
         is_estimated=is_estimated,
-        size_m=_scene_size(scene, tracked),
+        size_m=scene_size(
+            np.stack([s.position for s in scene.stations]),
+            np.concatenate([device.trajectory.position for device in tracked]),
+        ),
     )
     by_device = {samples.device: samples for samples in imu}
     estimate = estimate_paths(
@@ -129,17 +133,10 @@ def refine_tracks(
                 residual=residual,
                 is_used=is_used,
                 sigma_rad=estimate.sigma_rad,
-                rejected={reason: count for reason, count in rejected.items() if count},
+                rejected=add_counts(rejected),
             )
         )
     return scene, tuple(refined), estimate.contradicting_imus
-
-
-def _scene_size(scene: Scene, tracked: Sequence[TrackedDevice]) -> float:
-    """Return the median distance of the devices from the stations."""
-    centre = np.mean([s.position for s in scene.stations], axis=0)
-    offset = np.concatenate([device.trajectory.position for device in tracked]) - centre
-    return float(np.median(np.linalg.norm(offset, axis=1))) if len(offset) else 1.0
 
 
 def _marker_knots(

@@ -23,7 +23,7 @@ from locatk.core.lighthouse.devices.device_sweeps import (
 )
 from locatk.core.lighthouse.localization.positions import estimate_positions
 from locatk.core.lighthouse.motion.frames import fix_frame
-from locatk.core.lighthouse.motion.parameters import make_parameters
+from locatk.core.lighthouse.motion.parameters import make_parameters, scene_size
 from locatk.core.lighthouse.motion.results import (
     make_trajectory,
     pose_covariances,
@@ -34,6 +34,7 @@ from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.reframing import transform_trajectory
+from locatk.core.solution import add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -109,14 +110,15 @@ def refine_photodiodes(
     parts = [_select_photodiode(sweeps, t.device, channels) for t in rough]
     if not all(_is_path(own, t) for own, t in zip(parts, rough, strict=True)):
         return None
-    positions = np.concatenate([t.position for t in rough])
-    centre = np.mean([s.position for s in scene.stations], axis=0)
     common = make_parameters(
         scene,
         channels,
         np.zeros((0, 3)),
         is_estimated=is_estimated,
-        size_m=float(np.median(np.linalg.norm(positions - centre, axis=1))),
+        size_m=scene_size(
+            np.stack([s.position for s in scene.stations]),
+            np.concatenate([t.position for t in rough]),
+        ),
     )
     fastest_ns, _ = rotation_limits_ns(channels)
     floor_z = scene.floor_z if scene.planar else None
@@ -147,7 +149,7 @@ def refine_photodiodes(
     return PhotodiodePaths(
         scene,
         tuple(trajectories),
-        {reason: count for reason, count in rejected.items() if count},
+        add_counts(rejected),
         estimate.sigma_rad,
     )
 

@@ -215,6 +215,12 @@ class CommonParameters:
         return angle, by_position, by_station, column
 
 
+def scene_size(stations: Array, positions: Array) -> float:
+    """Return the median distance of positions (n, 3) from the centre of stations (s, 3)."""
+    distance = np.linalg.norm(positions - stations.mean(axis=0), axis=1)
+    return float(np.median(distance)) if len(distance) else 1.0
+
+
 def distortion_basis(local: Array) -> Array:
     """Return the terms (n, 7) of the distortion for points (n, 3) in the axes of a station."""
     azimuth = np.arctan2(local[:, 1], local[:, 0]) / DISTORTION_UNIT_RAD

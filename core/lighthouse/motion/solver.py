@@ -42,7 +42,11 @@ from locatk.core.lighthouse.motion.equations import (
     linearize,
 )
 from locatk.core.lighthouse.motion.inertial import InertialFactors, make_factors
-from locatk.core.lighthouse.motion.parameters import STATION_PARAMETERS, CommonParameters
+from locatk.core.lighthouse.motion.parameters import (
+    STATION_PARAMETERS,
+    CommonParameters,
+    scene_size,
+)
 from locatk.core.lighthouse.motion.path import Path, prior_information
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD, INLIER_GATE_RAD
 from locatk.core.robust import robust_sigma
@@ -375,8 +379,7 @@ class PathProblem:
         floor_z: float | None = None,
     ) -> None:
         self.sweeps, self.common, self.path, self.floor_z = sweeps, common, path, floor_z
-        centre = common.positions.mean(axis=0)
-        self.size_m = float(np.median(np.linalg.norm(path.position - centre, axis=1)))
+        self.size_m = scene_size(common.positions, path.position)
         unit = np.array([self.size_m**2, 1.0])
         self.min_power, self.max_power = MIN_POWER * unit, MAX_POWER * unit
         self.power = np.tile(START_POWER * unit, (len(path) - 1, 1))
