@@ -26,14 +26,15 @@ REJECTED_SIGMAS = 5.0
 """Normalized residual above which a sweep or the mean of a group is rejected."""
 
 ACCEPTED_SIGMAS = 3.5
-"""Normalized residual below which a rejected sweep is taken back."""
+"""Normalized residual below which a rejected sweep is reinstated."""
 
 NEIGHBOUR_KNOTS = 4
-"""Knots around a contradiction within which only the largest one is rejected at a time: the others
-may be its consequence."""
+"""Knots on each side of a contradiction within which much smaller ones are not rejected with it:
+they may be its consequence."""
 
 MIN_REDUNDANCY = 0.02
-"""Part of the variance of an angle that the path must not have absorbed for a test."""
+"""Smallest variance of a residual relative to that of the angle: a sweep that alone determines a
+coordinate has none, and cannot be tested."""
 
 
 CONTESTED_KNOTS = 20
@@ -56,17 +57,17 @@ class Consistency:
         Variance of the predicted angle [rad^2].
     ratio : (n,) ndarray
         Normalized residual, of a sweep or of its group, whichever is larger.
-    innovation : (n,) ndarray
+    normalized_innovation : (n,) ndarray
         Residual over the standard deviation of angle and prediction, for sweeps that the path was
         estimated without.
     """
 
     variance: Array
     ratio: Array
-    innovation: Array
+    normalized_innovation: Array
 
 
-def leverage(
+def residual_statistics(
     sweeps: PathSweeps,
     residuals: Residuals,
     states: BlockTridiagonal,
@@ -116,14 +117,14 @@ def leverage(
 def find_contradictions(
     sweeps: PathSweeps, consistency: Consistency, is_used: Mask
 ) -> tuple[Mask, Mask]:
-    """Return which accepted sweeps (n,) to reject, and which rejected ones to take back."""
+    """Return which accepted sweeps (n,) to reject, and which rejected ones to reinstate."""
     ratio = np.where(is_used, consistency.ratio, 0.0)
     largest = np.zeros(int(sweeps.knot.max(initial=0)) + 1)
     np.maximum.at(largest, sweeps.knot, ratio)
     nearby = maximum_filter1d(largest, 2 * NEIGHBOUR_KNOTS + 1, mode="nearest")
-    leaves = is_used & (ratio > REJECTED_SIGMAS) & (ratio > 0.7 * nearby[sweeps.knot])
-    comes = ~is_used & (consistency.innovation < ACCEPTED_SIGMAS)
-    return leaves, comes
+    leaving = is_used & (ratio > REJECTED_SIGMAS) & (ratio > 0.7 * nearby[sweeps.knot])
+    returning = ~is_used & (consistency.normalized_innovation < ACCEPTED_SIGMAS)
+    return leaving, returning
 
 
 def find_contested(sweeps: PathSweeps, is_used: Mask) -> Mask:

@@ -5,9 +5,10 @@ Lupton and Sukkarieh 2012; Forster et al. 2017). As the intervals last some mill
 rotation within one is that of the path. With the integrals ``theta`` of the angular rate, ``dv``
 and ``dp`` of the specific force, all after calibration, the residuals are::
 
-    log(R' R'') - theta,    v'' - v' - R dv - g T,    p'' - p' - v' T - R dp - g T^2 / 2
+    log(R_i^-1 R_j) - theta,    v_j - v_i - R dv - g T,    p_j - p_i - v_i T - R dp - g T^2 / 2
 
-with the time ``T`` between the knots and a rotation ``R`` between those of the knots.
+with the time ``T`` from knot i to knot j and a rotation ``R`` between those of both: half way for
+the velocity, a third of the way for the position.
 
 The parameters are gravity (shared by all devices), then for each IMU :data:`IMU_PARAMETERS`. They
 follow the other common parameters. The density of the noise is estimated from the residuals,
@@ -66,12 +67,13 @@ MAX_MISFIT = np.array([0.8, 1.5])
 MIN_MISFIT = np.array([0.04, 0.15])
 """Residual below which no IMU contradicts the light, in rad/s and m/s^2."""
 
-MIN_COMPARED_WINDOWS = 10
+MIN_COMPARED_S = 2.0
+"""Shortest time for which a sensor must be compared with the path before it is used."""
 
 MIN_DENSITY = np.array([1e-8, 1e-6])
 """Smallest power spectral density of the noise in rad^2/s and m^2/s^3, of the best sensors."""
 
-RELEASE = 1e3
+LOOSENED_POWER = 1e3
 """Power of the motion where the acceleration is measured, relative to the density of its noise."""
 
 GYRO_ROWS, POSITION_ROWS, VELOCITY_ROWS = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -425,14 +427,14 @@ class InertialFactors:
             arrays.append(rows)
         return arrays[0][..., 0], arrays[1], arrays[2]
 
-    def release_positions(self, power: Array) -> None:
+    def loosen_position_prior(self, power: Array) -> None:
         """Raise the power (k - 1, 2) of positions whose acceleration is measured.
 
         A prior of similar strength would pull accelerations, and thereby the scale, towards zero.
         """
         for imu, density in zip(self.imus, self.density, strict=True):
             rows = imu.interval[imu.has_force]
-            power[rows, 0] = np.maximum(power[rows, 0], RELEASE * density[imu.has_force, 1])
+            power[rows, 0] = np.maximum(power[rows, 0], LOOSENED_POWER * density[imu.has_force, 1])
 
     def update_density(
         self, path: Path, common: CommonParameters, states: BlockTridiagonal
@@ -501,8 +503,10 @@ def make_factors(
     imus, starts, densities, gravities, contradicting = [], [], [], [], []
     for own, is_own in samples:
         imu = select_intervals(own, path, is_own, start_ns)
-        if imu is None:
+        if imu is None or _measured_s(imu, imu.has_gyro) < MIN_COMPARED_S:
             continue
+        if _measured_s(imu, imu.has_force) < MIN_COMPARED_S:
+            imu = replace(imu, has_force=np.zeros_like(imu.has_force))
         gravity, value, density, is_consistent = compare(imu, path)
         if not is_consistent:
             contradicting.append(imu.device)
@@ -510,7 +514,8 @@ def make_factors(
         imus.append(imu if with_force else replace(imu, has_force=np.zeros_like(imu.has_force)))
         starts.append(value)
         densities.append(np.tile(np.maximum(density, MIN_DENSITY), (len(imu.interval), 1)))
-        gravities.append(gravity)
+        if np.any(imu.has_force):
+            gravities.append(gravity)
     if not imus:
         return None, common, tuple(contradicting)
     first = len(common.value)
@@ -521,9 +526,14 @@ def make_factors(
         common,
         information=block_diag(common.information, np.diag(information)),
         gauge=np.concatenate([common.gauge, np.zeros((size, common.gauge.shape[1]))]),
-        value=np.concatenate([common.value, np.mean(gravities, axis=0), *starts]),
+        value=np.concatenate([common.value, np.mean(gravities or [np.zeros(3)], axis=0), *starts]),
     )
     return InertialFactors(tuple(imus), first, densities), common, tuple(contradicting)
+
+
+def _measured_s(imu: ImuIntervals, is_measured: Mask) -> float:
+    """Return the time that a sensor covers, in seconds."""
+    return float(np.sum((imu.end_s - imu.start_s)[is_measured]))
 
 
 def compare(imu: ImuIntervals, path: Path) -> tuple[Array, Array, Array, bool]:
@@ -549,7 +559,7 @@ def compare(imu: ImuIntervals, path: Path) -> tuple[Array, Array, Array, bool]:
         ((GYRO_ROWS, turn, imu.has_gyro), (VELOCITY_ROWS, change, imu.has_force))
     ):
         residual = _window_means(raw.residual[:, rows], span_s, is_measured, window)
-        if len(residual) < MIN_COMPARED_WINDOWS:
+        if not len(residual):
             continue
         of_path = _window_means(motion, span_s, is_measured, window)
         offset = np.median(residual, axis=0)

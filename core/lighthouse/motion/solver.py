@@ -2,8 +2,8 @@
 
 Every sweep is a measurement at its own time. :func:`estimate_paths` refines rough trajectories:
 
-1. The paths are fitted with a robust loss while the common parameters are held.
-2. Sweeps that contradict the path are rejected, and those that agree with it are taken back, until
+1. The paths, and then the poses of the stations, are fitted with a robust loss.
+2. Sweeps that contradict the path are rejected, and those that agree with it are reinstated, until
    nothing changes (:mod:`~locatk.core.lighthouse.motion.consistency`); the common parameters, the
    noise of the angles and the power of the motion are estimated meanwhile.
 3. The covariance of each pose contains the noise and what remains of the common parameters.
@@ -33,7 +33,7 @@ from locatk.core.lighthouse.motion.consistency import (
     agrees_with_most,
     find_contested,
     find_contradictions,
-    leverage,
+    residual_statistics,
 )
 from locatk.core.lighthouse.motion.equations import (
     NormalEquations,
@@ -90,7 +90,8 @@ to it: undetected outliers look like accelerations."""
 ROBUST_ITERATIONS = 8
 MAX_ROUNDS = 20
 FINAL_ITERATIONS = 4
-"""Iterations with the robust loss, of the search for outliers, and after it."""
+"""Iterations with the robust loss, largest number of rounds of each search for outliers, and
+iterations after it."""
 
 MAX_KNOTS = 40_000
 """Largest number of knots, which bounds the memory to about 2 GB: of a device for 400 s."""
@@ -102,7 +103,7 @@ STRETCH_PASSES, STRETCH_ITERATIONS = 2, 4
 """Passes over stretches in which many sweeps are rejected, and iterations after each."""
 
 MAX_PREDICTION_SIGMA_RAD = 5e-3
-"""Largest standard deviation of a predicted angle with which a sweep is taken back: with more,
+"""Largest standard deviation of a predicted angle with which a sweep is reinstated: with more,
 reflections agree by chance."""
 
 STATION_GATE_SIGMAS = 6.0
@@ -216,8 +217,8 @@ def estimate_paths(
     problem = PathProblem(layout.sweeps, common, layout.path, floor_z)
     problem.fit_robustly()
     problem.reject_contradictions()
-    problem.resolve_stretches()
     problem.add_imus(imu, layout)
+    problem.resolve_stretches()
     problem.finish()
     if np.mean(problem.is_used) < MIN_USED_FRACTION:
         raise DegenerateError(
@@ -476,7 +477,7 @@ class PathProblem:
             equations = self.equations(np.nan_to_num(weight), with_common=with_common)
             self.move(equations, with_common=with_common)
         with np.errstate(invalid="ignore"):
-            spread = robust_sigma(self.residuals.residual)
+            spread = robust_sigma(self.residuals.residual[~self.is_left_out])
             self.is_used = np.abs(self.residuals.residual) < max(6 * spread, 10 * self.sigma)
         self.is_used &= ~self.is_left_out
         self.common = replace(common, value=self.common.value)
@@ -505,8 +506,8 @@ class PathProblem:
             self.is_left_out = is_out[self.sweeps.station]
 
     def reject_contradictions(self) -> None:
-        """Reject sweeps and take them back until nothing changes."""
-        returns = np.zeros(len(self.sweeps), np.int64)
+        """Reject sweeps and reinstate them until nothing changes."""
+        return_count = np.zeros(len(self.sweeps), np.int64)
         for number in range(MAX_ROUNDS):
             with_common = number % 2 == 1
             equations = self.equations(self.weight, with_common=with_common)
@@ -516,19 +517,19 @@ class PathProblem:
             self.update_sigma(consistency)
             if self.inertial is not None:
                 self.inertial.update_density(self.path, self.common, equations.states)
-                self.inertial.release_positions(self.power)
-            leaves, comes = find_contradictions(self.sweeps, consistency, self.is_used)
-            comes &= (returns < 2) & ~self.is_left_out
-            returns += comes
-            self.is_used = (self.is_used & ~leaves) | comes
-            if number >= 5 and with_common and np.sum(leaves) + np.sum(comes) == 0:
+                self.inertial.loosen_position_prior(self.power)
+            leaving, returning = find_contradictions(self.sweeps, consistency, self.is_used)
+            returning &= (return_count < 2) & ~self.is_left_out
+            return_count += returning
+            self.is_used = (self.is_used & ~leaving) | returning
+            if number >= 5 and with_common and np.sum(leaving) + np.sum(returning) == 0:
                 break
 
     def resolve_stretches(self) -> None:
         """Estimate again where many sweeps contradict the path, from both ends inwards.
 
         Reflections of both stations at a time agree with each other and bend the path to them. All
-        sweeps of such a stretch are left out, and those are taken back that agree with the motion
+        sweeps of such a stretch are left out, and those are reinstated that agree with the motion
         before and after it.
         """
         for _ in range(STRETCH_PASSES):
@@ -536,29 +537,29 @@ class PathProblem:
             if not np.any(is_contested):
                 return
             self.is_used &= ~is_contested
-            self.take_back(is_contested)
+            self.reinstate(is_contested)
             for _ in range(STRETCH_ITERATIONS):
                 equations = self.equations(self.weight, with_common=True)
                 self.move(equations, with_common=True)
                 consistency = self.check(equations)
                 self.update_power(equations)
                 self.update_sigma(consistency)
-                leaves, _ = find_contradictions(self.sweeps, consistency, self.is_used)
-                self.is_used &= ~leaves
+                leaving, _ = find_contradictions(self.sweeps, consistency, self.is_used)
+                self.is_used &= ~leaving
 
-    def take_back(self, candidates: Mask) -> None:
-        """Take back sweeps that agree with the path, as far as it predicts them."""
+    def reinstate(self, candidates: Mask) -> None:
+        """Reinstate sweeps that agree with the path, as far as it predicts them."""
         for _ in range(MAX_ROUNDS):
             for _ in range(2):
                 equations = self.equations(self.weight)
                 self.move(equations, with_common=False)
             consistency = self.check(equations)
-            leaves, comes = find_contradictions(self.sweeps, consistency, self.is_used)
-            comes &= candidates & ~self.is_left_out
-            comes &= consistency.variance < MAX_PREDICTION_SIGMA_RAD**2
-            comes &= agrees_with_most(self.sweeps, comes | self.is_used)
-            self.is_used = (self.is_used & ~leaves) | comes
-            if not np.any(comes & ~leaves):
+            leaving, returning = find_contradictions(self.sweeps, consistency, self.is_used)
+            returning &= candidates & ~self.is_left_out
+            returning &= consistency.variance < MAX_PREDICTION_SIGMA_RAD**2
+            returning &= agrees_with_most(self.sweeps, returning | self.is_used)
+            self.is_used = (self.is_used & ~leaving) | returning
+            if not np.any(returning & ~leaving):
                 return
 
     def add_imus(self, imu: Sequence[InertialSamples | None], layout: _Layout) -> None:
@@ -577,7 +578,7 @@ class PathProblem:
         )
         self.inertial, self.common, self.contradicting_imus = made
         if self.inertial is not None:
-            self.inertial.release_positions(self.power)
+            self.inertial.loosen_position_prior(self.power)
             self.reject_contradictions()
 
     def finish(self) -> None:
@@ -589,7 +590,9 @@ class PathProblem:
 
     def check(self, equations: NormalEquations) -> Consistency:
         """Return how far the path determines the angle of each sweep."""
-        return leverage(self.sweeps, self.residuals, equations.states, self.sigma, self.is_used)
+        return residual_statistics(
+            self.sweeps, self.residuals, equations.states, self.sigma, self.is_used
+        )
 
     def update_sigma(self, consistency: Consistency | None = None) -> None:
         """Estimate the noise of an angle from the residuals of the accepted sweeps."""

@@ -24,7 +24,7 @@ from locatk.core.lighthouse.calibration import (
 from locatk.core.lighthouse.devices import solver as device_solver
 from locatk.core.lighthouse.devices.tracking import TrackedDevice
 from locatk.core.lighthouse.devices.trajectories import refine_tracks
-from locatk.core.lighthouse.motion.consistency import find_contradictions, leverage
+from locatk.core.lighthouse.motion.consistency import find_contradictions, residual_statistics
 from locatk.core.lighthouse.motion.equations import (
     WEAK_RATE_SIGMA,
     NormalEquations,
@@ -602,7 +602,7 @@ def test_a_flip_after_a_pause_is_kept() -> None:
 
 
 def contradictions(wrong: dict[int, float], rejected: list[int]) -> tuple[list[int], list[int]]:
-    """Return the sweeps to reject and to take back, if some are wrong and some are rejected."""
+    """Return the sweeps to reject and to reinstate, if some are wrong and some are rejected."""
     problem = Problem(is_rigid=True, is_estimated=False, knots=12, is_exact=True)
     angle = problem.sweeps.angle.copy()
     angle[list(wrong)] += list(wrong.values())
@@ -613,9 +613,11 @@ def contradictions(wrong: dict[int, float], rejected: list[int]) -> tuple[list[i
         problem.path = problem.path.stepped(equations.states_step())
     residuals = linearize(problem.sweeps, problem.path, problem.common)
     is_used = problem.weight > 0
-    consistency = leverage(problem.sweeps, residuals, equations.states, SIGMA_RAD, is_used)
-    leaves, comes = find_contradictions(problem.sweeps, consistency, is_used)
-    return np.flatnonzero(leaves).tolist(), np.flatnonzero(comes).tolist()
+    consistency = residual_statistics(
+        problem.sweeps, residuals, equations.states, SIGMA_RAD, is_used
+    )
+    leaving, returning = find_contradictions(problem.sweeps, consistency, is_used)
+    return np.flatnonzero(leaving).tolist(), np.flatnonzero(returning).tolist()
 
 
 def test_single_wrong_sweeps_are_found() -> None:
