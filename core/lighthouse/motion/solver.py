@@ -19,13 +19,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from locatk.core.errors import DegenerateError
-from locatk.core.geometry import (
-    matrix_from_quaternion,
-    quaternion_angle,
-    quaternion_inverse,
-    quaternion_multiply,
-    slerp,
-)
 from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps
 from locatk.core.lighthouse.motion.consistency import (
@@ -42,6 +35,7 @@ from locatk.core.lighthouse.motion.equations import (
     linearize,
 )
 from locatk.core.lighthouse.motion.inertial import InertialFactors, make_factors
+from locatk.core.lighthouse.motion.layout import PathLayout, lay_out
 from locatk.core.lighthouse.motion.parameters import (
     STATION_PARAMETERS,
     CommonParameters,
@@ -55,21 +49,6 @@ from locatk.core.trajectory import Trajectory
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-MAX_PAUSE_S = 1.0
-"""Longest pause of the sweeps over which a path continues."""
-
-MAX_GAP_S = 0.3
-"""Longest gap without sweeps in which a path has knots."""
-
-MAX_START_GAP_S = 0.25
-"""Longest time from a sweep to the nearest pose of the rough trajectory."""
-
-MAX_JUMP_RAD = 0.6
-"""Largest turn between neighbouring rough poses: 30 rad/s at 50 poses a second."""
-
-MAX_FLIP_S = 3.0
-"""Longest time with a wrong orientation that is interpolated."""
 
 START_POWER = np.array([0.5, 30.0])
 """Power of the motion at the start: of the position, relative to the square of the distance of the
@@ -204,9 +183,7 @@ def estimate_paths(
         No device has a sweep near a pose, the sweeps do not determine the paths, or the recording
         is too long.
     """
-    layout = _lay_out(
-        sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0
-    )
+    layout = lay_out(sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0)
     if layout is None:
         raise DegenerateError("no sweep is near a pose")
     if len(layout.path) > MAX_KNOTS:
@@ -225,148 +202,6 @@ def estimate_paths(
             f"{1 - np.mean(problem.is_used):.0%} of the sweeps contradict every path"
         )
     return problem.estimate(layout)
-
-
-# ---- knots
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Knots, and the sweeps between them."""
-
-    path: Path
-    device: IntArray
-    time_ns: IntArray
-    sweeps: PathSweeps
-    sweep: IntArray
-
-
-def _lay_out(
-    sweeps: Sequence[DeviceSweeps],
-    first_photodiode: Sequence[int],
-    start: Sequence[Trajectory],
-    knot_ns: int,
-    *,
-    is_rigid: bool,
-) -> _Layout | None:
-    """Place knots at multiples of ``knot_ns`` around each sweep near a rough pose, and in gaps."""
-    times_ns, devices, knots, rows, poses = [], [], [], [], []
-    count = offset = 0
-    for number, (own, rough) in enumerate(zip(sweeps, start, strict=True)):
-        trajectory = without_flips(rough) if is_rigid else rough
-        near = _near(own.time_ns, rough.time_ns)
-        if len(near):
-            cell, of_sweep = np.unique(own.time_ns[near] // knot_ns, return_inverse=True)
-            cells = np.unique(np.concatenate([cell, cell + 1]))
-            edge = _fill_gaps(cells, round(MAX_GAP_S * 1e9) // knot_ns)
-            time_ns = edge * knot_ns
-            times_ns.append(time_ns)
-            devices.append(np.full(len(edge), number))
-            knots.append(count + np.searchsorted(edge, cell)[of_sweep.ravel()])
-            rows.append(offset + near)
-            poses.append(_interpolate(trajectory, time_ns))
-            count += len(edge)
-        offset += len(own)
-    if not count:
-        return None
-    time_ns, device = np.concatenate(times_ns), np.concatenate(devices)
-    sweep, knot = np.concatenate(rows), np.concatenate(knots)
-    start_ns = int(time_ns.min())
-    time_s = np.asarray((time_ns - start_ns) * 1e-9, np.float64)
-    position = np.concatenate([p for p, _ in poses])
-    quaternion = np.concatenate([q for _, q in poses])
-    is_linked = (np.diff(device) == 0) & (np.abs(np.diff(time_s)) < MAX_PAUSE_S)
-    path = Path(
-        time_s,
-        is_linked,
-        position,
-        np.zeros_like(position),
-        matrix_from_quaternion(quaternion) if is_rigid else None,
-        np.zeros_like(position) if is_rigid else None,
-    )
-    all_ns, station, plane, sensor, angle = (
-        np.concatenate([getattr(s, name) for s in sweeps])[sweep]
-        for name in ("time_ns", "station", "plane", "sensor", "angle")
-    )
-    photodiode = sensor + np.array(first_photodiode)[device[knot]]
-    weights = path.hermite_weights(knot, (all_ns - start_ns) * 1e-9)
-    return _Layout(
-        path,
-        device,
-        time_ns,
-        PathSweeps(knot, weights, station, plane, photodiode, angle),
-        sweep,
-    )
-
-
-def _fill_gaps(edge: IntArray, max_count: int) -> IntArray:
-    """Return ascending numbers of knots with those in gaps of up to ``max_count``."""
-    gap = np.diff(edge)
-    steps = np.where(gap <= max_count, gap, 1)
-    start = np.repeat(edge[:-1], steps)
-    step = np.arange(len(start)) - np.repeat(np.cumsum(steps) - steps, steps)
-    return np.append(start + step, edge[-1])
-
-
-def without_flips(trajectory: Trajectory) -> Trajectory:
-    """Return a trajectory without short parts in which a device has a wrong orientation.
-
-    A coplanar device has two poses that explain its angles almost equally. From the longest part
-    without a jump of the orientation, in both directions, short parts are left out whose
-    orientation does not continue that of the last part.
-    """
-    if len(trajectory) < 2:
-        return trajectory
-    quaternion, time_ns = trajectory.quaternion, trajectory.time_ns
-    edge = np.flatnonzero(_turn(quaternion[:-1], quaternion[1:]) > MAX_JUMP_RAD) + 1
-    start, stop = np.r_[0, edge], np.r_[edge, len(trajectory)]
-    longest = int(np.argmax(stop - start))
-    kept = np.ones(len(trajectory), bool)
-    forward, backward = range(longest + 1, len(start)), range(longest - 1, -1, -1)
-    for parts, near, far in ((forward, start, stop - 1), (backward, stop - 1, start)):
-        last = int(far[longest])
-        for part in parts:
-            is_long = time_ns[stop[part] - 1] - time_ns[start[part]] > MAX_FLIP_S * 1e9
-            is_late = abs(time_ns[near[part]] - time_ns[last]) > MAX_FLIP_S * 1e9
-            turn = _turn(quaternion[last], quaternion[near[part]])
-            if is_long or is_late or turn < MAX_JUMP_RAD:
-                last = int(far[part])
-            else:
-                kept[start[part] : stop[part]] = False
-    return trajectory.select(kept)
-
-
-def _turn(first: Array, second: Array) -> Array:
-    """Return the angles (n,) between orientations (n, 4) in radians."""
-    return quaternion_angle(quaternion_multiply(quaternion_inverse(first), second))
-
-
-def _near(time_ns: IntArray, pose_ns: IntArray) -> IntArray:
-    """Return the sweeps that are near a pose of the rough trajectory."""
-    if not len(pose_ns):
-        return np.zeros(0, np.int64)
-    after = np.clip(np.searchsorted(pose_ns, time_ns), 0, len(pose_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    gap_ns = np.minimum(np.abs(pose_ns[after] - time_ns), np.abs(time_ns - pose_ns[before]))
-    return np.flatnonzero(gap_ns <= MAX_START_GAP_S * 1e9)
-
-
-def _interpolate(trajectory: Trajectory, time_ns: IntArray) -> tuple[Array, Array]:
-    """Return positions and quaternions at times; beyond the ends, those of the ends."""
-    pose_s = (trajectory.time_ns - trajectory.time_ns[0]) * 1e-9
-    time_s = np.clip((time_ns - trajectory.time_ns[0]) * 1e-9, 0.0, pose_s[-1])
-    after = np.clip(np.searchsorted(pose_s, time_s), 1, max(len(pose_s) - 1, 1))
-    after = np.minimum(after, len(pose_s) - 1)
-    before = np.maximum(after - 1, 0)
-    span_s = np.maximum(pose_s[after] - pose_s[before], 1e-9)
-    fraction = np.clip((time_s - pose_s[before]) / span_s, 0.0, 1.0)
-    position = trajectory.position[before] + fraction[:, None] * (
-        trajectory.position[after] - trajectory.position[before]
-    )
-    return position, slerp(trajectory.quaternion[before], trajectory.quaternion[after], fraction)
-
-
-# ---- estimation
 
 
 class PathProblem:
@@ -562,7 +397,7 @@ class PathProblem:
             if not np.any(returning & ~leaving):
                 return
 
-    def add_imus(self, imu: Sequence[InertialSamples | None], layout: _Layout) -> None:
+    def add_imus(self, imu: Sequence[InertialSamples | None], layout: PathLayout) -> None:
         """Estimate the paths with the IMUs that agree with the light."""
         if self.path.rotation is None:
             return
@@ -641,7 +476,7 @@ class PathProblem:
             largest = min(MAX_LOCAL_POWER * usual, self.max_power[part])
             self.power[:, part] = np.clip(local, self.min_power[part], largest)
 
-    def estimate(self, layout: _Layout) -> PathEstimate:
+    def estimate(self, layout: PathLayout) -> PathEstimate:
         """Return the result with covariances."""
         equations = self.equations(self.weight, with_common=True)
         common_covariance, response = equations.covariances()

@@ -33,6 +33,7 @@ from locatk.core.lighthouse.motion.equations import (
     linearize,
 )
 from locatk.core.lighthouse.motion.frames import fix_frame
+from locatk.core.lighthouse.motion.layout import without_flips
 from locatk.core.lighthouse.motion.parameters import (
     FACTORY_SIGMA,
     GIVEN_POSITION_SIGMA_M,
@@ -44,7 +45,7 @@ from locatk.core.lighthouse.motion.parameters import (
 )
 from locatk.core.lighthouse.motion.path import Path, prior_information
 from locatk.core.lighthouse.motion.results import pose_covariances
-from locatk.core.lighthouse.motion.solver import PathEstimate, PathProblem, without_flips
+from locatk.core.lighthouse.motion.solver import PathEstimate, PathProblem
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.trajectory import Trajectory
