@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,10 @@ from locatk.core.geometry import Similarity
 from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import rotation_limits_ns
 from locatk.core.lighthouse.devices.tracking import TrackedDevice
-from locatk.core.lighthouse.motion.frames import fix_frame
+from locatk.core.lighthouse.motion.frames import PathFrame
 from locatk.core.lighthouse.motion.parameters import make_parameters, scene_size
-from locatk.core.lighthouse.motion.results import (
-    make_trajectory,
-    pose_covariances,
-    refined_scene,
-)
-from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths
+from locatk.core.lighthouse.motion.recording import PathRecording, Visit
+from locatk.core.lighthouse.motion.results import refined_scene
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.reframing import transform_trajectory
@@ -74,7 +71,7 @@ def refine_tracks(
     """
     channels = tracked[0].channels
     levers = [receivers[device.trajectory.device].position_m for device in tracked]
-    first = np.cumsum([0, *map(len, levers)])[:-1].tolist()
+    edge = np.cumsum([0, *map(len, levers)]).tolist()
     fastest_ns, _ = rotation_limits_ns(channels)
     common = make_parameters(
         scene,
@@ -87,69 +84,56 @@ def refine_tracks(
         ),
     )
     by_device = {samples.device: samples for samples in imu}
-    estimate = estimate_paths(
+    recording = PathRecording(
         [device.sweeps for device in tracked],
-        first,
+        [np.arange(first, end) for first, end in pairwise(edge)],
         [device.trajectory for device in tracked],
         common,
         fastest_ns // 2,
+        interval_ns or fastest_ns,
         [by_device.get(device.trajectory.device) for device in tracked],
+        _visits(scene, [device.trajectory.device for device in tracked]) if is_estimated else (),
     )
-    to_frame = Similarity.identity()
+    sample = recording.estimate_sample()
+    estimate = sample.estimate
+    to_frame, frame = Similarity.identity(), None
     if is_estimated:
-        on_marker = _marker_knots(estimate, scene, tracked)
+        on_marker = recording.marker_knots(estimate)
         has_markers = len(np.unique(on_marker[on_marker >= 0])) >= MIN_FRAME_MARKERS
         is_fixed = on_marker >= 0 if has_markers else np.ones(len(estimate.path), bool)
-        estimate = fix_frame(estimate, is_fixed, with_scale=has_markers)
+        frame = PathFrame.of(estimate, is_fixed, with_scale=has_markers)
         # The first station keeps its pose: it defines the frame of a scene without markers.
         positions, rotations, _ = estimate.common.stations
         turn = common.rotations[0] @ rotations[0].T
         to_frame = Similarity(1.0, turn, common.positions[0] - turn @ positions[0])
-        scene = refined_scene(scene, channels, estimate).transformed(to_frame)
-    covariance = pose_covariances(estimate)
-    refined, begin = [], 0
+        refined = refined_scene(scene, channels, estimate, frame.station_covariance(estimate))
+        scene = refined.transformed(to_frame)
+    result = []
     for number, device in enumerate(tracked):
-        end = begin + len(device.sweeps)
-        own = (estimate.sweep >= begin) & (estimate.sweep < end)
-        residual, is_used = np.full(end - begin, np.nan), np.zeros(end - begin, bool)
-        residual[estimate.sweep[own] - begin] = estimate.residual[own]
-        is_used[estimate.sweep[own] - begin] = estimate.is_used[own]
-        begin = end
-        made = make_trajectory(
-            estimate,
-            covariance,
-            number,
-            device.trajectory.device,
-            device.trajectory.frame,
-            interval_ns or fastest_ns,
-        )
+        path = recording.trace(number, sample, frame)
         rejected = dict(device.rejected)
-        rejected["pose_not_determined"] = made.undetermined
-        rejected["sweep_contradicts_pose"] = int(np.count_nonzero(np.isfinite(residual) & ~is_used))
-        refined.append(
+        rejected["pose_not_determined"] = path.undetermined
+        rejected["sweep_contradicts_pose"] = int(
+            np.count_nonzero(np.isfinite(path.residual) & ~path.is_used)
+        )
+        result.append(
             replace(
                 device,
-                trajectory=transform_trajectory(made.trajectory, to_frame, scene.frame),
-                residual=residual,
-                is_used=is_used,
+                trajectory=transform_trajectory(path.trajectory, to_frame, scene.frame),
+                residual=path.residual,
+                is_used=path.is_used,
                 sigma_rad=estimate.sigma_rad,
                 rejected=add_counts(rejected),
             )
         )
-    return scene, tuple(refined), estimate.contradicting_imus
+    return scene, tuple(result), estimate.contradicting_imus
 
 
-def _marker_knots(
-    estimate: PathEstimate, scene: Scene, tracked: Sequence[TrackedDevice]
-) -> IntArray:
-    """Return the number of the marker on which a device is at each knot, or -1."""
-    number = np.full(len(estimate.path), -1)
-    names = [device.trajectory.device for device in tracked]
-    for k, marker in enumerate(scene.markers):
-        for visit in marker.visits:
-            if visit.device not in names or visit.start_ns is None or visit.end_ns is None:
-                continue
-            is_visit = estimate.device == names.index(visit.device)
-            is_visit &= (estimate.time_ns >= visit.start_ns) & (estimate.time_ns <= visit.end_ns)
-            number[is_visit] = k
-    return number
+def _visits(scene: Scene, names: Sequence[str]) -> list[Visit]:
+    """Return the visits of markers by devices."""
+    return [
+        Visit(names.index(visit.device), marker, visit.start_ns, visit.end_ns)
+        for marker, own in enumerate(scene.markers)
+        for visit in own.visits
+        if visit.device in names and visit.start_ns is not None and visit.end_ns is not None
+    ]

@@ -22,14 +22,11 @@ from locatk.core.lighthouse.devices.device_sweeps import (
     select_device_sweeps,
 )
 from locatk.core.lighthouse.localization.positions import estimate_positions
-from locatk.core.lighthouse.motion.frames import fix_frame
+from locatk.core.lighthouse.motion.frames import PathFrame
 from locatk.core.lighthouse.motion.parameters import make_parameters, scene_size
-from locatk.core.lighthouse.motion.results import (
-    make_trajectory,
-    pose_covariances,
-    refined_scene,
-)
-from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths
+from locatk.core.lighthouse.motion.recording import PathRecording
+from locatk.core.lighthouse.motion.results import refined_scene
+from locatk.core.lighthouse.motion.solver import PathEstimate
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
@@ -122,28 +119,36 @@ def refine_photodiodes(
     )
     fastest_ns, _ = rotation_limits_ns(channels)
     floor_z = scene.floor_z if scene.planar else None
-    estimate = estimate_paths(
-        parts, [0] * len(parts), rough, common, fastest_ns // 2, floor_z=floor_z
+    recording = PathRecording(
+        parts,
+        [np.zeros(0, np.int64)] * len(parts),
+        rough,
+        common,
+        fastest_ns // 2,
+        fastest_ns,
+        [None] * len(parts),
+        floor_z=floor_z,
     )
-    to_frame, alignment = Similarity.identity(), None
+    sample = recording.estimate_sample()
+    estimate = sample.estimate
+    to_frame, alignment, frame = Similarity.identity(), None, None
     if is_estimated:
-        estimate = fix_frame(estimate, np.ones(len(estimate.path), bool), with_scale=True)
+        frame = PathFrame.of(estimate, np.ones(len(estimate.path), bool), with_scale=True)
         if scene.frame_source == "markers":
             points, angles = markers
             position = estimate_positions(angles, *estimate.common.stations, floor_z=floor_z)
             alignment = align_points(position.position, points)
         to_frame = alignment.transform if alignment else _rough_frame(estimate, rough)
-        scene = refined_scene(scene, channels, estimate).transformed(to_frame)
-    covariance = pose_covariances(estimate)
-    made = [
-        make_trajectory(estimate, covariance, k, t.device, t.frame, fastest_ns)
-        for k, t in enumerate(rough)
-    ]
+        refined = refined_scene(scene, channels, estimate, frame.station_covariance(estimate))
+        scene = refined.transformed(to_frame)
+    paths = [recording.trace(k, sample, frame) for k in range(len(rough))]
     rejected = {
-        "sweep_contradicts_pose": int(np.count_nonzero(~estimate.is_used)),
-        "pose_not_determined": sum(part.undetermined for part in made),
+        "sweep_contradicts_pose": sum(
+            int(np.count_nonzero(np.isfinite(path.residual) & ~path.is_used)) for path in paths
+        ),
+        "pose_not_determined": sum(path.undetermined for path in paths),
     }
-    trajectories = [transform_trajectory(p.trajectory, to_frame, scene.frame) for p in made]
+    trajectories = [transform_trajectory(p.trajectory, to_frame, scene.frame) for p in paths]
     if alignment is not None:
         trajectories = [alignment.add_uncertainty(t) for t in trajectories]
     return PhotodiodePaths(
@@ -185,9 +190,12 @@ def _rough_frame(estimate: PathEstimate, rough: Sequence[Trajectory]) -> Similar
     for device, trajectory in enumerate(rough):
         knots = np.flatnonzero(estimate.device == device)
         if len(knots):
-            nearest = np.searchsorted(estimate.time_ns[knots], trajectory.time_ns)
-            source.append(estimate.path.position[knots[np.minimum(nearest, len(knots) - 1)]])
-            target.append(trajectory.position)
+            next_knot = np.searchsorted(estimate.time_ns[knots], trajectory.time_ns)
+            nearest = knots[np.minimum(next_knot, len(knots) - 1)]
+            apart_ns = np.abs(estimate.time_ns[nearest] - trajectory.time_ns)
+            is_near = apart_ns < MAX_POSE_INTERVAL_S * 1e9
+            source.append(estimate.path.position[nearest[is_near]])
+            target.append(trajectory.position[is_near])
     a, b = np.concatenate(source), np.concatenate(target)
     distance = np.linalg.norm(umeyama(a, b).apply(a) - b, axis=1)
     is_close = distance <= 3 * np.median(distance)

@@ -7,7 +7,7 @@ those on markers, do not move on average (S-transformation, Baarda 1973).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,37 +19,53 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def fix_frame(estimate: PathEstimate, is_fixed: Mask, *, with_scale: bool) -> PathEstimate:
-    """Return an estimate with covariances in the frame of chosen poses.
+@dataclass(frozen=True)
+class PathFrame:
+    """Frame of chosen poses.
 
-    Parameters
+    Attributes
     ----------
-    estimate : PathEstimate
-    is_fixed : (k,) bool ndarray
-        Knots whose positions define the frame.
-    with_scale : bool
-        True if they define the scale, too.
+    centre : (3,) ndarray
+        Mean position of these poses.
+    motion : (g, m) ndarray
+        Translation, rotation about the centre and, if they define the scale, change of scale of
+        these poses per change of the common parameters.
     """
-    centre = estimate.path.position[is_fixed].mean(axis=0)
-    by_motion = common_motions(estimate.path.position - centre, with_scale)
-    fixed = by_motion[is_fixed].reshape(-1, by_motion.shape[2])
-    response = estimate.response[is_fixed, :3].reshape(len(fixed), -1)
-    motion = np.linalg.lstsq(fixed, response, rcond=None)[0]
-    position = estimate.response[:, :3] - by_motion @ motion
-    parts = [position]
-    if estimate.path.rotation is not None:
-        parts.append(estimate.response[:, 3:] - estimate.path.rotation.mT @ motion[3:6])
-    common = np.eye(len(estimate.common.value))
-    stations = common_motions(estimate.common.stations[0] - centre, with_scale)
-    for i, by_station in enumerate(stations):
-        row = i * STATION_PARAMETERS
-        common[row : row + 3] -= by_station @ motion
-        common[row + 3 : row + 6] -= motion[3:6]
-    return replace(
-        estimate,
-        response=np.concatenate(parts, axis=1),
-        station_covariance=common @ estimate.common_covariance @ common.T,
-    )
+
+    centre: Array
+    motion: Array
+
+    @classmethod
+    def of(cls, estimate: PathEstimate, is_fixed: Mask, *, with_scale: bool) -> PathFrame:
+        """Return the frame of the positions at chosen knots (k,)."""
+        position = estimate.path.position[is_fixed]
+        centre = position.mean(axis=0)
+        by_motion = common_motions(position - centre, with_scale)
+        response = estimate.response[is_fixed, :3].reshape(3 * len(position), -1)
+        motion = np.linalg.lstsq(by_motion.reshape(len(response), -1), response, rcond=None)[0]
+        return cls(centre, np.asarray(motion, np.float64))
+
+    def apply(self, estimate: PathEstimate) -> PathEstimate:
+        """Return an estimate with the responses of its poses in this frame."""
+        path = estimate.path
+        by_motion = common_motions(path.position - self.centre, len(self.motion) > 6)
+        response = estimate.response.copy()
+        # Common parameters of other devices follow those of the frame.
+        own = slice(0, self.motion.shape[1])
+        response[:, :3, own] -= by_motion @ self.motion
+        if path.rotation is not None:
+            response[:, 3:, own] -= path.rotation.mT @ self.motion[3:6]
+        return replace(estimate, response=response)
+
+    def station_covariance(self, estimate: PathEstimate) -> Array:
+        """Return the covariance (m, m) of the common parameters in this frame."""
+        change = np.eye(len(estimate.common.value))
+        offset = estimate.common.stations[0] - self.centre
+        for i, by_station in enumerate(common_motions(offset, len(self.motion) > 6)):
+            row = i * STATION_PARAMETERS
+            change[row : row + 3] -= by_station @ self.motion
+            change[row + 3 : row + 6] -= self.motion[3:6]
+        return np.asarray(change @ estimate.common_covariance @ change.T)
 
 
 def common_motions(offset: Array, with_scale: bool = True) -> Array:

@@ -42,6 +42,9 @@ IMU_PARAMETERS = 10
 """Biases in rad/s and m/s^2, rotation of the IMU against the photodiodes, and the delay of the
 samples in seconds. Scales are not estimated: noise of the samples biases them towards zero."""
 
+IMU_COLUMNS = 3 + IMU_PARAMETERS
+"""Common parameters that an IMU depends on: gravity and its own."""
+
 PARAMETER_SIGMA = np.repeat([0.05, 0.5, 0.02, 0.004], [3, 3, 3, 1])
 """Standard deviations of these parameters. Biases of common sensors (BMI088, data sheet) are 0.017
 rad/s and 0.2 m/s^2; low-pass filters of 30 to 100 Hz delay samples by 2 to 8 ms."""
@@ -236,7 +239,7 @@ def linearize_imu(imu: ImuIntervals, path: Path, gravity: Array, value: Array) -
     n, k = len(imu.interval), imu.interval
     span_s = (imu.end_s - imu.start_s)[:, None]
     residual, by_states = np.zeros((n, 9)), np.zeros((n, 9, 24))
-    by_common = np.zeros((n, 9, 3 + IMU_PARAMETERS))
+    by_common = np.zeros((n, 9, IMU_COLUMNS))
     of_imu = by_common[:, :, 3:]
     turn = path.turns()[k]
     correction = skew(value[MOUNTING]) + np.eye(3)
@@ -327,8 +330,8 @@ class InertialFactors:
     imus: tuple[ImuIntervals, ...]
     first: int
     density: list[Array]
-    reduction: list[Array] = field(default_factory=list)
-    min_density: list[Array] = field(default_factory=list)
+    reduction: list[Array] = field(init=False, default_factory=list)
+    min_density: list[Array] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
         for imu in self.imus:
@@ -357,6 +360,27 @@ class InertialFactors:
         """Return the indices (13,) of gravity and the parameters of an IMU."""
         own = self.first + 3 + number * IMU_PARAMETERS + np.arange(IMU_PARAMETERS)
         return np.concatenate([self.first + np.arange(3), own])
+
+    def for_samples(
+        self, samples: InertialSamples, path: Path, start_ns: int, first: int
+    ) -> InertialFactors | None:
+        """Return factors of another part of the path of one of the devices.
+
+        ``first`` is the index of gravity among the common parameters of that part. None if the
+        samples do not cover it, or the IMU of the device is not used.
+        """
+        numbers = [k for k, imu in enumerate(self.imus) if imu.device == samples.device]
+        made = select_intervals(samples, path, np.ones(len(path), bool), start_ns)
+        if not numbers or made is None:
+            return None
+        imu, density = self.imus[numbers[0]], self.density[numbers[0]]
+        made = replace(
+            made,
+            has_gyro=made.has_gyro & np.any(imu.has_gyro),
+            has_force=made.has_force & np.any(imu.has_force),
+        )
+        usual = np.tile(np.median(density, axis=0), (len(made.interval), 1))
+        return InertialFactors((made,), first, [usual])
 
     def residuals(self, number: int, path: Path, common: CommonParameters) -> InertialResiduals:
         """Return the residuals of an IMU."""

@@ -146,6 +146,32 @@ class CommonParameters:
         first = len(self.positions) * STATION_PARAMETERS + self.photodiodes.size
         return first + (2 * station + plane) * len(self.photodiodes) + photodiode
 
+    def columns_of(self, photodiodes: IntArray) -> IntArray:
+        """Return the indices of all stations and of some photodiodes with their biases."""
+        stations = len(self.positions)
+        planes = np.arange(2 * stations)[:, None]
+        return np.concatenate(
+            [
+                np.arange(stations * STATION_PARAMETERS),
+                self.lever_columns(photodiodes).ravel(),
+                self.bias_columns(planes // 2, planes % 2, photodiodes).ravel(),
+            ]
+        )
+
+    def select(self, photodiodes: IntArray) -> CommonParameters:
+        """Return the parameters of all stations and of some photodiodes.
+
+        Before a recording is used, these are independent of the other photodiodes.
+        """
+        column = self.columns_of(photodiodes)
+        return replace(
+            self,
+            photodiodes=self.photodiodes[photodiodes],
+            information=self.information[np.ix_(column, column)],
+            gauge=self.gauge[column],
+            value=self.value[column],
+        )
+
     def pose_sigma(self, distance_m: float) -> Array:
         """Return the standard deviation (s,) of angles at a distance by the poses of stations."""
         count = len(self.positions)

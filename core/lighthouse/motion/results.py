@@ -46,41 +46,38 @@ class PathTrajectory:
 
 
 def make_trajectory(
-    estimate: PathEstimate,
-    covariance: Array,
-    device: int,
-    name: str,
-    frame: str,
-    interval_ns: int,
+    estimate: PathEstimate, knots: IntArray, name: str, frame: str, interval_ns: int
 ) -> PathTrajectory:
-    """Return the poses of a device, one in each interval.
-
-    ``covariance`` (k, 6, 6) is that of all knots, from :func:`pose_covariances`.
-    """
-    knots = np.flatnonzero(estimate.device == device)
+    """Return the poses of a device at some of its knots, one in each interval."""
     if len(knots):
         interval = estimate.time_ns[knots] // interval_ns
         knots = knots[np.r_[True, np.diff(interval) > 0]]
     path, n = estimate.path, estimate.path.pose_size
-    sigma = np.sqrt(np.einsum("kii->ki", covariance[knots])[:, :n])
+    covariance = pose_covariances(estimate, knots)
+    sigma = np.sqrt(np.einsum("kii->ki", covariance)[:, :n])
     is_determined = np.all(sigma < MAX_POSE_SIGMA[:n], axis=1)
     is_sparse = _used_nearby(estimate, 2)[knots] < MIN_USED_SWEEPS
     is_determined &= ~is_sparse | np.all(sigma[:, :3] < MAX_SPARSE_SIGMA_M, axis=1)
-    kept = knots[is_determined]
+    kept, covariance = knots[is_determined], covariance[is_determined]
     undetermined = int(np.count_nonzero(~is_determined))
     time_ns, position = estimate.time_ns[kept], path.position[kept]
     if path.rotation is None:
-        own = covariance[kept][:, :3, :3]
+        own = covariance[:, :3, :3]
         return PathTrajectory(
             Trajectory.from_positions(name, frame, time_ns, position, own), undetermined
         )
     quaternion = quaternion_from_matrix(path.rotation[kept])
-    trajectory = Trajectory(name, frame, time_ns, position, quaternion, covariance[kept])
+    trajectory = Trajectory(name, frame, time_ns, position, quaternion, covariance)
     return PathTrajectory(trajectory, undetermined)
 
 
-def refined_scene(scene: Scene, channels: Sequence[int], estimate: PathEstimate) -> Scene:
-    """Return a scene with the estimated stations and their joint covariance."""
+def refined_scene(
+    scene: Scene, channels: Sequence[int], estimate: PathEstimate, covariance: Array
+) -> Scene:
+    """Return a scene with the estimated stations and their joint covariance.
+
+    ``covariance`` (m, m) is that of the common parameters in the frame of the poses.
+    """
     positions, rotations, calibrations = estimate.common.stations
     order = {channel: i for i, channel in enumerate(channels)}
     stations = []
@@ -100,26 +97,29 @@ def refined_scene(scene: Scene, channels: Sequence[int], estimate: PathEstimate)
                 position=positions[i],
                 rotation=rotations[i],
                 calibration=calibration,
-                covariance=estimate.station_covariance[pose, pose],
+                covariance=covariance[pose, pose],
             )
         )
         rows.append(first + np.arange(JOINT_PARAMETERS))
     index = np.concatenate(rows)
-    joint = estimate.station_covariance[np.ix_(index, index)]
+    joint = covariance[np.ix_(index, index)]
     return replace(scene, stations=tuple(stations), covariance=joint)
 
 
-def pose_covariances(estimate: PathEstimate) -> Array:
-    """Return the covariances (k, 6, 6) of the poses, rotations in the axes of the frame."""
+def pose_covariances(estimate: PathEstimate, knots: IntArray) -> Array:
+    """Return the covariances (p, 6, 6) of the poses at knots (p,).
+
+    Rotations are in the axes of the frame; those of single photodiodes are ``nan``.
+    """
     factor = _square_root(estimate.common_covariance)
-    shared = estimate.response @ factor
-    covariance = estimate.pose_covariance + shared @ shared.mT
-    k, n = covariance.shape[:2]
-    full = np.full((k, 6, 6), np.nan)
+    shared = estimate.response[knots] @ factor
+    covariance = estimate.pose_covariance[knots] + shared @ shared.mT
+    count, n = covariance.shape[:2]
+    full = np.full((count, 6, 6), np.nan)
     full[:, :n, :n] = covariance
     if estimate.path.rotation is not None:
-        to_frame = np.zeros((k, 6, 6))
-        to_frame[:, :3, :3], to_frame[:, 3:, 3:] = np.eye(3), estimate.path.rotation
+        to_frame = np.zeros((count, 6, 6))
+        to_frame[:, :3, :3], to_frame[:, 3:, 3:] = np.eye(3), estimate.path.rotation[knots]
         full = to_frame @ full @ to_frame.mT
     return full
 

@@ -34,7 +34,11 @@ from locatk.core.lighthouse.motion.equations import (
     assemble,
     linearize,
 )
-from locatk.core.lighthouse.motion.inertial import InertialFactors, make_factors
+from locatk.core.lighthouse.motion.inertial import (
+    IMU_COLUMNS,
+    InertialFactors,
+    make_factors,
+)
 from locatk.core.lighthouse.motion.layout import PathLayout, lay_out
 from locatk.core.lighthouse.motion.parameters import (
     STATION_PARAMETERS,
@@ -67,13 +71,10 @@ MAX_LOCAL_POWER = 10.0
 to it: undetected outliers look like accelerations."""
 
 ROBUST_ITERATIONS = 8
-MAX_ROUNDS = 20
+MIN_ROUNDS, MAX_ROUNDS = 5, 20
 FINAL_ITERATIONS = 4
-"""Iterations with the robust loss, largest number of rounds of each search for outliers, and
-iterations after it."""
-
-MAX_KNOTS = 40_000
-"""Largest number of knots, which bounds the memory to about 2 GB: of a device for 400 s."""
+"""Iterations with the robust loss, smallest and largest number of rounds of each search for
+outliers, and iterations after it."""
 
 MIN_USED_FRACTION = 0.3
 """Smallest fraction of accepted sweeps of a path that is trusted."""
@@ -113,8 +114,6 @@ class PathEstimate:
     common : CommonParameters
     common_covariance : (m, m) ndarray
         Of the common parameters, for the poses.
-    station_covariance : (m, m) ndarray
-        The same in the frame in which the covariances of the poses hold, for the stations.
     pose_covariance : (k, n, n) ndarray
         Of the pose at each knot while the common parameters are known.
     response : (k, n, m) ndarray
@@ -128,6 +127,9 @@ class PathEstimate:
         Knot before each of them.
     sigma_rad : float
         Standard deviation of an angle.
+    is_left_out : (s,) bool ndarray
+        Stations that contradict the others.
+    inertial : InertialFactors, optional
     contradicting_imus : tuple of str
         Devices whose IMU contradicts the light and was left out.
     """
@@ -137,7 +139,6 @@ class PathEstimate:
     time_ns: IntArray
     common: CommonParameters
     common_covariance: Array
-    station_covariance: Array
     pose_covariance: Array
     response: Array
     sweep: IntArray
@@ -145,6 +146,8 @@ class PathEstimate:
     is_used: Mask
     knot: IntArray
     sigma_rad: float
+    is_left_out: Mask
+    inertial: InertialFactors | None = None
     contradicting_imus: tuple[str, ...] = ()
 
 
@@ -180,32 +183,86 @@ def estimate_paths(
     Raises
     ------
     DegenerateError
-        No device has a sweep near a pose, the sweeps do not determine the paths, or the recording
-        is too long.
+        No device has a sweep near a pose, or the sweeps do not determine the paths.
     """
-    layout = lay_out(sweeps, first_photodiode, start, knot_ns, is_rigid=len(common.photodiodes) > 0)
-    if layout is None:
-        raise DegenerateError("no sweep is near a pose")
-    if len(layout.path) > MAX_KNOTS:
-        raise DegenerateError(
-            f"the devices move for {1e-9 * knot_ns * len(layout.path):.0f} s in all, and paths are "
-            f"estimated for up to {1e-9 * knot_ns * MAX_KNOTS:.0f} s"
-        )
+    layout = _require_layout(sweeps, first_photodiode, start, knot_ns, common)
     problem = PathProblem(layout.sweeps, common, layout.path, floor_z)
     problem.fit_robustly()
     problem.reject_contradictions()
     problem.add_imus(imu, layout)
     problem.resolve_stretches()
     problem.finish()
-    if np.mean(problem.is_used) < MIN_USED_FRACTION:
-        raise DegenerateError(
-            f"{1 - np.mean(problem.is_used):.0%} of the sweeps contradict every path"
-        )
+    problem.require_agreement()
     return problem.estimate(layout)
 
 
+def follow_path(
+    sweeps: DeviceSweeps,
+    start: Trajectory,
+    common: CommonParameters,
+    knot_ns: int,
+    imu: InertialSamples | None,
+    sample: PathEstimate,
+    *,
+    floor_z: float | None = None,
+) -> PathEstimate:
+    """Estimate the path of a device while the common parameters are held.
+
+    Parameters
+    ----------
+    sweeps : DeviceSweeps
+    start : Trajectory
+    common : CommonParameters
+        At their values. After those of the scene and the photodiodes, gravity and the parameters
+        of the IMU if there is one.
+    knot_ns : int
+    imu : InertialSamples or None
+    sample : PathEstimate
+        Of other parts of the recording.
+    floor_z : float, optional
+
+    Returns
+    -------
+    PathEstimate
+        Its ``common_covariance`` is empty.
+
+    Raises
+    ------
+    DegenerateError
+        See :func:`estimate_paths`.
+    """
+    layout = _require_layout([sweeps], [0], [start], knot_ns, common)
+    problem = PathProblem(layout.sweeps, common, layout.path, floor_z, is_held=True)
+    problem.is_left_out, problem.sigma = sample.is_left_out, sample.sigma_rad
+    problem.fit_robustly()
+    problem.reject_contradictions()
+    if imu is not None and sample.inertial is not None:
+        first = len(common.value) - IMU_COLUMNS
+        start_ns = int(layout.time_ns.min())
+        problem.inertial = sample.inertial.for_samples(imu, layout.path, start_ns, first)
+        problem.reject_contradictions()
+    problem.resolve_stretches()
+    problem.finish()
+    problem.require_agreement()
+    return problem.estimate(layout)
+
+
+def _require_layout(
+    sweeps: Sequence[DeviceSweeps],
+    first_photodiode: Sequence[int],
+    start: Sequence[Trajectory],
+    knot_ns: int,
+    common: CommonParameters,
+) -> PathLayout:
+    is_rigid = len(common.photodiodes) > 0
+    layout = lay_out(sweeps, first_photodiode, start, knot_ns, is_rigid=is_rigid)
+    if layout is None:
+        raise DegenerateError("no sweep is near a pose")
+    return layout
+
+
 class PathProblem:
-    """Paths and common parameters while they are estimated."""
+    """Paths and common parameters while they are estimated, or held at known values."""
 
     def __init__(
         self,
@@ -213,7 +270,10 @@ class PathProblem:
         common: CommonParameters,
         path: Path,
         floor_z: float | None = None,
+        *,
+        is_held: bool = False,
     ) -> None:
+        self.is_held = is_held
         self.sweeps, self.common, self.path, self.floor_z = sweeps, common, path, floor_z
         self.size_m = scene_size(common.positions, path.position)
         unit = np.array([self.size_m**2, 1.0])
@@ -222,9 +282,14 @@ class PathProblem:
         self.sigma = ANGLE_SIGMA_RAD
         self.residuals = linearize(sweeps, path, common)
         self.is_used = np.isfinite(self.residuals.residual)
-        self.is_left_out = np.zeros(len(sweeps), bool)
+        self.is_left_out = np.zeros(len(common.positions), bool)
         self.inertial: InertialFactors | None = None
         self.contradicting_imus: tuple[str, ...] = ()
+
+    @property
+    def is_testable(self) -> Mask:
+        """Sweeps (n,) of stations that are not left out."""
+        return np.asarray(~self.is_left_out[self.sweeps.station])
 
     @property
     def weight(self) -> Array:
@@ -292,29 +357,35 @@ class PathProblem:
         residual = np.abs(self.residuals.residual[self.is_used])
         return float(np.median(np.nan_to_num(residual, nan=np.inf))) if len(residual) else 0.0
 
+    def iterate(self, *, with_common: bool) -> tuple[NormalEquations, float]:
+        """Take a step with the accepted sweeps; return the equations and the largest change."""
+        with_common = with_common and not self.is_held
+        equations = self.equations(self.weight, with_common=with_common)
+        return equations, self.move(equations, with_common=with_common)
+
     def fit_robustly(self) -> None:
         """Fit the paths with a Cauchy loss that narrows from the gate to the noise.
 
         Light planes and photodiodes are held, so that wrong sweeps cannot bend them.
         """
         common = self.common
-        self.common = common.only_poses()
+        if not self.is_held:
+            self.common = common.only_poses()
         for iteration in range(ROBUST_ITERATIONS):
+            if iteration == ROBUST_ITERATIONS // 2 and not self.is_held:
+                self.leave_out_stations()
             residual = self.residuals.residual
             spread = float(np.clip(robust_sigma(residual), self.sigma, INLIER_GATE_RAD))
             scale = np.clip(LOSS_SIGMAS * spread, LOSS_SIGMAS * self.sigma, INLIER_GATE_RAD)
             with np.errstate(invalid="ignore"):
                 weight = spread**-2.0 / (1.0 + (residual / scale) ** 2)
-            with_common = iteration > ROBUST_ITERATIONS // 2
-            if iteration == ROBUST_ITERATIONS // 2:
-                self.leave_out_stations()
-            weight[self.is_left_out] = 0.0
-            equations = self.equations(np.nan_to_num(weight), with_common=with_common)
-            self.move(equations, with_common=with_common)
+            weight = np.where(self.is_testable, np.nan_to_num(weight), 0.0)
+            with_common = iteration > ROBUST_ITERATIONS // 2 and not self.is_held
+            self.move(self.equations(weight, with_common=with_common), with_common=with_common)
         with np.errstate(invalid="ignore"):
-            spread = robust_sigma(self.residuals.residual[~self.is_left_out])
+            spread = robust_sigma(self.residuals.residual[self.is_testable])
             self.is_used = np.abs(self.residuals.residual) < max(6 * spread, 10 * self.sigma)
-        self.is_used &= ~self.is_left_out
+        self.is_used &= self.is_testable
         self.common = replace(common, value=self.common.value)
         self.update_sigma()
 
@@ -336,28 +407,24 @@ class PathProblem:
         gate = np.maximum(
             INLIER_GATE_RAD, STATION_GATE_SIGMAS * self.common.pose_sigma(self.size_m)
         )
-        is_out = usual > gate
         if np.any(usual < gate / 2):
-            self.is_left_out = is_out[self.sweeps.station]
+            self.is_left_out = usual > gate
 
     def reject_contradictions(self) -> None:
         """Reject sweeps and reinstate them until nothing changes."""
         return_count = np.zeros(len(self.sweeps), np.int64)
         for number in range(MAX_ROUNDS):
             with_common = number % 2 == 1
-            equations = self.equations(self.weight, with_common=with_common)
-            self.move(equations, with_common=with_common)
-            consistency = self.check(equations)
-            self.update_power(equations)
-            self.update_sigma(consistency)
+            equations, _ = self.iterate(with_common=with_common)
+            consistency = self.update_noise(equations)
             if self.inertial is not None:
                 self.inertial.update_density(self.path, self.common, equations.states)
                 self.inertial.loosen_position_prior(self.power)
             leaving, returning = find_contradictions(self.sweeps, consistency, self.is_used)
-            returning &= (return_count < 2) & ~self.is_left_out
+            returning &= (return_count < 2) & self.is_testable
             return_count += returning
             self.is_used = (self.is_used & ~leaving) | returning
-            if number >= 5 and with_common and np.sum(leaving) + np.sum(returning) == 0:
+            if number >= MIN_ROUNDS and with_common and not np.any(leaving | returning):
                 break
 
     def resolve_stretches(self) -> None:
@@ -368,29 +435,23 @@ class PathProblem:
         before and after it.
         """
         for _ in range(STRETCH_PASSES):
-            is_contested = find_contested(self.sweeps, self.is_used | self.is_left_out)
+            is_contested = find_contested(self.sweeps, self.is_used | ~self.is_testable)
             if not np.any(is_contested):
                 return
             self.is_used &= ~is_contested
             self.reinstate(is_contested)
             for _ in range(STRETCH_ITERATIONS):
-                equations = self.equations(self.weight, with_common=True)
-                self.move(equations, with_common=True)
-                consistency = self.check(equations)
-                self.update_power(equations)
-                self.update_sigma(consistency)
+                consistency = self.update_noise(self.iterate(with_common=True)[0])
                 leaving, _ = find_contradictions(self.sweeps, consistency, self.is_used)
                 self.is_used &= ~leaving
 
     def reinstate(self, candidates: Mask) -> None:
         """Reinstate sweeps that agree with the path, as far as it predicts them."""
         for _ in range(MAX_ROUNDS):
-            for _ in range(2):
-                equations = self.equations(self.weight)
-                self.move(equations, with_common=False)
-            consistency = self.check(equations)
+            self.iterate(with_common=False)
+            consistency = self.check(self.iterate(with_common=False)[0])
             leaving, returning = find_contradictions(self.sweeps, consistency, self.is_used)
-            returning &= candidates & ~self.is_left_out
+            returning &= candidates & self.is_testable
             returning &= consistency.variance < MAX_PREDICTION_SIGMA_RAD**2
             returning &= agrees_with_most(self.sweeps, returning | self.is_used)
             self.is_used = (self.is_used & ~leaving) | returning
@@ -419,9 +480,26 @@ class PathProblem:
     def finish(self) -> None:
         """Converge with the accepted sweeps."""
         for _ in range(FINAL_ITERATIONS):
-            equations = self.equations(self.weight, with_common=True)
-            if self.move(equations, with_common=True) < 1e-6:
+            if self.iterate(with_common=True)[1] < 1e-6:
                 break
+
+    def require_agreement(self) -> None:
+        """Raise an error if most sweeps contradict the paths.
+
+        Raises
+        ------
+        DegenerateError
+        """
+        fraction = float(np.mean(self.is_used))
+        if fraction < MIN_USED_FRACTION:
+            raise DegenerateError(f"{1 - fraction:.0%} of the sweeps contradict every path")
+
+    def update_noise(self, equations: NormalEquations) -> Consistency:
+        """Estimate the noise of an angle and the power of the motion; return the residuals."""
+        consistency = self.check(equations)
+        self.update_power(equations)
+        self.update_sigma(consistency)
+        return consistency
 
     def check(self, equations: NormalEquations) -> Consistency:
         """Return how far the path determines the angle of each sweep."""
@@ -479,7 +557,11 @@ class PathProblem:
     def estimate(self, layout: PathLayout) -> PathEstimate:
         """Return the result with covariances."""
         equations = self.equations(self.weight, with_common=True)
-        common_covariance, response = equations.covariances()
+        if self.is_held:
+            covariance = np.zeros((0, 0))
+            response = -equations.states.solve(equations.coupling)
+        else:
+            covariance, response = equations.covariances()
         diagonal, _ = equations.states.inverse_blocks
         n = self.path.pose_size
         return PathEstimate(
@@ -487,8 +569,7 @@ class PathProblem:
             layout.device,
             layout.time_ns,
             self.common,
-            common_covariance,
-            common_covariance,
+            covariance,
             diagonal[:, :n, :n],
             response[:, :n],
             layout.sweep,
@@ -496,5 +577,7 @@ class PathProblem:
             self.is_used,
             self.sweeps.knot,
             self.sigma,
+            self.is_left_out,
+            self.inertial,
             self.contradicting_imus,
         )
