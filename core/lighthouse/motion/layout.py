@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +76,7 @@ def lay_out(
     times_ns, devices, knots, rows, poses = [], [], [], [], []
     count = offset = 0
     for number, (own, rough) in enumerate(zip(sweeps, start, strict=True)):
-        trajectory = without_flips(rough) if is_rigid else rough
+        trajectory = interpolate_flips(rough) if is_rigid else rough
         near = _near(own.time_ns, rough.time_ns)
         if len(near):
             cell, of_sweep = np.unique(own.time_ns[near] // knot_ns, return_inverse=True)
@@ -157,6 +157,14 @@ def without_flips(trajectory: Trajectory) -> Trajectory:
             else:
                 kept[start[part] : stop[part]] = False
     return trajectory.select(kept)
+
+
+def interpolate_flips(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory with interpolated poses where a device has a wrong orientation."""
+    if not len(trajectory):
+        return trajectory
+    position, quaternion = _interpolate(without_flips(trajectory), trajectory.time_ns)
+    return replace(trajectory, position=position, quaternion=quaternion)
 
 
 def _turn(first: Array, second: Array) -> Array:

@@ -18,7 +18,7 @@ from locatk.core.errors import DegenerateError
 from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps
 from locatk.core.lighthouse.motion.frames import PathFrame
-from locatk.core.lighthouse.motion.layout import without_flips
+from locatk.core.lighthouse.motion.layout import interpolate_flips
 from locatk.core.lighthouse.motion.parameters import CommonParameters
 from locatk.core.lighthouse.motion.results import make_trajectory
 from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths, follow_path
@@ -214,7 +214,7 @@ class PathRecording:
         own, rough = self.sweeps[device], self.start[device]
         common, column, covariance, imu = self._held_parameters(device, sample)
         if len(common.photodiodes):
-            rough = without_flips(rough)
+            rough = interpolate_flips(rough)
         length_ns = -(-round(PART_S * 1e9) // self.interval_ns) * self.interval_ns
         overlap_ns, none = round(PART_OVERLAP_S * 1e9), np.zeros(0, np.int64)
         for number in np.unique(own.time_ns // length_ns).tolist():
