@@ -16,7 +16,8 @@ What a reader has and a test machine has not:
 - ``s3://`` is a server of moto on this machine; a bucket holds the sessions that are in the
   page's folder when it is first named.
 - Files that do not come out of the page's own commands are in :data:`FILES`. Where published
-  data or an optional package is absent, the page is skipped from there on.
+  data, an optional package or a program of :data:`OPTIONAL_PROGRAMS` is absent, the page is
+  skipped from there on.
 
 Comments that readers do not see, on the lines before a block, tell what is not the rule::
 
@@ -60,6 +61,9 @@ EXCEPTIONS = {
     "locatk bench": "minutes; tests/formats/test_bench*.py run them with less",
 }
 """How a command begins that is not run, and why."""
+
+OPTIONAL_PROGRAMS = {"gs": "Ghostscript"}
+"""Other programs that a page runs and a machine may lack; the page is skipped from there on."""
 
 DEVICES = {"polaris-array": "polaris", "dotbot-gateway": "lighthouse", "locatk": "landmarks"}
 """``--device`` to the system that is simulated for it."""
@@ -314,6 +318,8 @@ class Reader:
             pytest.importorskip("distributed", reason=f"{line} needs locatk[dask]")
             self.links.enter_context(terminal([sys.executable, "-m", *words], self.folder))
             return 0
+        if words[0] in OPTIONAL_PROGRAMS and shutil.which(words[0]) is None:
+            pytest.skip(f"{line} needs {OPTIONAL_PROGRAMS[words[0]]}")
         for bucket in re.findall(r"s3://([\w-]+)", line):
             self.store(bucket)
         with ExitStack() as stack:

@@ -223,6 +223,7 @@ def build_corpus(folder: Path) -> None:
         (folder / f"{name}-sim.toml").write_text(run(words, folder).stdout)
         _save_attachments(folder / f"{name}.mcap", folder)
     _write_tables(folder)
+    _write_crazyflie_logs(folder)
     _write_images(folder)
     _write_streams(folder)
     _write_document(folder)
@@ -275,6 +276,24 @@ def _write_tables(folder: Path) -> None:
                f"db_time={100_000 * k}" for k, (t, c) in enumerate(pairs)]  # fmt: skip
     (folder / "gateway.log").write_text("\n".join(records))
     (folder / "path.csv").write_text("x_mm,y_mm\n200,200\n600,200\n600,600\n")
+
+
+def _write_crazyflie_logs(folder: Path) -> None:
+    """Write a log of a micro SD card, of either version, and the CSV file of a log block."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+    import crazyflie
+
+    flight = crazyflie.Flight(seconds=2.0)
+    for version in (1, 2):
+        rng = np.random.default_rng(version)
+        log = crazyflie.write_flight(flight, rng, version=version, angles=True, estimator=True)
+        (folder / f"log0{version}").write_bytes(log.data())
+    head = "Timestamp,stateEstimate.x,stateEstimate.y,stateEstimate.z,acc.x,acc.y,acc.z"
+    angles = ",".join(f"lighthouse.rawAngle{k}{axis}lh2" for k in (0, 1) for axis in "xy")
+    values = np.random.default_rng(3).normal(0, 0.3, (200, 10))
+    rows = [f"{12_000 + 10 * k}," + ",".join(f"{v:.4f}" for v in row)
+            for k, row in enumerate(values)]  # fmt: skip
+    (folder / "block.csv").write_text("\n".join([f"{head},{angles}", *rows, ""]))
 
 
 def _write_images(folder: Path) -> None:
@@ -370,7 +389,8 @@ TARGETS = {
                 ("export", "{}", "--format", form, "-o", f"out{ending}", "--json")
                 for form, ending in (
                     *(("csv", ".csv"), ("tum", ""), ("kitti", ""), ("parquet", ".parquet")),
-                    *(("ros2", ".mcap"), ("crazyflie-config", ".yaml")),
+                    *(("ros2", ".mcap"), ("crazyflie-config", ".yaml"),
+                      ("dotbot-calibration", ".out")),
                 )
             ),
             ("report", "{}", "-o", "out.html"),
@@ -398,6 +418,22 @@ TARGETS = {
             ("import", "polaris-csv", "{}", "-o", "out.mcap", "--rate", "40", "--spacing", "20"),
             ("import", "landmark-csv", "{}", "-o", "out.mcap", "--circle", "25", "--json"),
             ("import", "dotbot-log", "{}", "-o", "out.mcap"),
+        ),
+    ),
+    "crazyflie-logs": Target(
+        ("log01", "log02"),
+        (mutations.damage_bytes,),
+        (
+            ("import", "crazyflie-usd", "{}", "-o", "out.mcap", "--json"),
+            ("import", "crazyflie-usd", "{}", "--config", "stations.yaml", "-o", "out.mcap"),
+        ),
+    ),
+    "crazyflie-tables": Target(
+        ("block.csv",),
+        (mutations.damage_text, mutations.damage_text, mutations.damage_bytes),
+        (
+            ("import", "crazyflie-csv", "{}", "-o", "out.mcap", "--json"),
+            ("import", "crazyflie-csv", "{}", "--config", "stations.yaml", "-o", "out.mcap"),
         ),
     ),
     "trajectories": Target(
@@ -528,7 +564,7 @@ def fits(command: Words, name: str) -> bool:
         return artifact[command[1].removesuffix(".mcap")] == stem
     if verb == "decode" and "--device" in command:
         return command[-1] in ("auto", stem.removesuffix("-raw"))
-    if "crazyflie-config" in command:
+    if "crazyflie-config" in command or "dotbot-calibration" in command:
         return stem in ("lighthouse-solved", "scene")
     if "lighthouse.mcap" in command or "lighthouse-solved.mcap" in command:
         return stem in ("lighthouse", "lighthouse-solved", "robot-1", "truth")

@@ -20,13 +20,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.geometry import Similarity, umeyama
+from locatk.core.geometry import Similarity, rotation_exp, umeyama
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.epochs import Epochs, rotor_angles
@@ -37,6 +37,7 @@ from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.estimation import require_two_stations, select_stations
 from locatk.core.lighthouse.scene.frame import MIN_MARKERS, marker_angles, scale_from_distances
 from locatk.core.lighthouse.scene.keyframes import require_distinct_positions
+from locatk.core.lighthouse.scene.reframing import rotation_between
 from locatk.core.solution import Solution, SolverWarning
 
 Array = NDArray[np.float64]
@@ -56,10 +57,14 @@ class PaperScene:
     stations : tuple of ((3,) ndarray, (3, 3) ndarray)
         Position and rotation (station to scene) of each station, in the axes of the first one.
         Empty for one station, whose pose the paper does not estimate.
+    to_floor : Similarity
+        Transform to the default frame of a planar scene of two stations: the plane is z = 0, the
+        first station is above the origin, and its view is along x. Else the identity.
     """
 
     locate: Callable[[Array], Array]
     stations: tuple[tuple[Array, Array], ...]
+    to_floor: Similarity = field(default_factory=Similarity.identity)
 
 
 def paper_image_points(
@@ -166,7 +171,16 @@ def two_planar(image: Array) -> PaperScene:
         return _intersect_plane(points[:, 0], normal, zeta) @ TO_STATION.T
 
     second = (TO_STATION @ position, TO_STATION @ rotation.T @ TO_STATION.T)
-    return PaperScene(locate, ((np.zeros(3), np.eye(3)), second))
+    to_floor = _to_floor(-TO_STATION @ normal, 1 / zeta)
+    return PaperScene(locate, ((np.zeros(3), np.eye(3)), second), to_floor)
+
+
+def _to_floor(up: Array, height: float) -> Similarity:
+    """Return the transform to a plane with normal ``up``, ``height`` below the first station."""
+    level = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    heading = float(np.arctan2(level[1, 0], level[0, 0]))
+    rotation = rotation_exp([0.0, 0.0, -heading]) @ level
+    return Similarity(1.0, rotation, np.array([0.0, 0.0, height]))
 
 
 def _intersect_plane(image: Array, normal: Array, zeta: float) -> Array:
@@ -285,6 +299,7 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
                 "the published method cannot decide whether a scene is planar: planar is assumed",
             )
         )
+    is_planar = kind != "two-3d"
     if kind == "one-planar":
         columns = [0]
     else:
@@ -301,7 +316,8 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
 
     if kind == "one-planar":
         solved = one_planar(marker_points[:, :2], visited[:, 0])
-        to_frame, scale = Similarity.identity(), "markers"
+        raised = np.array([0.0, 0.0, np.mean(marker_points[:, 2])])
+        to_frame, scale = Similarity(1.0, np.eye(3), raised), "markers"
     else:
         first, second = (np.insert(image[is_complete, k], 0, 1.0, axis=1) for k in (0, 1))
         require_distinct_positions(first, second, 4 if kind == "two-planar" else 8)
@@ -330,12 +346,12 @@ def solve_published(epochs: Epochs, prior: Scene, kind: str) -> Solution:
         ),
         prior.markers,
         prior.distances,
-        kind != "two-3d",
-        0.0,
+        is_planar,
+        float(np.mean(marker_points[:, 2])) if is_planar and scale == "markers" else 0.0,
         scale,
         prior.frame,
         tuple(warning.message for warning in warnings),
-        frame_source="markers" if scale == "markers" else "station",
+        frame_source="markers" if scale == "markers" else "floor" if is_planar else "station",
     )
     return Solution(
         "lighthouse",
@@ -369,7 +385,7 @@ def _scene_frame(
     """Return the similarity to the frame of the markers, or to the known scale, and its source."""
     if len(marker_points) >= MIN_MARKERS:
         return umeyama(solved.locate(visited), marker_points), "markers"
-    unit = Similarity.identity()
+    unit = solved.to_floor
     if not prior.distances:
         return unit, "unit"
     scale, _ = scale_from_distances(
@@ -378,4 +394,4 @@ def _scene_frame(
         epochs,
         angles,
     )
-    return Similarity(scale, unit.rotation, unit.translation), "distance"
+    return Similarity(scale, unit.rotation, scale * unit.translation), "distance"

@@ -35,6 +35,14 @@ MIN_AXIS_LENGTH_M = 0.1
 """Smallest distance of the point on the x axis from the origin [m]: with a placement by hand, the
 axis is then known to 4 degrees."""
 
+MAX_FLOOR_MISFIT_M = 0.05
+"""Rms distance of the points from the plane from which they contradict the scene [m], and it is
+refused: five times the tolerance of DIN 18202 over 4 m."""
+
+ASSUMED_BASELINE_M = 2.0
+"""Distance of the first two stations that is assumed if the scale is unknown [m]. Stations of a
+room are 2 to 6 m apart; the smallest distance gives the largest standard deviations."""
+
 MAX_ITERATIONS = 20
 
 
@@ -54,7 +62,11 @@ class FloorFrame:
     scale_sigma : float or None
         Of the scale, relative; None if a known length of the x axis did not determine it.
     heights_m : (n,) ndarray
-        Residual height of each point above the fitted plane, in the unit of the new frame.
+        Residual height of each point above the plane, in the unit of the new frame.
+    misfit_m : float or None
+        Rms height of the points, with the degrees of freedom that the fit leaves; in metres, if
+        ``metres_per_unit`` is right. None if every plane fits: three or fewer points, or one if the
+        normal was given.
     """
 
     to_floor: Similarity
@@ -63,13 +75,7 @@ class FloorFrame:
     origin_sigma_m: float
     scale_sigma: float | None
     heights_m: Array
-
-    @property
-    def misfit_m(self) -> float | None:
-        """Rms height of the points, None for three or fewer, which every plane fits."""
-        if len(self.heights_m) <= 3:
-            return None
-        return float(np.sqrt(np.sum(self.heights_m**2) / (len(self.heights_m) - 3)))
+    misfit_m: float | None
 
 
 def fit_floor_frame(
@@ -104,8 +110,8 @@ def fit_floor_frame(
     Raises
     ------
     DegenerateError
-        The points are on one line and there is no vertical, they are on no plane, or the first two
-        coincide.
+        The points are on one line and there is no vertical, they are more than
+        :data:`MAX_FLOOR_MISFIT_M` from one plane, or the first two coincide.
     """
     points = np.asarray(points, float)
     axis = points[1] - points[0]
@@ -130,15 +136,21 @@ def fit_floor_frame(
         scale, rotation, -scale * rotation @ origin + np.array([0.0, 0.0, height_m])
     )
     heights = to_floor.apply(points)[:, 2] - height_m
-    # A floor that is less flat than assumed levels the frame less well.
-    if len(points) > 3 and level_rad is not None:
-        misfit_m = unit_m / scale * float(np.sqrt(np.sum(heights**2) / (len(points) - 3)))
+    # A plane has three parameters, or only its height if the normal is given.
+    freedom = len(points) - (3 if level_rad is not None else 1)
+    misfit_m = None
+    if freedom > 0:
+        misfit_m = unit_m / scale * float(np.sqrt(np.sum(heights**2) / freedom))
+    if misfit_m is not None and level_rad is not None:
+        # A floor that is less flat than assumed levels the frame less well.
         level_rad *= max(1.0, misfit_m / FLOOR_SIGMA_M)
-        if level_rad > MAX_LEVEL_SIGMA_RAD:
-            raise DegenerateError(
-                f"the points are {1e3 * misfit_m:.0f} mm (rms) from one plane, which is no floor",
-                hint="leave out standstills that were not on the floor (--ignore)",
-            )
+    if (misfit_m or 0.0) > MAX_FLOOR_MISFIT_M or (level_rad or 0.0) > MAX_LEVEL_SIGMA_RAD:
+        raise DegenerateError(
+            f"the points are {1e3 * (misfit_m or 0.0):.0f} mm (rms) from one plane, which is no "
+            "floor",
+            hint="leave out standstills that were not on the floor (--ignore), or the scene is "
+            "wrong: use --method bundle",
+        )
     placed_m = PLACEMENT_SIGMA_M * np.sqrt(2.0)
     return FloorFrame(
         to_floor,
@@ -147,6 +159,7 @@ def fit_floor_frame(
         PLACEMENT_SIGMA_M,
         None if x_distance_m is None else placed_m / x_distance_m,
         heights,
+        misfit_m,
     )
 
 

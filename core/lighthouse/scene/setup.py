@@ -15,7 +15,7 @@ import numpy as np
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
 from locatk.core.lighthouse.results import FrameFacts, LighthouseFacts, StandstillFacts
-from locatk.core.lighthouse.scene.floor_frame import fit_floor_frame
+from locatk.core.lighthouse.scene.floor_frame import ASSUMED_BASELINE_M, fit_floor_frame
 from locatk.core.lighthouse.scene.frame import MAX_MARKER_MISFIT_M
 from locatk.core.lighthouse.scene.gravity import UpMeasurement, estimate_up, station_ups, with_ups
 from locatk.core.lighthouse.scene.model import Distance, Marker, MarkerVisit, Scene
@@ -207,7 +207,7 @@ def place_on_floor(
     Raises
     ------
     DegenerateError
-        A point was not located, or the points do not determine the frame.
+        A point was not located, or the points do not determine the frame, or contradict the scene.
     InputError
         The setup has a height, and the scale is unknown.
     """
@@ -237,6 +237,7 @@ def place_on_floor(
         estimate_up([*station_ups(scene), *devices]),
         x_distance_m=setup.x_distance_m,
         height_m=setup.height_m,
+        metres_per_unit=1.0 if is_metric else ASSUMED_BASELINE_M,
         normal=np.array([0.0, 0.0, 1.0]) if scene.planar else None,
     )
     warnings = list(solution.warnings)
@@ -271,7 +272,7 @@ def place_on_floor(
         origin_sigma_m=frame.origin_sigma_m,
         heading_sigma_rad=frame.heading_sigma_rad,
         scale_sigma=frame.scale_sigma,
-        misfit_m=frame.misfit_m,
+        misfit_m=frame.misfit_m if is_metric else None,
     )
     return replace(
         transform_solution(solution, frame.to_floor, moved),

@@ -15,6 +15,7 @@ from locatk.core.geometry import Similarity, quaternion_inverse, quaternion_rota
 from locatk.core.inertial import STANDARD_GRAVITY_M_S2, InertialSamples
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport
+from locatk.core.lighthouse.scene.floor_frame import ASSUMED_BASELINE_M, PLACEMENT_SIGMA_M
 from locatk.core.lighthouse.simulation.session import (
     FLOOR_MARKERS_M,
     SimulatedSession,
@@ -90,6 +91,45 @@ def test_a_floor_with_a_known_axis(
     assert locatk("calibrate", "scene", session, "-o", swapped, *args).exit_code == 0
     first, other = scene.stations[0].position, read_scene(swapped).stations[0].position
     assert other[:2] == pytest.approx([first[1], 1 - first[0]], abs=0.02)
+
+
+def test_the_published_method_has_its_floor_at_zero(
+    locatk: Callable[..., Any], session: Path, tmp_path: Path
+) -> None:
+    """Its planar scene was in the axes of the first station, 545 mm (rms) off the floor."""
+    out = tmp_path / "scene.toml"
+    args = ("--floor", "--x-distance", 1000, "--method", "paper", "--json")
+    result = locatk("calibrate", "scene", session, "-o", out, *args)
+    assert result.exit_code == 0, result.stderr
+    frame = json.loads(result.stdout)["sessions"][0]["frame"]
+    positions = np.array([rest["position_m"] for rest in frame["standstills"]])
+    assert positions[:, 2] == pytest.approx(0.0, abs=1e-6)
+    # The stations are not ideal, which the published method assumes.
+    corners = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
+    assert positions[:4, :2] == pytest.approx(np.array(corners), abs=0.08)
+    assert positions[1] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    scene = read_scene(out)
+    assert scene.planar
+    assert scene.floor_z == pytest.approx(0.0, abs=1e-6)
+    assert all(1.5 < station.position[2] < 2.2 for station in scene.stations)
+
+
+def test_an_axis_without_scale_is_not_in_metres(
+    locatk: Callable[..., Any], session: Path, tmp_path: Path
+) -> None:
+    """The standard deviation of its direction took the distance of the stations for a metre."""
+    out = tmp_path / "scene.toml"
+    result = locatk("calibrate", "scene", session, "-o", out, "--floor", "--json")
+    assert result.exit_code == 0, result.stderr
+    frame = json.loads(result.stdout)["sessions"][0]["frame"]
+    length = np.linalg.norm(frame["standstills"][1]["position_m"])
+    assert frame["heading_sigma_rad"] == pytest.approx(
+        np.sqrt(2) * PLACEMENT_SIGMA_M / (ASSUMED_BASELINE_M * length)
+    )
+    # The axis has a metre, and the stations are farther apart than assumed.
+    true_sigma_rad = np.sqrt(2) * PLACEMENT_SIGMA_M
+    assert true_sigma_rad < frame["heading_sigma_rad"] < 2 * true_sigma_rad
+    assert "misfit_m" not in frame
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def test_a_scene_from_a_port(port: Path, tmp_path: Path, process: Callable[..., 
     wizard.until("Recorded: origin. Put it on the x axis, 1 m from the origin")
     wizard.until("Recorded: x axis")
     wizard.until("Move the device through the whole room")
-    time.sleep(10.0)
+    time.sleep(4.0)
     assert wizard.stop() == 0, wizard.stderr
     assert wizard.stderr.count("Recorded: floor") == 2
     assert "stations 1, 2; at rest for 1 s" in wizard.stderr

@@ -14,6 +14,7 @@ from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.scene import Marker, MarkerVisit, Scene
 from locatk.core.lighthouse.scene.floor_frame import (
     FLOOR_SIGMA_M,
+    MAX_FLOOR_MISFIT_M,
     PLACEMENT_SIGMA_M,
     fit_floor_frame,
 )
@@ -182,6 +183,23 @@ def test_points_that_are_no_floor_are_refused() -> None:
     assert frame.level_sigma_rad / flat.level_sigma_rad == pytest.approx(
         frame.misfit_m / FLOOR_SIGMA_M, rel=1e-3
     )
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_points_that_contradict_a_given_normal_are_refused(count: int) -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    flat = fit_floor_frame(FLOOR[:count], STATIONS, normal=up)
+    assert flat.misfit_m == pytest.approx(0.0, abs=1e-12)
+    # Half of the tolerance is accepted and reported, twice the tolerance is refused.
+    tilt = (FLOOR[:count, 0] - FLOOR[:count, 0].mean()) / np.std(FLOOR[:count, 0], ddof=1)
+    for factor in (0.5, 2.0):
+        points = FLOOR[:count] + factor * MAX_FLOOR_MISFIT_M * tilt[:, None] * up
+        if factor > 1:
+            with pytest.raises(DegenerateError, match=r"100 mm \(rms\) from one plane"):
+                fit_floor_frame(points, STATIONS, normal=up)
+        else:
+            misfit = fit_floor_frame(points, STATIONS, normal=up).misfit_m
+            assert misfit == pytest.approx(factor * MAX_FLOOR_MISFIT_M)
 
 
 # ---- end to end, from sweeps of ideal stations
