@@ -237,6 +237,7 @@ def _locate_and_verify(
     if paths is not None:
         scene, trajectories, sigma_rad = paths.scene, paths.trajectories, paths.sigma_rad
         rejected = add_counts(rejected, paths.rejected)
+        path_warnings = paths.warnings
     stations = {c: s for c in channels if (s := scene.station(c)) is not None}
     verification = None
     # A floor homography has no pose to verify.

@@ -113,9 +113,8 @@ def solve_devices(
         estimate = _estimate_scene(sweeps, receivers, scene)
     tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
     path_warnings: list[SolverWarning] = []
-    contradicting_imus: tuple[str, ...] = ()
     try:
-        refined, tracked, contradicting_imus = refine_tracks(
+        refined, tracked, path_warnings = refine_tracks(
             tracked,
             receivers,
             estimate.scene,
@@ -134,7 +133,6 @@ def solve_devices(
         *estimate.warnings,
         *path_warnings,
         *device_warnings(tracked),
-        *map(_imu_warning, contradicting_imus),
         *contradiction_warnings(detections, trajectories),
     ]
 
@@ -342,14 +340,6 @@ def paths_warning(error: DegenerateError) -> SolverWarning:
         "paths_not_estimated",
         f"{error}: each pose is estimated from the sweeps around it, and its covariance contains "
         "no errors of the stations",
-    )
-
-
-def _imu_warning(device: str) -> SolverWarning:
-    return SolverWarning(
-        "imu_contradicts_light",
-        f"{device}: its IMU measures another motion than the sweeps and was not used: its axes or "
-        "units differ from those of the device, or its time stamps are wrong",
     )
 
 

@@ -24,7 +24,7 @@ from locatk.core.lighthouse.motion.results import refined_scene
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.reframing import transform_trajectory
-from locatk.core.solution import add_counts
+from locatk.core.solution import SolverWarning, add_counts
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -42,7 +42,7 @@ def refine_tracks(
     is_estimated: bool,
     interval_ns: int | None = None,
     imu: Sequence[InertialSamples] = (),
-) -> tuple[Scene, tuple[TrackedDevice, ...], tuple[str, ...]]:
+) -> tuple[Scene, tuple[TrackedDevice, ...], list[SolverWarning]]:
     """Estimate trajectories in continuous time, and the stations with them.
 
     Parameters
@@ -61,8 +61,8 @@ def refine_tracks(
     -------
     scene : Scene
     tracked : tuple of TrackedDevice
-    contradicting : tuple of str
-        Devices whose IMU contradicts the light and was not used.
+    warnings : list of SolverWarning
+        IMUs that contradict the light, and stations that were moved.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def refine_tracks(
         [by_device.get(device.trajectory.device) for device in tracked],
         _visits(scene, [device.trajectory.device for device in tracked]) if is_estimated else (),
     )
-    sample = recording.estimate_sample()
+    sample = recording.require_sample(channels)
     estimate = sample.estimate
     to_frame, frame = Similarity.identity(), None
     if is_estimated:
@@ -126,7 +126,7 @@ def refine_tracks(
                 rejected=add_counts(rejected),
             )
         )
-    return scene, tuple(result), estimate.contradicting_imus
+    return scene, tuple(result), recording.warnings(sample, channels)
 
 
 def _visits(scene: Scene, names: Sequence[str]) -> list[Visit]:

@@ -31,7 +31,7 @@ from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.reframing import transform_trajectory
-from locatk.core.solution import add_counts
+from locatk.core.solution import SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -58,12 +58,14 @@ class PhotodiodePaths:
     rejected : dict of str to int
     sigma_rad : float
         Standard deviation of an angle.
+    warnings : list of SolverWarning
     """
 
     scene: Scene
     trajectories: tuple[Trajectory, ...]
     rejected: dict[str, int]
     sigma_rad: float
+    warnings: list[SolverWarning]
 
 
 def refine_photodiodes(
@@ -129,7 +131,7 @@ def refine_photodiodes(
         [None] * len(parts),
         floor_z=floor_z,
     )
-    sample = recording.estimate_sample()
+    sample = recording.require_sample(channels)
     estimate = sample.estimate
     to_frame, alignment, frame = Similarity.identity(), None, None
     if is_estimated:
@@ -156,6 +158,7 @@ def refine_photodiodes(
         tuple(trajectories),
         add_counts(rejected),
         estimate.sigma_rad,
+        recording.warnings(sample, channels),
     )
 
 

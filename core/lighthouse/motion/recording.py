@@ -19,9 +19,11 @@ from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps
 from locatk.core.lighthouse.motion.frames import PathFrame
 from locatk.core.lighthouse.motion.layout import interpolate_flips
+from locatk.core.lighthouse.motion.moves import find_moves, moved_stations
 from locatk.core.lighthouse.motion.parameters import CommonParameters
 from locatk.core.lighthouse.motion.results import make_trajectory
 from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths, follow_path
+from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -40,6 +42,12 @@ MAX_SAMPLE_DEVICES = 8
 SAMPLE_WINDOW_S = 5.0
 VISIT_WINDOW_S = 1.0
 """Length of the windows from which stations are estimated, and of those on markers."""
+
+USUAL_USED_FRACTION = 0.97
+"""Fraction of accepted sweeps above which no station was moved."""
+
+MIN_END_S, MAX_END_S = 3.0, 60.0
+"""Length of the beginning and the end of a recording in which the stations are compared."""
 
 PART_S, PART_OVERLAP_S = 20.0, 1.0
 """Length of the parts of a path, and the overlap with each neighbour."""
@@ -150,6 +158,46 @@ class PathRecording:
         estimate = replace(estimate, device=np.array(devices)[estimate.device])
         return PathSample(estimate, tuple(devices), is_whole)
 
+    def warnings(self, sample: PathSample, channels: Sequence[int]) -> list[SolverWarning]:
+        """Return the doubts about IMUs and stations. The channels are those of the stations."""
+        warnings = [_imu_warning(device) for device in sample.estimate.contradicting_imus]
+        if np.mean(sample.estimate.is_used) < USUAL_USED_FRACTION:
+            message = self.move_message(channels)
+            if message is not None:
+                warnings.append(SolverWarning("station_moved", message))
+        return warnings
+
+    def move_message(self, channels: Sequence[int]) -> str | None:
+        """Return which station was moved during the recording, if one was."""
+        ends = self._estimate_ends() if len(channels) > 1 else None
+        moves = [] if ends is None else find_moves(*ends)
+        moved = [channels[i] for i in moved_stations(moves, len(channels))]
+        if not moved:
+            return None
+        largest = max(moves, key=lambda move: move.distance_m)
+        return (
+            f"{'one of the stations' if len(moved) > 1 else 'the station'} on channel "
+            f"{' or '.join(map(str, moved))} was moved during the recording, by about "
+            f"{1e3 * largest.distance_m:.0f} mm and {np.degrees(largest.turn_rad):.1f} degrees: "
+            "poses may be wrong by as much"
+        )
+
+    def _estimate_ends(self) -> tuple[PathEstimate, PathEstimate] | None:
+        """Estimate the beginning and the end of the recording, if they are determined."""
+        start_ns = min(int(own.time_ns[0]) for own in self.sweeps if len(own))
+        end_ns = max(int(own.time_ns[-1]) for own in self.sweeps if len(own)) + 1
+        length_ns = min((end_ns - start_ns) // 3, round(MAX_END_S * 1e9))
+        if length_ns < MIN_END_S * 1e9:
+            return None
+        estimates = []
+        for low_ns, high_ns in ((start_ns, start_ns + length_ns), (end_ns - length_ns, end_ns)):
+            cut = [own.take(_within(own.time_ns, low_ns, high_ns)) for own in self.sweeps]
+            try:
+                estimates.append(replace(self, sweeps=cut).estimate_sample().estimate)
+            except DegenerateError:
+                return None
+        return estimates[0], estimates[1]
+
     def marker_knots(self, estimate: PathEstimate) -> IntArray:
         """Return the number of the marker on which the device is at each knot, or -1."""
         number = np.full(len(estimate.path), -1)
@@ -158,6 +206,20 @@ class PathRecording:
             is_visit &= _within(estimate.time_ns, visit.start_ns, visit.end_ns + 1)
             number[is_visit] = visit.marker
         return number
+
+    def require_sample(self, channels: Sequence[int]) -> PathSample:
+        """Return :meth:`estimate_sample`.
+
+        Raises
+        ------
+        DegenerateError
+            It states if a station was moved.
+        """
+        try:
+            return self.estimate_sample()
+        except DegenerateError as error:
+            message = self.move_message(channels)
+            raise error if message is None else DegenerateError(message) from None
 
     def _max_knots(self, devices: Sequence[int]) -> int:
         """Return the largest number of knots of devices that are estimated at once."""
@@ -330,6 +392,14 @@ class _Part:
     sweep: IntArray
     rows: IntArray
     rough_poses: int = 0
+
+
+def _imu_warning(device: str) -> SolverWarning:
+    return SolverWarning(
+        "imu_contradicts_light",
+        f"{device}: its IMU measures another motion than the sweeps and was not used: its axes or "
+        "units differ from those of the device, or its time stamps are wrong",
+    )
 
 
 def _within(time_ns: IntArray, start_ns: int, end_ns: int) -> Mask:

@@ -1,13 +1,20 @@
-"""Long recordings: paths that are estimated part by part."""
+"""Long recordings, and stations that are moved during a recording."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from locatk.core.geometry import umeyama
 from locatk.core.lighthouse import solve
+from locatk.core.lighthouse.motion import moves as moves_module
 from locatk.core.lighthouse.motion import recording
+from locatk.core.lighthouse.motion.moves import find_moves, moved_stations
+from locatk.core.lighthouse.motion.parameters import STATION_PARAMETERS
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.lighthouse.flights import Flight, make_flight
 
@@ -33,6 +40,7 @@ def errors(flight: Flight, trajectory: Trajectory, *, with_scale: bool = False) 
     return np.asarray(np.linalg.norm(aligned - truth, axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("geometry", "diodes"), [("given", 4), ("unknown", 4), ("given", 1)])
 def test_parts_are_as_accurate_as_the_whole(
     monkeypatch: pytest.MonkeyPatch, geometry: str, diodes: int
@@ -69,3 +77,65 @@ def test_a_part_without_agreement_has_no_poses(monkeypatch: pytest.MonkeyPatch) 
     gap_s = 1e-9 * np.diff(trajectory.time_ns).max()
     assert 2.9 < gap_s < 3.1
     assert errors(flight, trajectory).max() < 0.01
+
+
+# ---- moved stations
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("geometry", "seed"), [("given", 1), ("unknown", 3)])
+def test_a_moved_station_is_named(geometry: str, seed: int) -> None:
+    flight = make_flight(
+        seed, duration_s=22.0, motion="slow", geometry=geometry, is_station_moved=True
+    )
+    solution = solve(flight.sweeps, flight.scene, receivers=flight.receivers)
+    (warning,) = [w for w in solution.warnings if w.code == "station_moved"]
+    assert "was moved during the recording" in warning.message
+
+
+def estimate_of(positions: np.ndarray, rotations: np.ndarray) -> recording.PathEstimate:
+    """Return an estimate of stations, known to 1 mm and 1 mrad."""
+    count = len(positions) * STATION_PARAMETERS
+    sigma = np.tile(np.r_[np.full(6, 1e-3), np.zeros(STATION_PARAMETERS - 6)], len(positions))
+    common = SimpleNamespace(positions=positions, stations=(positions, rotations, ()))
+    return cast(
+        recording.PathEstimate,
+        SimpleNamespace(
+            common=common,
+            common_covariance=np.diag(sigma**2) if count else np.zeros((0, 0)),
+            is_left_out=np.zeros(len(positions), bool),
+        ),
+    )
+
+
+def test_motions_of_the_whole_scene_are_no_moves() -> None:
+    rng = np.random.default_rng(5)
+    positions = rng.normal(size=(3, 3))
+    rotations = Rotation.random(3, rng).as_matrix()
+    turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    first = estimate_of(positions, rotations)
+    assert find_moves(first, estimate_of(positions @ turn.T + shift, turn @ rotations)) == []
+    moved = positions.copy()
+    moved[1] += [0.0, 0.03, 0.0]
+    moves = find_moves(first, estimate_of(moved @ turn.T + shift, turn @ rotations))
+    assert [move.stations for move in moves] == [(0, 1), (1, 2)]
+    assert moved_stations(moves, 3) == (1,)
+    assert moves[0].distance_m == pytest.approx(0.03)
+    # Within the covariance, there is none.
+    moved[1] = positions[1] + [0.0, 0.006, 0.0]
+    assert find_moves(first, estimate_of(moved, rotations)) == []
+
+
+def test_the_covariance_of_a_relative_pose_is_that_of_samples() -> None:
+    rng = np.random.default_rng(6)
+    positions, rotations = rng.normal(size=(2, 3)), Rotation.random(2, rng).as_matrix()
+    _, relative, covariance = moves_module._relative_pose(estimate_of(positions, rotations), 0, 1)
+    samples = []
+    for change in rng.normal(0.0, 1e-3, (4000, 2, 6)):
+        place = positions + change[:, :3]
+        turned = Rotation.from_rotvec(change[:, 3:]).as_matrix() @ rotations
+        step = turned[0].T @ (place[1] - place[0])
+        turn = Rotation.from_matrix(turned[0].T @ turned[1] @ relative.T).as_rotvec()
+        samples.append(np.r_[step, turn])
+    expected = np.cov(np.array(samples).T)
+    np.testing.assert_allclose(covariance, expected, atol=0.1 * np.abs(expected).max())
