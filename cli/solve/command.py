@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 
+MIN_RATE_HZ, MAX_RATE_HZ = 0.1, 10_000.0
+"""Smallest and largest number of poses per second."""
+
 BAR_CHARACTERS = 30
 """Length of the progress bar of a batch."""
 
@@ -79,6 +82,32 @@ odometry_lag_option = click.option(
 )
 
 
+class PoseRate(click.ParamType):
+    """Poses per second, or the word ``sweeps`` for a pose at the time of each sweep."""
+
+    name = "rate"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text of a valid rate."""
+        try:
+            is_valid = value == "sweeps" or MIN_RATE_HZ <= float(value) <= MAX_RATE_HZ
+        except ValueError:
+            is_valid = False
+        if not is_valid:
+            limits = f"{MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz"
+            self.fail(f"{value!r} is neither a rate of {limits} nor the word sweeps", param, ctx)
+        return str(value)
+
+
+rate_option = click.option(
+    "--rate",
+    type=PoseRate(),
+    metavar="HZ|sweeps",
+    help="Lighthouse: poses per second of devices that move, or one at the time of each sweep.  "
+    "[default: one per rotation of a station]",
+)
+
+
 def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
     """Convert a number of processes; 0 stands for one per core."""
     if value != "auto" and not value.isdecimal():
@@ -111,6 +140,7 @@ def _jobs(ctx: click.Context, param: click.Parameter, value: str) -> int:
         "tags of several designs.",
     ),
     scene_option,
+    rate_option,
     speed_option,
     templates_option,
     odometry_noise_option,
@@ -154,6 +184,7 @@ def command(
     output: str | None,
     method: str | None,
     scene: str | None,
+    rate: str | None,
     artifact: Path | None,
     camera: Path | None,
     tag: tuple[Path, ...],
@@ -184,6 +215,7 @@ def command(
       locatk solve run.mcap -o solved.mcap
       locatk solve run.mcap -o solved.mcap --method paper --json
       locatk solve first.mcap -o solved.mcap --save-scene scene.toml
+      locatk solve flight.mcap -o solved.mcap --rate 100
       locatk solve day/*.mcap -o solved/ --artifact scene.toml
       locatk solve day/ -o solved/ --jobs auto --resume --json
       locatk solve "s3://lab/*.mcap" -o s3://lab/out --scheduler tcp://host:8786
@@ -220,6 +252,7 @@ def command(
         tag=tag or None,
         odometry_noise=odometry_noise,
         odometry_lag=odometry_lag,
+        rate=None if rate is None else float("inf" if rate == "sweeps" else rate),
     )
     try:
         outputs = pipeline.plan_outputs(names, output, is_folder=found.has_folder)

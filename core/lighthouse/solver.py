@@ -48,6 +48,13 @@ from locatk.core.trajectory import Trajectory
 METHODS = ("bundle", "paper")
 
 
+_RATE_WARNING = SolverWarning(
+    "rate_not_used",
+    "the photodiodes have a pose for each report, and none between them: they report too few "
+    "sweeps a second for a path",
+)
+
+
 @dataclass(frozen=True)
 class SolveOptions:
     """Options of the solver.
@@ -61,11 +68,15 @@ class SolveOptions:
         from the stations and the data.
     seed : int
         Seed of the random samples.
+    rate_hz : float, optional
+        Poses per second of devices that move, infinite for a pose at each sweep; by default, one
+        per rotation of the fastest station. Between sweeps, poses are interpolated.
     """
 
     method: str = "bundle"
     scene: str = "auto"
     seed: int = 0
+    rate_hz: float | None = None
 
     def __post_init__(self) -> None:
         for name, value, choices in (
@@ -76,6 +87,13 @@ class SolveOptions:
                 raise InputError(
                     f"unknown {name} {value!r}", hint=f"choose one of {', '.join(choices)}"
                 )
+        if self.rate_hz is not None and not self.rate_hz > 0:
+            raise InputError(f"{self.rate_hz:g} poses per second is not positive")
+        if self.rate_hz is not None and self.method == "paper":
+            raise InputError(
+                "the published method has no paths between sweeps",
+                hint="leave --rate or --method paper out",
+            )
 
 
 def solve(
@@ -126,7 +144,7 @@ def solve(
     sweeps = sweeps.take(~is_doubled)
     rigid = select_rigid_receivers(sweeps, receivers) if receivers else {}
     if rigid and options.method == "bundle":
-        solution = solve_devices(sweeps, rigid, scene, imu=imu)
+        solution = solve_devices(sweeps, rigid, scene, imu=imu, rate_hz=options.rate_hz)
         single = [k for k, name in enumerate(sweeps.devices) if name not in rigid]
         rows = np.flatnonzero(np.isin(sweeps.device, single))
         if len(rows):
@@ -183,7 +201,7 @@ def _solve_photodiodes(
             epochs, scene, kind=options.scene, odometry=odometry, seed=options.seed
         )
     return _locate_and_verify(
-        estimate, sweeps, epochs.rejected, options.method, is_estimated=not scene.stations
+        estimate, sweeps, epochs.rejected, options, is_estimated=not scene.stations
     )
 
 
@@ -215,7 +233,7 @@ def _locate_and_verify(
     estimate: SceneEstimate,
     sweeps: Sweeps,
     rejected_sweeps: Mapping[str, int],
-    method: str,
+    options: SolveOptions,
     *,
     is_estimated: bool,
 ) -> Solution:
@@ -230,10 +248,18 @@ def _locate_and_verify(
     paths, path_warnings = None, []
     try:
         paths = refine_photodiodes(
-            sweeps, channels, trajectories, scene, markers, is_estimated=is_estimated
+            sweeps,
+            channels,
+            trajectories,
+            scene,
+            markers,
+            is_estimated=is_estimated,
+            rate_hz=options.rate_hz,
         )
     except DegenerateError as error:
         path_warnings.append(paths_warning(error))
+    if paths is None and options.rate_hz is not None:
+        path_warnings.append(_RATE_WARNING)
     if paths is not None:
         scene, trajectories, sigma_rad = paths.scene, paths.trajectories, paths.sigma_rad
         rejected = add_counts(rejected, paths.rejected)
@@ -255,7 +281,7 @@ def _locate_and_verify(
         )
     return Solution(
         "lighthouse",
-        method,
+        options.method,
         trajectories,
         add_counts(rejected_sweeps, estimate.rejected, rejected),
         detect_stations(

@@ -70,6 +70,8 @@ class SolveRequest:
         Landmarks: random walk of the heading by odometry [deg/sqrt(m)].
     odometry_lag : float, optional
         Landmarks: time by which odometry is later than the hall sensors [ms].
+    rate : float, optional
+        Lighthouse: poses per second on paths, infinite for a pose at each sweep.
     setup : SceneSetup, optional
         Lighthouse: points at which a device rested, found by its standstills.
     """
@@ -83,6 +85,7 @@ class SolveRequest:
     tag: tuple[Path, ...] | None = None
     odometry_noise: float | None = None
     odometry_lag: float | None = None
+    rate: float | None = None
     setup: SceneSetup | None = None
 
 
@@ -169,7 +172,9 @@ def _prepare_lighthouse(session: Session, request: SolveRequest) -> Callable[[],
     imus = observations.read_imu(session)
     receivers = _rigid_devices(sweeps, observations.read_receivers(session))
     more: dict[str, Any] = {"receivers": receivers, "imu": imus} if receivers else {}
-    options = _solver_options(lighthouse.SolveOptions, method=request.method, scene=request.scene)
+    options = _solver_options(
+        lighthouse.SolveOptions, method=request.method, scene=request.scene, rate_hz=request.rate
+    )
     conflicts += [
         SolverWarning("other_station_id", message)
         for message in station_reports.describe_unknown_stations(initial, reports)
@@ -312,7 +317,7 @@ SYSTEMS: dict[str, Solver] = {
         System(
             "lighthouse",
             ("bundle", "paper"),
-            ("scene", "setup"),
+            ("scene", "rate", "setup"),
             _prepare_lighthouse,
             estimates_scene=True,
         ),

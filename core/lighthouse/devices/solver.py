@@ -73,7 +73,7 @@ def solve_devices(
     receivers: Mapping[str, Receiver],
     scene: Scene | None = None,
     *,
-    interval_s: float | None = None,
+    rate_hz: float | None = None,
     imu: Sequence[InertialSamples] = (),
 ) -> Solution:
     """Solve the rigid devices of a recording.
@@ -89,8 +89,9 @@ def solve_devices(
         devices, whose size gives the scale, with the scene's calibrations where it has them. The
         markers on which a device rested then give frame and scale; without them, the frame is that
         of the first station.
-    interval_s : float, optional
-        Time from pose to pose in seconds; by default, a rotation of the fastest station.
+    rate_hz : float, optional
+        Poses per second, infinite for a pose at each sweep; by default, one per rotation of the
+        fastest station.
     imu : sequence of InertialSamples
         Of any of the devices. An IMU that contradicts the light is left out with a warning.
 
@@ -111,7 +112,7 @@ def solve_devices(
     estimate = DeviceSceneEstimate(scene, LighthouseFacts(), ())
     if not scene.stations:
         estimate = _estimate_scene(sweeps, receivers, scene)
-    tracked = track_devices(sweeps, receivers, estimate.scene, interval_s=interval_s)
+    tracked = track_devices(sweeps, receivers, estimate.scene)
     path_warnings: list[SolverWarning] = []
     try:
         refined, tracked, path_warnings = refine_tracks(
@@ -119,7 +120,7 @@ def solve_devices(
             receivers,
             estimate.scene,
             is_estimated=not scene.stations,
-            interval_ns=None if interval_s is None else max(1, round(interval_s * 1e9)),
+            rate_hz=rate_hz,
             imu=imu,
         )
         estimate = replace(estimate, scene=refined)

@@ -232,8 +232,6 @@ def track_devices(
     sweeps: Sweeps,
     receivers: Mapping[str, Receiver],
     scene: Scene,
-    *,
-    interval_s: float | None = None,
 ) -> tuple[TrackedDevice, ...]:
     """Estimate the trajectories of rigid devices in a known scene.
 
@@ -245,8 +243,6 @@ def track_devices(
         By device.
     scene : Scene
         With stations.
-    interval_s : float, optional
-        Time from pose to pose in seconds; by default, a rotation of the fastest station.
 
     Returns
     -------
@@ -270,15 +266,12 @@ def track_devices(
         )
     channels = tuple(s.channel for s in selected)
     stations = stack_stations(selected)
-    interval_ns = None if interval_s is None else max(1, round(interval_s * 1e9))
     tracked = []
     for number, name in enumerate(sweeps.devices):
         if name not in receivers:
             continue
         device_sweeps, rejected = select_device_sweeps(sweeps, number, receivers[name], channels)
-        device = track_device(
-            name, scene.frame, device_sweeps, receivers[name], stations, channels, interval_ns
-        )
+        device = track_device(name, scene.frame, device_sweeps, receivers[name], stations, channels)
         tracked.append(replace(device, rejected=add_counts(rejected, device.rejected)))
     return tuple(tracked)
 
@@ -290,7 +283,6 @@ def track_device(
     receiver: Receiver,
     stations: StationArrays,
     channels: tuple[int, ...],
-    interval_ns: int | None = None,
 ) -> TrackedDevice:
     """Estimate the trajectory of one device in a known scene.
 
@@ -303,8 +295,6 @@ def track_device(
     stations : StationArrays
     channels : tuple of int
         Of the stations.
-    interval_ns : int, optional
-        Time from pose to pose; by default, a rotation of the fastest station.
 
     Notes
     -----
@@ -312,7 +302,7 @@ def track_device(
     therefore share half of their sweeps and are not independent.
     """
     fastest_ns, slowest_ns = rotation_limits_ns(channels)
-    windows = make_windows(sweeps, interval_ns or fastest_ns, slowest_ns)
+    windows = make_windows(sweeps, fastest_ns, slowest_ns)
     problem = TrackingProblem(sweeps, receiver, stations, windows, slowest_ns)
     is_solvable = has_enough_sweeps(sweeps, windows.sweep)
     states = EpochStates.initial(is_solvable)
@@ -622,9 +612,9 @@ def _refine(
     covariance = pose_covariance(problem, solved, fit, noise, sigma, lasting_sigma)
 
     has_too_few = ~has_enough_sweeps(problem.sweeps, inliers)
-    is_undetermined = np.any(
-        np.sqrt(np.einsum("mii->mi", covariance)) > MAX_POSE_SIGMA_M_RAD, axis=1
-    )
+    variance = np.einsum("mii->mi", covariance)
+    is_known = (variance >= 0) & (variance <= MAX_POSE_SIGMA_M_RAD**2)
+    is_undetermined = ~np.all(is_known, axis=1)
     rejected = {
         "moment_with_too_few_sweeps": int(np.count_nonzero(has_too_few)),
         "pose_not_determined": int(np.count_nonzero(is_undetermined & ~has_too_few)),

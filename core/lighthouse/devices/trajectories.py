@@ -40,7 +40,7 @@ def refine_tracks(
     scene: Scene,
     *,
     is_estimated: bool,
-    interval_ns: int | None = None,
+    rate_hz: float | None = None,
     imu: Sequence[InertialSamples] = (),
 ) -> tuple[Scene, tuple[TrackedDevice, ...], list[SolverWarning]]:
     """Estimate trajectories in continuous time, and the stations with them.
@@ -53,8 +53,9 @@ def refine_tracks(
     scene : Scene
     is_estimated : bool
         True if the scene was estimated from the same sweeps. Otherwise it is returned unchanged.
-    interval_ns : int, optional
-        Time from pose to pose; by default, a rotation of the fastest station.
+    rate_hz : float, optional
+        Poses per second, infinite for a pose at each sweep; by default, one per rotation of the
+        fastest station.
     imu : sequence of InertialSamples
 
     Returns
@@ -90,7 +91,7 @@ def refine_tracks(
         [device.trajectory for device in tracked],
         common,
         fastest_ns // 2,
-        interval_ns or fastest_ns,
+        rate_hz,
         [by_device.get(device.trajectory.device) for device in tracked],
         _visits(scene, [device.trajectory.device for device in tracked]) if is_estimated else (),
     )

@@ -76,6 +76,7 @@ def refine_photodiodes(
     markers: tuple[Array, Array],
     *,
     is_estimated: bool,
+    rate_hz: float | None = None,
 ) -> PhotodiodePaths | None:
     """Estimate the paths of moving photodiodes, and the stations with them.
 
@@ -93,6 +94,9 @@ def refine_photodiodes(
         that of markers.
     is_estimated : bool
         True if the scene was estimated from the same sweeps. Otherwise it is returned unchanged.
+    rate_hz : float, optional
+        Poses per second, infinite for a pose at each sweep; by default, one per rotation of the
+        fastest station.
 
     Returns
     -------
@@ -127,7 +131,7 @@ def refine_photodiodes(
         rough,
         common,
         fastest_ns // 2,
-        fastest_ns,
+        rate_hz,
         [None] * len(parts),
         floor_z=floor_z,
     )

@@ -7,6 +7,7 @@ overlap, so that each pose follows from the motion before and after it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -21,7 +22,11 @@ from locatk.core.lighthouse.motion.frames import PathFrame
 from locatk.core.lighthouse.motion.layout import interpolate_flips
 from locatk.core.lighthouse.motion.moves import find_moves, moved_stations
 from locatk.core.lighthouse.motion.parameters import CommonParameters
-from locatk.core.lighthouse.motion.results import make_trajectory
+from locatk.core.lighthouse.motion.results import (
+    PathTrajectory,
+    interpolate_trajectory,
+    make_trajectory,
+)
 from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths, follow_path
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -104,8 +109,11 @@ class PathRecording:
         Rough poses by device.
     common : CommonParameters
         Before the sweeps are used.
-    knot_ns, interval_ns : int
-        Time from knot to knot, and from pose to pose.
+    knot_ns : int
+        Time from knot to knot.
+    rate_hz : float, optional
+        Poses per second, infinite for a pose at each sweep. By default, there is one in each two
+        knots: a rotation of the fastest station.
     imu : sequence of InertialSamples or None
         By device.
     visits : sequence of Visit
@@ -118,7 +126,7 @@ class PathRecording:
     start: Sequence[Trajectory]
     common: CommonParameters
     knot_ns: int
-    interval_ns: int
+    rate_hz: float | None
     imu: Sequence[InertialSamples | None]
     visits: Sequence[Visit] = ()
     floor_z: float | None = None
@@ -256,10 +264,30 @@ class PathRecording:
             residual[part.rows] = part.estimate.residual[part.sweep]
             is_used[part.rows] = part.estimate.is_used[part.sweep]
             placed = part.estimate if frame is None else frame.apply(part.estimate)
-            made = make_trajectory(placed, part.knots, rough.device, rough.frame, self.interval_ns)
+            made = self._trajectory(device, placed, part)
             trajectories.append(made.trajectory)
             undetermined += made.undetermined
         return DevicePath(_join(trajectories), undetermined, residual, is_used)
+
+    def _trajectory(self, device: int, estimate: PathEstimate, part: _Part) -> PathTrajectory:
+        """Return the poses of a device in a part, in the frame of an estimate."""
+        name, frame = self.start[device].device, self.start[device].frame
+        if self.rate_hz is None or not len(part.knots):
+            return make_trajectory(estimate, part.knots, name, frame, 2 * self.knot_ns)
+        if math.isinf(self.rate_hz):
+            time_ns = np.unique(self.sweeps[device].time_ns[part.rows])
+        else:
+            # Multiples of the interval, also where it is no whole number of nanoseconds.
+            first, last = estimate.time_ns[part.knots[[0, -1]]]
+            end_ns = int(last) + self.knot_ns
+            number = np.arange(
+                math.ceil(int(first) * 1e-9 * self.rate_hz) - 1,
+                math.floor(end_ns * 1e-9 * self.rate_hz) + 2,
+            )
+            time_ns = np.array([round(n * 1e9 / self.rate_hz) for n in number.tolist()], np.int64)
+            time_ns = time_ns[_within(time_ns, int(first), end_ns)]
+        knots = np.flatnonzero(estimate.device == device)
+        return interpolate_trajectory(estimate, knots, time_ns, name, frame)
 
     def _of_sample(self, device: int, sample: PathSample) -> _Part:
         """Return the path of a device from a sample that is the whole recording."""
@@ -277,7 +305,8 @@ class PathRecording:
         common, column, covariance, imu = self._held_parameters(device, sample)
         if len(common.photodiodes):
             rough = interpolate_flips(rough)
-        length_ns = -(-round(PART_S * 1e9) // self.interval_ns) * self.interval_ns
+        pose_ns = 2 * self.knot_ns
+        length_ns = -(-round(PART_S * 1e9) // pose_ns) * pose_ns
         overlap_ns, none = round(PART_OVERLAP_S * 1e9), np.zeros(0, np.int64)
         for number in np.unique(own.time_ns // length_ns).tolist():
             start_ns, end_ns = number * length_ns, (number + 1) * length_ns

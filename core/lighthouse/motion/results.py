@@ -30,6 +30,10 @@ MAX_SPARSE_SIGMA_M = 0.02
 motion before and after it."""
 
 
+MAX_SPAN_NS = 1_000_000_000
+"""Longest time between neighbouring knots."""
+
+
 @dataclass(frozen=True)
 class PathTrajectory:
     """Trajectory of a device, and the number of poses that were left out.
@@ -52,21 +56,73 @@ def make_trajectory(
     if len(knots):
         interval = estimate.time_ns[knots] // interval_ns
         knots = knots[np.r_[True, np.diff(interval) > 0]]
-    path, n = estimate.path, estimate.path.pose_size
+    path = estimate.path
+    rotation = None if path.rotation is None else path.rotation[knots]
+    return _determined_poses(
+        name,
+        frame,
+        estimate.time_ns[knots],
+        path.position[knots],
+        rotation,
+        pose_covariances(estimate, knots),
+        _used_nearby(estimate, 2)[knots],
+    )
+
+
+def interpolate_trajectory(
+    estimate: PathEstimate, knots: IntArray, time_ns: IntArray, name: str, frame: str
+) -> PathTrajectory:
+    """Return the poses of a device at ascending times (n,) that are between neighbouring knots.
+
+    ``knots`` (k,) are all those of the device. Covariances are interpolated linearly.
+    """
+    path, knot_ns = estimate.path, estimate.time_ns[knots]
+    row = np.searchsorted(knot_ns, time_ns, side="right") - 1
+    is_inside = (row >= 0) & (row < len(knots) - 1)
+    row, time_ns = row[is_inside], time_ns[is_inside]
+    span_ns = knot_ns[row + 1] - knot_ns[row]
+    # Gaps in which the motion is interpolated have knots; longer ones have none.
+    is_near = path.is_linked[knots[row]] & (span_ns == np.diff(knot_ns).min(initial=MAX_SPAN_NS))
+    row, time_ns, span_ns = row[is_near], time_ns[is_near], span_ns[is_near]
+    knot, since_ns = knots[row], time_ns - knot_ns[row]
+    weights = path.hermite_weights(knot, path.time_s[knot] + 1e-9 * since_ns)
+    position, rotation = path.poses(knot, weights)
     covariance = pose_covariances(estimate, knots)
+    fraction = (since_ns / span_ns)[:, None, None]
+    return _determined_poses(
+        name,
+        frame,
+        time_ns,
+        position,
+        rotation,
+        (1 - fraction) * covariance[row] + fraction * covariance[row + 1],
+        _used_nearby(estimate, 2)[knot],
+    )
+
+
+def _determined_poses(
+    name: str,
+    frame: str,
+    time_ns: IntArray,
+    position: Array,
+    rotation: Array | None,
+    covariance: Array,
+    used_sweeps: IntArray,
+) -> PathTrajectory:
+    """Return the poses whose covariance is small enough for the number of accepted sweeps."""
+    n = 3 if rotation is None else 6
     sigma = np.sqrt(np.einsum("kii->ki", covariance)[:, :n])
-    is_determined = np.all(sigma < MAX_POSE_SIGMA[:n], axis=1)
-    is_sparse = _used_nearby(estimate, 2)[knots] < MIN_USED_SWEEPS
-    is_determined &= ~is_sparse | np.all(sigma[:, :3] < MAX_SPARSE_SIGMA_M, axis=1)
-    kept, covariance = knots[is_determined], covariance[is_determined]
-    undetermined = int(np.count_nonzero(~is_determined))
-    time_ns, position = estimate.time_ns[kept], path.position[kept]
-    if path.rotation is None:
+    kept = np.all(sigma < MAX_POSE_SIGMA[:n], axis=1)
+    is_sparse = used_sweeps < MIN_USED_SWEEPS
+    kept &= ~is_sparse | np.all(sigma[:, :3] < MAX_SPARSE_SIGMA_M, axis=1)
+    undetermined = int(np.count_nonzero(~kept))
+    time_ns, position, covariance = time_ns[kept], position[kept], covariance[kept]
+    if rotation is None:
         own = covariance[:, :3, :3]
         return PathTrajectory(
             Trajectory.from_positions(name, frame, time_ns, position, own), undetermined
         )
-    quaternion = quaternion_from_matrix(path.rotation[kept])
+    quaternion = quaternion_from_matrix(rotation[kept])
     trajectory = Trajectory(name, frame, time_ns, position, quaternion, covariance)
     return PathTrajectory(trajectory, undetermined)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,24 @@ def test_options_reach_the_solver(locatk, requests, session: Path, tmp_path: Pat
         systems.SolveRequest(method="paper", scene="two-3d"),
         systems.SolveRequest(artifact=scene),
     ]
+
+
+@pytest.mark.parametrize(("text", "rate_hz"), [("100", 100.0), ("0.5", 0.5), ("sweeps", inf)])
+def test_a_rate_reaches_the_solver(
+    locatk, requests, session: Path, tmp_path: Path, text: str, rate_hz: float
+) -> None:
+    out = tmp_path / "solved.mcap"
+    assert locatk("solve", session, "-o", out, "--rate", text).exit_code == 0
+    assert [request.rate for request in requests] == [rate_hz]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "1e9", "often"])
+def test_a_wrong_rate_is_refused(locatk, requests, session: Path, text: str) -> None:
+    result = locatk("solve", session, "--rate", text)
+    assert result.exit_code == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "the word sweeps" in result.stderr
+    assert requests == []
 
 
 def test_nothing_is_overwritten_unasked(locatk, requests, session: Path, tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
-"""Long recordings, and stations that are moved during a recording."""
+"""Long recordings, stations that are moved during a recording, and the times of poses."""
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import cast
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from locatk.core.errors import InputError
 from locatk.core.geometry import umeyama
-from locatk.core.lighthouse import solve
+from locatk.core.lighthouse import SolveOptions, solve
 from locatk.core.lighthouse.motion import moves as moves_module
 from locatk.core.lighthouse.motion import recording
 from locatk.core.lighthouse.motion.moves import find_moves, moved_stations
@@ -139,3 +141,59 @@ def test_the_covariance_of_a_relative_pose_is_that_of_samples() -> None:
         samples.append(np.r_[step, turn])
     expected = np.cov(np.array(samples).T)
     np.testing.assert_allclose(covariance, expected, atol=0.1 * np.abs(expected).max())
+
+
+# ---- times of poses
+
+
+@pytest.fixture(scope="module")
+def short_flight() -> Flight:
+    return make_flight(12, duration_s=6.0, motion="agile", geometry="given")
+
+
+@pytest.mark.parametrize("rate_hz", [7.0, 400.0, math.inf])
+def test_poses_between_sweeps_are_as_good_as_their_covariance(
+    short_flight: Flight, rate_hz: float
+) -> None:
+    flight = short_flight
+    usual = solve_flight(flight)
+    options = SolveOptions(rate_hz=rate_hz)
+    solution = solve(flight.sweeps, flight.scene, options, receivers=flight.receivers)
+    (trajectory,) = solution.trajectories
+    if math.isinf(rate_hz):
+        assert np.isin(trajectory.time_ns, flight.sweeps.time_ns).all()
+        assert len(trajectory) > 0.95 * len(np.unique(flight.sweeps.time_ns))
+    else:
+        number = trajectory.time_ns * (rate_hz * 1e-9)
+        assert np.abs(number - np.rint(number)).max() < 1e-3
+        assert len(trajectory) == pytest.approx(6.0 * rate_hz, abs=0.03 * 6.0 * rate_hz + 1)
+    assert np.median(errors(flight, trajectory)) < 1.2 * np.median(errors(flight, usual)) + 2e-4
+    assert errors(flight, trajectory).max() < 1.5 * errors(flight, usual).max() + 1e-3
+    truth, turns = flight.true_poses(trajectory.time_ns)
+    to_truth = umeyama(trajectory.position, truth, with_scale=False).rotation
+    turned = Rotation.from_matrix(to_truth) * Rotation.from_quat(trajectory.quaternion)
+    off = (turned * turns.inv()).magnitude()
+    assert np.median(off) < np.radians(1.5)
+    sigma = np.interp(trajectory.time_ns, usual.time_ns, usual.sigma[:, 0])
+    assert 0.8 < np.median(trajectory.sigma[:, 0] / sigma) < 1.2
+
+
+def test_parts_have_each_pose_of_a_grid_once(
+    short_flight: Flight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = SolveOptions(rate_hz=130.0)
+    flight = short_flight
+    whole = solve(flight.sweeps, flight.scene, options, receivers=flight.receivers)
+    monkeypatch.setattr(recording, "MAX_SAMPLE_KNOTS", 300)
+    monkeypatch.setattr(recording, "PART_S", 1.3)
+    parts = solve(flight.sweeps, flight.scene, options, receivers=flight.receivers)
+    times = parts.trajectories[0].time_ns
+    assert len(times) > 700 and np.all(np.diff(times) > 0)
+    assert np.array_equal(times, whole.trajectories[0].time_ns)
+
+
+def test_a_rate_is_positive_and_not_of_the_published_method() -> None:
+    with pytest.raises(InputError, match="not positive"):
+        SolveOptions(rate_hz=0.0)
+    with pytest.raises(InputError, match="published method"):
+        SolveOptions(method="paper", rate_hz=10.0)
