@@ -192,8 +192,10 @@ class PathRecording:
 
     def _estimate_ends(self) -> tuple[PathEstimate, PathEstimate] | None:
         """Estimate the beginning and the end of the recording, if they are determined."""
-        start_ns = min(int(own.time_ns[0]) for own in self.sweeps if len(own))
-        end_ns = max(int(own.time_ns[-1]) for own in self.sweeps if len(own)) + 1
+        times_ns = np.concatenate(
+            [own.time_ns[[0, -1]] for own in self.sweeps if len(own)] or [[0]]
+        )
+        start_ns, end_ns = int(times_ns.min()), int(times_ns.max()) + 1
         length_ns = min((end_ns - start_ns) // 3, round(MAX_END_S * 1e9))
         if length_ns < MIN_END_S * 1e9:
             return None
