@@ -192,10 +192,11 @@ class PathRecording:
 
     def _estimate_ends(self) -> tuple[PathEstimate, PathEstimate] | None:
         """Estimate the beginning and the end of the recording, if they are determined."""
-        times_ns = np.concatenate(
-            [own.time_ns[[0, -1]] for own in self.sweeps if len(own)] or [[0]]
-        )
-        start_ns, end_ns = int(times_ns.min()), int(times_ns.max()) + 1
+        received = [own for own in self.sweeps if len(own)]
+        if not received:
+            return None
+        start_ns = min(int(own.time_ns[0]) for own in received)
+        end_ns = max(int(own.time_ns[-1]) for own in received) + 1
         length_ns = min((end_ns - start_ns) // 3, round(MAX_END_S * 1e9))
         if length_ns < MIN_END_S * 1e9:
             return None
