@@ -112,6 +112,18 @@ class Path:
         vector = w[:, 1] * self.spin[knot] + w[:, 2] * turn[knot] + w[:, 3] * end_rate[knot]
         return position, self.rotation[knot] @ rotation_exp(vector)
 
+    def window_sums(self, values: Array, window: int) -> Array:
+        """Return sums of values (m, k - 1) of steps over windows of steps around each.
+
+        Windows end where knots are not linked.
+        """
+        index = np.arange(len(self) - 1)
+        segment = np.cumsum(np.r_[0, ~self.is_linked[:-1]])
+        low = np.maximum(index - window // 2, np.searchsorted(segment, segment))
+        high = np.minimum(index + (window + 1) // 2, np.searchsorted(segment, segment, "right"))
+        total = np.concatenate([np.zeros((len(values), 1)), np.cumsum(values, axis=1)], axis=1)
+        return np.asarray(np.maximum(total[:, high] - total[:, low], 0.0))
+
     def prior_errors(self) -> Array:
         """Return how far each state (k - 1, 2, n) is from the one that follows from the last."""
         span_s = np.diff(self.time_s)[:, None]

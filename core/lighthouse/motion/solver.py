@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from locatk.core.errors import DegenerateError
 from locatk.core.inertial import InertialSamples
@@ -544,13 +543,11 @@ class PathProblem:
                 spread += 2 * np.einsum("kij,kij->k", unit[:, :2, 2:], between)
             known = np.maximum(6.0 - spread / self.power[:, part], 1e-3) * self.path.is_linked
             energy *= self.path.is_linked
-            smooth = uniform_filter1d(np.stack([energy, known]), window, axis=1, mode="nearest")
-            # Windows between two paths have no degrees of freedom.
-            known_windows = smooth[:, smooth[1] > 0.0]
-            ratio = known_windows[0] / known_windows[1]
+            energy, known = self.path.window_sums(np.stack([energy, known]), window)
+            ratio = energy[known > 0.0] / known[known > 0.0]
             usual = max(float(np.quantile(ratio, USUAL_POWER_QUANTILE)), self.min_power[part])
             # One degree of freedom of usual motion keeps windows without sweeps in range.
-            local = (smooth[0] + usual / window) / (smooth[1] + 1.0 / window)
+            local = (energy + usual) / (known + 1.0)
             largest = min(MAX_LOCAL_POWER * usual, self.max_power[part])
             self.power[:, part] = np.clip(local, self.min_power[part], largest)
 

@@ -729,3 +729,15 @@ def test_a_station_that_contradicts_the_others_is_left_out() -> None:
     estimation = PathProblem(lost, problem.common, problem.path)
     estimation.leave_out_stations()
     assert not estimation.is_left_out.any()
+
+
+def test_windows_do_not_cross_from_one_path_to_another() -> None:
+    linked = np.array([True, True, False, True, True, True])
+    zeros = np.zeros((7, 3))
+    path = Path(np.arange(7) * 0.01, linked, zeros, zeros)
+    values = np.array([[1.0, 2.0, 0.0, 8.0, 16.0, 32.0], np.ones(6)])
+    sums = path.window_sums(values, 3)
+    # The step between the paths ends the first one.
+    np.testing.assert_allclose(sums[0], [3, 3, 2, 24, 56, 48])
+    np.testing.assert_allclose(sums[1], [2, 3, 2, 2, 3, 2])
+    np.testing.assert_allclose(path.window_sums(values, 100)[0], [3, 3, 3, 56, 56, 56])
