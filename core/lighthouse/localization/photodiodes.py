@@ -27,7 +27,6 @@ from locatk.core.lighthouse.noise import (
     INLIER_GATE_SIGMAS,
     MIN_INLIER_GATE_RAD,
 )
-from locatk.core.lighthouse.recording import NANOSECONDS_PER_S
 from locatk.core.lighthouse.results import SceneVerification, StationDetection
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
@@ -36,6 +35,7 @@ from locatk.core.solution import SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 MAX_RANGE_M = 20.0
 """Largest plausible distance from the nearest base station, in metres. A position beyond is one
@@ -48,12 +48,19 @@ reflections and fast robots cost a few per cent."""
 SWAPPED_PLANES = ((0,), (1,), (0, 1))
 """Planes that a report may have exchanged between two stations: one of them, or both."""
 
-JUMP_WINDOW_EPOCHS = 5
-"""Length of the window of the jump filter. Two wrong positions in a row stay a minority in it."""
+JUMP_NEIGHBOURS = 3
+"""Epochs before and after one that predict its position."""
+
+MAX_JUMP_PASSES = 20
+"""Most searches for jumps, each without those that were found."""
 
 MAX_JUMP_RATIO = 5.0
-"""Deviation from the median of the window, relative to the usual step or deviation, from which a
-position is a jump."""
+"""Departure from the predicted position, relative to the usual one and to those of the neighbours,
+from which a position is a jump."""
+
+MAX_DEPARTURE_M_S2 = 20.0
+"""Departure from the predicted position, over the square of the time to the neighbours, that no
+motion of 10 m/s^2 causes."""
 
 MAX_JUMP_WINDOW_S = 2.0
 """Longest window of the jump filter: after a pause of the recording a device may be anywhere."""
@@ -256,37 +263,97 @@ def inlier_gate(estimates: PositionEstimates) -> float:
 def find_jumps(
     epochs: Epochs, estimates: PositionEstimates, is_accepted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Find epochs without redundancy that leave the trajectory of their device.
+    """Find epochs that leave the trajectory of their device.
 
-    Each position is compared with the median of the window around it, which a steady motion does
-    not leave (Hampel filter).
+    Each position is compared with the one that its neighbours predict: the median of the
+    interpolations between all pairs of a neighbour before and one after it, which is right as long
+    as most of them are. A jump departs from it by much more than the neighbours do from theirs, and
+    than is usual in the recording.
 
     Returns
     -------
     (m,) bool ndarray
     """
     is_jump = np.zeros(len(epochs), bool)
-    if np.all(estimates.redundancy[is_accepted] > 0):
-        return is_jump
     for device in range(len(epochs.devices)):
         rows = np.flatnonzero(is_accepted & (epochs.device == device))
-        if len(rows) < JUMP_WINDOW_EPOCHS:
-            continue
-        path = estimates.position[rows]
-        last = JUMP_WINDOW_EPOCHS - 1
-        first = np.clip(np.arange(len(rows)) - last // 2, 0, len(rows) - JUMP_WINDOW_EPOCHS)
-        window = first[:, None] + np.arange(JUMP_WINDOW_EPOCHS)
-        deviation = np.linalg.norm(path - np.median(path[window], axis=1), axis=1)
-        step = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        usual = max(
-            float(np.percentile(deviation, USUAL_MOTION_PERCENTILE)),
-            float(np.percentile(step, USUAL_MOTION_PERCENTILE)),
-        )
-        span_ns = epochs.time_ns[rows[first + last]] - epochs.time_ns[rows[first]]
-        is_far = deviation > MAX_JUMP_RATIO * usual
-        is_far &= span_ns < round(MAX_JUMP_WINDOW_S * NANOSECONDS_PER_S)
-        is_jump[rows] = is_far & (estimates.redundancy[rows] <= 0)
+        # Jumps spoil the predictions of their neighbours: the largest ones are removed first.
+        for _ in range(MAX_JUMP_PASSES):
+            own = rows[~is_jump[rows]]
+            if len(own) < 2 * JUMP_NEIGHBOURS + 1:
+                break
+            time_s = (epochs.time_ns[own] - epochs.time_ns[own[0]]) * 1e-9
+            position = estimates.position[own]
+            departure = _departures(time_s, position)
+            step = np.linalg.norm(np.diff(position, axis=0), axis=1)
+            usual_step = float(np.percentile(step, USUAL_MOTION_PERCENTILE))
+            spacing_s = np.maximum(np.diff(time_s, append=np.inf), np.diff(time_s, prepend=-np.inf))
+            limit = MAX_DEPARTURE_M_S2 * spacing_s**2
+            # Epochs without redundancy contain wrong sweeps more often, up to several in a row.
+            is_free = estimates.redundancy[own] <= 0
+            limit[is_free] = np.minimum(limit[is_free], MAX_JUMP_RATIO * usual_step)
+            found = _stand_out(departure, limit)
+            if not np.any(found):
+                break
+            is_jump[own[found]] = True
     return is_jump
+
+
+def _departures(time_s: Array, position: Array) -> Array:
+    """Return the distances (n,) from the positions that neighbours predict; ``nan`` without.
+
+    At the ends of a trajectory and of pauses, positions are extrapolated from one side.
+    """
+    steps = range(1, JUMP_NEIGHBOURS + 1)
+    between = [_predict(time_s, position, -i, j) for i in steps for j in steps]
+    beyond = [
+        _predict(time_s, position, sign * i, sign * j)
+        for sign in (-1, 1)
+        for i in steps
+        for j in steps
+        if i < j
+    ]
+    departure = np.full(len(position), np.nan)
+    for predicted in map(np.stack, (beyond, between)):
+        has_any = np.isfinite(predicted[:, :, 0]).any(axis=0)
+        middle = np.nanmedian(predicted[:, has_any], axis=0)
+        departure[has_any] = np.linalg.norm(position[has_any] - middle, axis=1)
+    return departure
+
+
+def _predict(time_s: Array, position: Array, first: int, second: int) -> Array:
+    """Return the positions (n, d) on the lines through two neighbours of each; ``nan`` without."""
+    index = np.arange(len(position))
+    low, high = index + first, index + second
+    is_inside = (np.minimum(low, high) >= 0) & (np.maximum(low, high) < len(position))
+    low, high = (np.clip(rows, 0, len(position) - 1) for rows in (low, high))
+    times_s = np.stack([time_s[low], time_s, time_s[high]])
+    span_s = time_s[high] - time_s[low]
+    is_inside &= (np.ptp(times_s, axis=0) < MAX_JUMP_WINDOW_S) & (span_s != 0)
+    fraction = (time_s - time_s[low]) / np.where(span_s != 0, span_s, 1.0)
+    on_line = position[low] + fraction[:, None] * (position[high] - position[low])
+    return np.where(is_inside[:, None], on_line, np.nan)
+
+
+def _stand_out(departure: Array, limit: Array) -> Mask:
+    """Return which departures (n,) are the largest around, and far larger than the others.
+
+    They are beyond ``limit`` (n,), or far larger than those around them and than is usual.
+    """
+    known = np.isfinite(departure)
+    found = np.zeros(len(departure), bool)
+    values = departure[known]
+    if len(values) < 2 * JUMP_NEIGHBOURS + 1:
+        return found
+    usual = float(np.percentile(values, USUAL_MOTION_PERCENTILE))
+    padded = np.pad(values, JUMP_NEIGHBOURS + 1, mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * JUMP_NEIGHBOURS + 3)
+    others = np.delete(windows, JUMP_NEIGHBOURS + 1, axis=1)
+    local = np.percentile(others, USUAL_MOTION_PERCENTILE, axis=1)
+    threshold = MAX_JUMP_RATIO * np.maximum(usual, local)
+    is_far = values > np.minimum(threshold, np.maximum(limit[known], MAX_JUMP_RATIO * usual))
+    found[known] = is_far & (values >= windows.max(axis=1))
+    return found
 
 
 # ---- contradictions
