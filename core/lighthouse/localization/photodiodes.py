@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.epochs import Epochs, rotor_angles
@@ -267,8 +269,9 @@ def find_jumps(
 
     Each position is compared with the one that its neighbours predict: the median of the
     interpolations between all pairs of a neighbour before and one after it, which is right as long
-    as most of them are. A jump departs from it by much more than the neighbours do from theirs, and
-    than is usual in the recording.
+    as most of them are. A jump departs from it by much more than is usual in the recording, and
+    than its neighbours depart from what is predicted for them without it. The latter tells a jump
+    from a corner.
 
     Returns
     -------
@@ -283,35 +286,54 @@ def find_jumps(
             if len(own) < 2 * JUMP_NEIGHBOURS + 1:
                 break
             time_s = (epochs.time_ns[own] - epochs.time_ns[own[0]]) * 1e-9
-            position = estimates.position[own]
-            departure = _departures(time_s, position)
-            step = np.linalg.norm(np.diff(position, axis=0), axis=1)
-            usual_step = float(np.percentile(step, USUAL_MOTION_PERCENTILE))
-            spacing_s = np.maximum(np.diff(time_s, append=np.inf), np.diff(time_s, prepend=-np.inf))
-            limit = MAX_DEPARTURE_M_S2 * spacing_s**2
-            # Epochs without redundancy contain wrong sweeps more often, up to several in a row.
-            is_free = estimates.redundancy[own] <= 0
-            limit[is_free] = np.minimum(limit[is_free], MAX_JUMP_RATIO * usual_step)
-            found = _stand_out(departure, limit)
+            found = _stand_out(time_s, estimates.position[own])
             if not np.any(found):
                 break
             is_jump[own[found]] = True
     return is_jump
 
 
-def _departures(time_s: Array, position: Array) -> Array:
+def _stand_out(time_s: Array, position: Array) -> Mask:
+    """Return which positions (n, d) depart from their predictions, the largest around each."""
+    departure = _departures(time_s, position)
+    if not np.any(np.isfinite(departure)):
+        return np.zeros(len(position), bool)
+    usual = float(np.nanpercentile(departure, USUAL_MOTION_PERCENTILE))
+    sides = []
+    for sign in (-1, 1):
+        # The better one of two neighbours: the other one may be wrong as well.
+        nearest = [
+            _shifted(_departures(time_s, position, without=-sign * k), -sign * k) for k in (1, 2)
+        ]
+        sides.append(np.fmin(*nearest))
+    threshold = MAX_JUMP_RATIO * np.fmax(usual, np.fmax(*sides))
+    # Several jumps together make each other's predictions wrong, but exceed what a motion explains.
+    spacing_s = np.diff(time_s)
+    reachable = np.full(len(position), np.inf)
+    reachable[1:-1] = MAX_DEPARTURE_M_S2 * np.maximum(spacing_s[1:], spacing_s[:-1]) ** 2
+    threshold = np.fmin(threshold, np.maximum(reachable, MAX_JUMP_RATIO * usual))
+    excess = np.where(departure > threshold, departure, 0.0)
+    largest = maximum_filter1d(excess, 2 * JUMP_NEIGHBOURS + 1, mode="constant")
+    return np.asarray((excess > 0.0) & (excess >= largest))
+
+
+def _departures(time_s: Array, position: Array, without: int = 0) -> Array:
     """Return the distances (n,) from the positions that neighbours predict; ``nan`` without.
 
-    At the ends of a trajectory and of pauses, positions are extrapolated from one side.
+    The neighbour at the offset ``without`` is not used. At the ends of a trajectory and of pauses,
+    positions are extrapolated from one side.
     """
-    steps = range(1, JUMP_NEIGHBOURS + 1)
-    between = [_predict(time_s, position, -i, j) for i in steps for j in steps]
-    beyond = [
-        _predict(time_s, position, sign * i, sign * j)
+    steps = [k for k in range(1, JUMP_NEIGHBOURS + 2) if k != abs(without)]
+    usual = list(range(1, JUMP_NEIGHBOURS + 1))
+    sides = {
+        sign: [sign * k for k in (steps if sign * without > 0 else usual)[:JUMP_NEIGHBOURS]]
         for sign in (-1, 1)
-        for i in steps
-        for j in steps
-        if i < j
+    }
+    between = [_predict(time_s, position, i, j) for i in sides[-1] for j in sides[1]]
+    beyond = [
+        _predict(time_s, position, i, j)
+        for side in sides.values()
+        for i, j in combinations(side, 2)
     ]
     departure = np.full(len(position), np.nan)
     for predicted in map(np.stack, (beyond, between)):
@@ -319,6 +341,16 @@ def _departures(time_s: Array, position: Array) -> Array:
         middle = np.nanmedian(predicted[:, has_any], axis=0)
         departure[has_any] = np.linalg.norm(position[has_any] - middle, axis=1)
     return departure
+
+
+def _shifted(values: Array, step: int) -> Array:
+    """Return ``values[k - step]`` for each k; ``nan`` beyond the ends."""
+    result = np.full(len(values), np.nan)
+    if step > 0:
+        result[step:] = values[:-step]
+    else:
+        result[:step] = values[-step:]
+    return result
 
 
 def _predict(time_s: Array, position: Array, first: int, second: int) -> Array:
@@ -333,27 +365,6 @@ def _predict(time_s: Array, position: Array, first: int, second: int) -> Array:
     fraction = (time_s - time_s[low]) / np.where(span_s != 0, span_s, 1.0)
     on_line = position[low] + fraction[:, None] * (position[high] - position[low])
     return np.where(is_inside[:, None], on_line, np.nan)
-
-
-def _stand_out(departure: Array, limit: Array) -> Mask:
-    """Return which departures (n,) are the largest around, and far larger than the others.
-
-    They are beyond ``limit`` (n,), or far larger than those around them and than is usual.
-    """
-    known = np.isfinite(departure)
-    found = np.zeros(len(departure), bool)
-    values = departure[known]
-    if len(values) < 2 * JUMP_NEIGHBOURS + 1:
-        return found
-    usual = float(np.percentile(values, USUAL_MOTION_PERCENTILE))
-    padded = np.pad(values, JUMP_NEIGHBOURS + 1, mode="reflect")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * JUMP_NEIGHBOURS + 3)
-    others = np.delete(windows, JUMP_NEIGHBOURS + 1, axis=1)
-    local = np.percentile(others, USUAL_MOTION_PERCENTILE, axis=1)
-    threshold = MAX_JUMP_RATIO * np.maximum(usual, local)
-    is_far = values > np.minimum(threshold, np.maximum(limit[known], MAX_JUMP_RATIO * usual))
-    found[known] = is_far & (values >= windows.max(axis=1))
-    return found
 
 
 # ---- contradictions

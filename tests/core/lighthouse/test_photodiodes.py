@@ -93,33 +93,53 @@ def test_epochs_without_redundancy_do_not_show_the_noise() -> None:
 
 
 def path_with_jump(size: float, row: int = 20) -> Array:
-    """A steady path of 10 mm a step with one position off to the side."""
+    """A path of 10 mm a step that scatters by 1 mm, with one position off to the side."""
     path = np.stack([0.01 * np.arange(40), np.zeros(40), np.zeros(40)], axis=1)
+    path += np.random.default_rng(3).normal(0.0, 1e-3, path.shape)
     path[row, 1] += size
     return path
 
 
-@pytest.mark.parametrize(("size", "is_jump"), [(0.04, False), (0.06, True), (1.0, True)])
-def test_positions_far_from_the_path_are_jumps(size: float, is_jump: bool) -> None:
-    epochs = epochs_of(np.zeros((40, 1, 2)))
-    estimates = estimates_with(np.zeros((40, 1, 2)), redundancy=0, position=path_with_jump(size))
-    found = np.flatnonzero(find_jumps(epochs, estimates, np.ones(40, bool)))
-    assert found.tolist() == ([20] if is_jump else [])
+def jumps_of(path: Array, redundancy: int = 1, step_s: float = 0.1) -> list[int]:
+    """Return the positions of a path that are jumps."""
+    angles = np.zeros((len(path), 1, 2))
+    estimates = estimates_with(angles, redundancy=redundancy, position=path)
+    found = find_jumps(epochs_of(angles, step_s=step_s), estimates, np.ones(len(path), bool))
+    return np.flatnonzero(found).tolist()
 
 
-def test_positions_with_redundancy_are_not_jumps() -> None:
-    epochs = epochs_of(np.zeros((40, 1, 2)))
-    estimates = estimates_with(np.zeros((40, 1, 2)), redundancy=0, position=path_with_jump(1.0))
-    estimates.redundancy[20] = 1
-    assert not find_jumps(epochs, estimates, np.ones(40, bool)).any()
+@pytest.mark.parametrize("redundancy", [0, 1])
+@pytest.mark.parametrize("row", [0, 1, 20, 39])
+@pytest.mark.parametrize(("size", "is_jump"), [(0.003, False), (0.06, True), (1.0, True)])
+def test_positions_far_from_the_path_are_jumps(
+    size: float, is_jump: bool, row: int, redundancy: int
+) -> None:
+    found = jumps_of(path_with_jump(size, row), redundancy)
+    assert found == ([row] if is_jump else [])
+
+
+def test_two_wrong_positions_in_a_row_are_jumps() -> None:
+    path = path_with_jump(0.3)
+    path[21, 0] -= 0.4
+    assert jumps_of(path) == [20, 21]
+
+
+@pytest.mark.parametrize("speed", [0.003, 0.03, 0.1])
+def test_starts_stops_and_corners_are_no_jumps(speed: float) -> None:
+    # At rest for 80 % of the time, then a square at constant speed.
+    steps = np.zeros((200, 3))
+    for side, direction in enumerate([(1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)]):
+        steps[150 + 10 * side : 160 + 10 * side] = speed * np.array(direction)
+    path = np.cumsum(steps, axis=0)
+    path += np.random.default_rng(3).normal(0.0, 2e-4, path.shape)
+    assert jumps_of(path) == []
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_over_a_pause_a_position_is_not_a_jump(factor: float) -> None:
-    # Five epochs span four steps.
-    epochs = epochs_of(np.zeros((40, 1, 2)), step_s=factor * MAX_JUMP_WINDOW_S / 4)
-    estimates = estimates_with(np.zeros((40, 1, 2)), redundancy=0, position=path_with_jump(1.0))
-    assert find_jumps(epochs, estimates, np.ones(40, bool)).any() == (factor < 1)
+    # A position and two neighbours span two steps.
+    found = jumps_of(path_with_jump(1.0), 0, step_s=factor * MAX_JUMP_WINDOW_S / 2)
+    assert bool(found) == (factor < 1)
 
 
 # ---- contradictions
