@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ from locatk.core.solution import SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MAX_RANGE_M = 20.0
@@ -295,74 +296,67 @@ def find_jumps(
 
 def _stand_out(time_s: Array, position: Array) -> Mask:
     """Return which positions (n, d) depart from their predictions, the largest around each."""
-    departure = _departures(time_s, position)
-    if not np.any(np.isfinite(departure)):
-        return np.zeros(len(position), bool)
-    usual = float(np.nanpercentile(departure, USUAL_MOTION_PERCENTILE))
-    sides = []
-    for sign in (-1, 1):
-        # The better one of two neighbours: the other one may be wrong as well.
-        nearest = [
-            _shifted(_departures(time_s, position, without=-sign * k), -sign * k) for k in (1, 2)
-        ]
-        sides.append(np.fmin(*nearest))
-    threshold = MAX_JUMP_RATIO * np.fmax(usual, np.fmax(*sides))
-    # Several jumps together make each other's predictions wrong, but exceed what a motion explains.
-    spacing_s = np.diff(time_s)
-    reachable = np.full(len(position), np.inf)
-    reachable[1:-1] = MAX_DEPARTURE_M_S2 * np.maximum(spacing_s[1:], spacing_s[:-1]) ** 2
-    threshold = np.fmin(threshold, np.maximum(reachable, MAX_JUMP_RATIO * usual))
-    excess = np.where(departure > threshold, departure, 0.0)
-    largest = maximum_filter1d(excess, 2 * JUMP_NEIGHBOURS + 1, mode="constant")
-    return np.asarray((excess > 0.0) & (excess >= largest))
+    count = len(position)
+    departure = _departures(time_s, position, np.arange(count))
+    excess = np.zeros(count)
+    if np.any(np.isfinite(departure)):
+        usual = float(np.nanpercentile(departure, USUAL_MOTION_PERCENTILE))
+        far = np.flatnonzero(departure > MAX_JUMP_RATIO * usual)
+        sides = []
+        for sign in (-1, 1):
+            # The better one of two neighbours: the other one may be wrong as well.
+            nearest = [
+                _departures(time_s, position, far + sign * k, without=-sign * k) for k in (1, 2)
+            ]
+            sides.append(np.fmin(*nearest))
+        # Several jumps together make each other's predictions wrong, but exceed any motion.
+        spacing_s = np.diff(time_s, prepend=-np.inf, append=np.inf)
+        longest_s = np.maximum(spacing_s[far], spacing_s[far + 1])
+        largest = np.fmin(MAX_JUMP_RATIO * np.fmax(*sides), MAX_DEPARTURE_M_S2 * longest_s**2)
+        is_jump = ~(departure[far] <= largest)
+        excess[far[is_jump]] = departure[far[is_jump]]
+    around = maximum_filter1d(excess, 2 * JUMP_NEIGHBOURS + 1, mode="constant")
+    return np.asarray((excess > 0.0) & (excess >= around))
 
 
-def _departures(time_s: Array, position: Array, without: int = 0) -> Array:
-    """Return the distances (n,) from the positions that neighbours predict; ``nan`` without.
+def _departures(time_s: Array, position: Array, rows: IntArray, without: int = 0) -> Array:
+    """Return the distances (m,) of positions from what their neighbours predict; ``nan`` without.
 
     The neighbour at the offset ``without`` is not used. At the ends of a trajectory and of pauses,
-    positions are extrapolated from one side.
+    positions are extrapolated from one side. Rows beyond the ends have no distance.
     """
-    steps = [k for k in range(1, JUMP_NEIGHBOURS + 2) if k != abs(without)]
-    usual = list(range(1, JUMP_NEIGHBOURS + 1))
-    sides = {
-        sign: [sign * k for k in (steps if sign * without > 0 else usual)[:JUMP_NEIGHBOURS]]
-        for sign in (-1, 1)
-    }
-    between = [_predict(time_s, position, i, j) for i in sides[-1] for j in sides[1]]
-    beyond = [
-        _predict(time_s, position, i, j)
-        for side in sides.values()
-        for i, j in combinations(side, 2)
-    ]
-    departure = np.full(len(position), np.nan)
-    for predicted in map(np.stack, (beyond, between)):
-        has_any = np.isfinite(predicted[:, :, 0]).any(axis=0)
-        middle = np.nanmedian(predicted[:, has_any], axis=0)
-        departure[has_any] = np.linalg.norm(position[has_any] - middle, axis=1)
+    reach = JUMP_NEIGHBOURS + 1
+    before = [k for k in range(-reach, 0) if k != without][-JUMP_NEIGHBOURS:]
+    after = [k for k in range(1, reach + 1) if k != without][:JUMP_NEIGHBOURS]
+    beyond = [*combinations(before, 2), *combinations(after, 2)]
+    departure = np.full(len(rows), np.nan)
+    missing = np.flatnonzero((rows >= 0) & (rows < len(position)))
+    for pairs in (product(before, after), beyond):
+        own = rows[missing]
+        predicted = np.stack([_predict(time_s, position, own, i, j) for i, j in pairs], axis=-1)
+        # Sorted, with the missing ones last: faster than a median that looks for them.
+        predicted.sort(axis=-1)
+        count = np.isfinite(predicted[:, 0]).sum(axis=-1)
+        has_any = count > 0
+        upper = (count // 2)[has_any, None, None]
+        lower = ((count - 1) // 2)[has_any, None, None]
+        known = predicted[has_any]
+        middle = sum(np.take_along_axis(known, k, axis=-1)[..., 0] for k in (lower, upper)) / 2
+        offset = position[own[has_any]] - middle
+        departure[missing[has_any]] = np.linalg.norm(offset, axis=1)
+        missing = missing[~has_any]
     return departure
 
 
-def _shifted(values: Array, step: int) -> Array:
-    """Return ``values[k - step]`` for each k; ``nan`` beyond the ends."""
-    result = np.full(len(values), np.nan)
-    if step > 0:
-        result[step:] = values[:-step]
-    else:
-        result[:step] = values[-step:]
-    return result
-
-
-def _predict(time_s: Array, position: Array, first: int, second: int) -> Array:
-    """Return the positions (n, d) on the lines through two neighbours of each; ``nan`` without."""
-    index = np.arange(len(position))
-    low, high = index + first, index + second
+def _predict(time_s: Array, position: Array, rows: IntArray, first: int, second: int) -> Array:
+    """Return the positions (m, d) on lines through two neighbours of each row; ``nan`` without."""
+    low, high = rows + first, rows + second
     is_inside = (np.minimum(low, high) >= 0) & (np.maximum(low, high) < len(position))
-    low, high = (np.clip(rows, 0, len(position) - 1) for rows in (low, high))
-    times_s = np.stack([time_s[low], time_s, time_s[high]])
+    low, high = (np.clip(index, 0, len(position) - 1) for index in (low, high))
+    times_s = np.stack([time_s[low], time_s[rows], time_s[high]])
     span_s = time_s[high] - time_s[low]
     is_inside &= (np.ptp(times_s, axis=0) < MAX_JUMP_WINDOW_S) & (span_s != 0)
-    fraction = (time_s - time_s[low]) / np.where(span_s != 0, span_s, 1.0)
+    fraction = (time_s[rows] - time_s[low]) / np.where(span_s != 0, span_s, 1.0)
     on_line = position[low] + fraction[:, None] * (position[high] - position[low])
     return np.where(is_inside[:, None], on_line, np.nan)
 
