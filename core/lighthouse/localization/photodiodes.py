@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
 
 from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.epochs import Epochs, rotor_angles
@@ -60,6 +60,12 @@ MAX_JUMP_PASSES = 20
 MAX_JUMP_RATIO = 5.0
 """Departure from the predicted position, relative to the usual one and to those of the neighbours,
 from which a position is a jump."""
+
+MIN_PREDICTIONS = 3
+"""Fewest pairs of neighbours that predict a position: a median of fewer is not robust."""
+
+MAX_EXTRAPOLATION = 2.0
+"""Longest time from two neighbours to the position that they predict, in times between them."""
 
 MAX_DEPARTURE_M_S2 = 20.0
 """Departure from the predicted position, over the square of the time to the neighbours, that no
@@ -315,8 +321,8 @@ def _stand_out(time_s: Array, position: Array) -> Mask:
         largest = np.fmin(MAX_JUMP_RATIO * np.fmax(*sides), MAX_DEPARTURE_M_S2 * longest_s**2)
         is_jump = ~(departure[far] <= largest)
         excess[far[is_jump]] = departure[far[is_jump]]
-    around = maximum_filter1d(excess, 2 * JUMP_NEIGHBOURS + 1, mode="constant")
-    return np.asarray((excess > 0.0) & (excess >= around))
+    windows = sliding_window_view(np.pad(excess, JUMP_NEIGHBOURS), 2 * JUMP_NEIGHBOURS + 1)
+    return np.asarray((excess > 0.0) & (excess >= windows.max(axis=1)))
 
 
 def _departures(time_s: Array, position: Array, rows: IntArray, without: int = 0) -> Array:
@@ -337,14 +343,14 @@ def _departures(time_s: Array, position: Array, rows: IntArray, without: int = 0
         # Sorted, with the missing ones last: faster than a median that looks for them.
         predicted.sort(axis=-1)
         count = np.isfinite(predicted[:, 0]).sum(axis=-1)
-        has_any = count > 0
-        upper = (count // 2)[has_any, None, None]
-        lower = ((count - 1) // 2)[has_any, None, None]
-        known = predicted[has_any]
+        is_known = count >= MIN_PREDICTIONS
+        upper = (count // 2)[is_known, None, None]
+        lower = ((count - 1) // 2)[is_known, None, None]
+        known = predicted[is_known]
         middle = sum(np.take_along_axis(known, k, axis=-1)[..., 0] for k in (lower, upper)) / 2
-        offset = position[own[has_any]] - middle
-        departure[missing[has_any]] = np.linalg.norm(offset, axis=1)
-        missing = missing[~has_any]
+        offset = position[own[is_known]] - middle
+        departure[missing[is_known]] = np.linalg.norm(offset, axis=1)
+        missing = missing[~is_known]
     return departure
 
 
@@ -357,6 +363,7 @@ def _predict(time_s: Array, position: Array, rows: IntArray, first: int, second:
     span_s = time_s[high] - time_s[low]
     is_inside &= (np.ptp(times_s, axis=0) < MAX_JUMP_WINDOW_S) & (span_s != 0)
     fraction = (time_s[rows] - time_s[low]) / np.where(span_s != 0, span_s, 1.0)
+    is_inside &= np.abs(fraction - 0.5) <= MAX_EXTRAPOLATION + 0.5
     on_line = position[low] + fraction[:, None] * (position[high] - position[low])
     return np.where(is_inside[:, None], on_line, np.nan)
 
