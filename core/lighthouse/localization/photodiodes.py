@@ -64,12 +64,8 @@ from which a position is a jump."""
 MIN_PREDICTIONS = 3
 """Fewest pairs of neighbours that predict a position: a median of fewer is not robust."""
 
-MAX_EXTRAPOLATION = 2.0
+MAX_EXTRAPOLATION = 4.0
 """Longest time from two neighbours to the position that they predict, in times between them."""
-
-MAX_DEPARTURE_M_S2 = 20.0
-"""Departure from the predicted position, over the square of the time to the neighbours, that no
-motion of 10 m/s^2 causes."""
 
 MAX_JUMP_WINDOW_S = 2.0
 """Longest window of the jump filter: after a pause of the recording a device may be anywhere."""
@@ -293,15 +289,20 @@ def find_jumps(
             if len(own) < 2 * JUMP_NEIGHBOURS + 1:
                 break
             time_s = (epochs.time_ns[own] - epochs.time_ns[own[0]]) * 1e-9
-            found = _stand_out(time_s, estimates.position[own])
+            is_free = estimates.redundancy[own] <= 0
+            found = _stand_out(time_s, estimates.position[own], is_free)
             if not np.any(found):
                 break
             is_jump[own[found]] = True
     return is_jump
 
 
-def _stand_out(time_s: Array, position: Array) -> Mask:
-    """Return which positions (n, d) depart from their predictions, the largest around each."""
+def _stand_out(time_s: Array, position: Array, is_free: Mask) -> Mask:
+    """Return which positions (n, d) depart from their predictions, the largest around each.
+
+    Those without redundancy, ``is_free`` (n,), contain wrong sweeps more often: several together
+    make each other's predictions wrong, but exceed what the usual speed explains.
+    """
     count = len(position)
     departure = _departures(time_s, position, np.arange(count))
     excess = np.zeros(count)
@@ -315,10 +316,13 @@ def _stand_out(time_s: Array, position: Array) -> Mask:
                 _departures(time_s, position, far + sign * k, without=-sign * k) for k in (1, 2)
             ]
             sides.append(np.fmin(*nearest))
-        # Several jumps together make each other's predictions wrong, but exceed any motion.
-        spacing_s = np.diff(time_s, prepend=-np.inf, append=np.inf)
-        longest_s = np.maximum(spacing_s[far], spacing_s[far + 1])
-        largest = np.fmin(MAX_JUMP_RATIO * np.fmax(*sides), MAX_DEPARTURE_M_S2 * longest_s**2)
+        spacing_s = np.diff(time_s)
+        step = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        speed = np.percentile(step / np.maximum(spacing_s, 1e-9), USUAL_MOTION_PERCENTILE)
+        around_s = np.concatenate([[np.inf], spacing_s, [np.inf]])
+        reach = speed * np.maximum(around_s[far], around_s[far + 1])
+        limit = np.fmin(np.fmax(*sides), np.where(is_free[far], reach, np.inf))
+        largest = MAX_JUMP_RATIO * limit
         is_jump = ~(departure[far] <= largest)
         excess[far[is_jump]] = departure[far[is_jump]]
     windows = sliding_window_view(np.pad(excess, JUMP_NEIGHBOURS), 2 * JUMP_NEIGHBOURS + 1)
