@@ -64,6 +64,11 @@ Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+INITIAL_SIGMA_RAD = 2e-3
+"""Standard deviation of an angle in radians for the initial poses: 4 mm at two metres, which a
+given scene or the dimensions of a device may be off by. With that of exact geometry, rates would
+explain errors of the geometry, and spoil the prediction of the neighbouring epochs."""
+
 LOSS_SCALE_RAD = 3e-3
 """Scale of the Cauchy loss in radians while the noise is unknown; the residuals of reflections are
 far larger."""
@@ -376,7 +381,7 @@ def _solve_seed_batch(
         own_observations.take(best).trimmed(),
         problem.stations,
         poses.take(best),
-        sigma_rad=ANGLE_SIGMA_RAD,
+        sigma_rad=INITIAL_SIGMA_RAD,
         loss_scale_rad=LOSS_SCALE_RAD,
         tolerance=INITIAL_TOLERANCE,
     ).poses
@@ -386,7 +391,7 @@ def _solve_seed_batch(
         observations,
         problem.stations,
         poses.take(best),
-        sigma_rad=ANGLE_SIGMA_RAD,
+        sigma_rad=INITIAL_SIGMA_RAD,
         loss_scale_rad=LOSS_SCALE_RAD,
     )
     accepted = is_accepted(observations, fit.residual)
@@ -523,7 +528,7 @@ def _solve_from(
             observations,
             problem.stations,
             start.take(rows),
-            sigma_rad=ANGLE_SIGMA_RAD,
+            sigma_rad=INITIAL_SIGMA_RAD,
             loss_scale_rad=LOSS_SCALE_RAD,
             tolerance=INITIAL_TOLERANCE,
             cutoff_rad=OUTLIER_CUTOFF_RAD,
