@@ -11,7 +11,7 @@ from locatk.core.errors import DegenerateError, InputError
 from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.solver import (
     merge_solutions,
-    paths_warning,
+    paths_warnings,
     select_rigid_receivers,
     solve_devices,
 )
@@ -257,7 +257,7 @@ def _locate_and_verify(
             rate_hz=options.rate_hz,
         )
     except DegenerateError as error:
-        path_warnings.append(paths_warning(error))
+        path_warnings.extend(paths_warnings(error))
     if paths is None and options.rate_hz is not None:
         path_warnings.append(_RATE_WARNING)
     if paths is not None:

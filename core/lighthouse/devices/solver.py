@@ -37,6 +37,7 @@ from locatk.core.lighthouse.devices.tracking import (
 )
 from locatk.core.lighthouse.devices.trajectories import refine_tracks
 from locatk.core.lighthouse.devices.verification import verify_devices
+from locatk.core.lighthouse.motion.recording import MovedStationError
 from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
@@ -126,7 +127,7 @@ def solve_devices(
         estimate = replace(estimate, scene=refined)
     except DegenerateError as error:
         if any(len(device.trajectory) for device in tracked):
-            path_warnings.append(paths_warning(error))
+            path_warnings.extend(paths_warnings(error))
     trajectories = tuple(device.trajectory for device in tracked)
     detections = station_detections(tracked, estimate.scene)
     facts = _tracking_facts(estimate.facts, tracked, estimate.scene, detections)
@@ -335,13 +336,18 @@ def device_warnings(tracked: Sequence[TrackedDevice]) -> list[SolverWarning]:
     return warnings
 
 
-def paths_warning(error: DegenerateError) -> SolverWarning:
-    """Return the warning for poses that are not on estimated paths."""
-    return SolverWarning(
-        "paths_not_estimated",
-        f"{error}: each pose is estimated from the sweeps around it, and its covariance contains "
-        "no errors of the stations",
-    )
+def paths_warnings(error: DegenerateError) -> list[SolverWarning]:
+    """Return the warnings for poses that are not on estimated paths."""
+    warnings = [
+        SolverWarning(
+            "paths_not_estimated",
+            f"{error}: each pose is estimated from the sweeps around it, and its covariance "
+            "contains no errors of the stations",
+        )
+    ]
+    if isinstance(error, MovedStationError):
+        warnings.append(SolverWarning("station_moved", error.move))
+    return warnings
 
 
 def contradiction_warnings(

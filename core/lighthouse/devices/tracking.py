@@ -720,12 +720,7 @@ def _closest_residuals(problem: TrackingProblem, epochs: IntArray, residual: Arr
 def angle_noise(
     sweeps: DeviceSweeps, residual: Array, is_used: Mask, window_sweeps: IntArray
 ) -> tuple[float, float]:
-    """Estimate the standard deviation of an angle in radians: in all, and its lasting part.
-
-    Errors of a photodiode's position, its cover or a generic calibration repeat from rotation to
-    rotation and do not average out. The residuals of consecutive rotations differ by the rest of
-    the noise only, which separates the two parts.
-    """
+    """Estimate the standard deviation of an angle in radians: in all, and its lasting part."""
     window_sizes = np.count_nonzero(window_sweeps >= 0, axis=1)
     if not len(window_sizes) or not np.any(is_used):
         return ANGLE_SIGMA_RAD, 0.0
@@ -733,6 +728,16 @@ def angle_noise(
     # The unknowns of an epoch absorb a part of its residuals.
     inflation = np.sqrt(number / max(number - STATE_UNKNOWNS, 0.25 * number))
     total = max(ANGLE_SIGMA_RAD, inflation * robust_sigma(residual[is_used]))
+    return total, lasting_noise(sweeps, residual, is_used, total)
+
+
+def lasting_noise(sweeps: DeviceSweeps, residual: Array, is_used: Mask, total: float) -> float:
+    """Estimate the lasting part of the standard deviation ``total`` of an angle in radians.
+
+    Errors of a photodiode's position, its cover or a generic calibration repeat from rotation to
+    rotation and do not average out. The residuals of consecutive rotations differ by the rest of
+    the noise only, which separates the two parts.
+    """
     series = np.ravel_multi_index(
         (sweeps.station, sweeps.sensor, sweeps.plane),
         (len(CHANNELS), int(np.max(sweeps.sensor)) + 1, 2),
@@ -743,9 +748,9 @@ def angle_noise(
         np.diff(sweeps.time_ns[rows]) < MAX_ROTATION_PERIOD_NS
     )
     if not np.any(is_consecutive):
-        return total, total
+        return total
     passing = robust_sigma(np.diff(residual[rows])[is_consecutive]) / np.sqrt(2)
-    return total, float(np.sqrt(max(0.0, total**2 - passing**2)))
+    return float(np.sqrt(max(0.0, total**2 - passing**2)))
 
 
 def pose_covariance(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from locatk.core.geometry import Similarity
 from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import rotation_limits_ns
-from locatk.core.lighthouse.devices.tracking import TrackedDevice
+from locatk.core.lighthouse.devices.tracking import TrackedDevice, lasting_noise
 from locatk.core.lighthouse.motion.frames import PathFrame
 from locatk.core.lighthouse.motion.parameters import make_parameters, scene_size
 from locatk.core.lighthouse.motion.recording import PathRecording, Visit
@@ -124,6 +124,9 @@ def refine_tracks(
                 residual=path.residual,
                 is_used=path.is_used,
                 sigma_rad=estimate.sigma_rad,
+                lasting_sigma_rad=lasting_noise(
+                    device.sweeps, path.residual, path.is_used, estimate.sigma_rad
+                ),
                 rejected=add_counts(rejected),
             )
         )

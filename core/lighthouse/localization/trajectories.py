@@ -197,11 +197,12 @@ def _rough_frame(estimate: PathEstimate, rough: Sequence[Trajectory]) -> Similar
     for device, trajectory in enumerate(rough):
         knots = np.flatnonzero(estimate.device == device)
         if len(knots):
-            next_knot = np.searchsorted(estimate.time_ns[knots], trajectory.time_ns)
-            nearest = knots[np.minimum(next_knot, len(knots) - 1)]
-            apart_ns = np.abs(estimate.time_ns[nearest] - trajectory.time_ns)
+            knot_ns, own = estimate.time_ns[knots], estimate.path.position[knots]
+            next_knot = np.minimum(np.searchsorted(knot_ns, trajectory.time_ns), len(knots) - 1)
+            apart_ns = np.abs(knot_ns[next_knot] - trajectory.time_ns)
             is_near = apart_ns < MAX_POSE_INTERVAL_S * 1e9
-            source.append(estimate.path.position[nearest[is_near]])
+            time_ns = trajectory.time_ns[is_near]
+            source.append(np.stack([np.interp(time_ns, knot_ns, axis) for axis in own.T], axis=1))
             target.append(trajectory.position[is_near])
     a, b = np.concatenate(source), np.concatenate(target)
     distance = np.linalg.norm(umeyama(a, b).apply(a) - b, axis=1)

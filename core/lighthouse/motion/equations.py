@@ -255,7 +255,7 @@ def prior_equations(path: Path, power: Array) -> tuple[Array, Array, Array]:
     gradient : (k, d) ndarray
     """
     k, n = len(path), path.pose_size
-    unit = prior_information(np.diff(path.time_s)) * path.is_linked[:, None, None]
+    unit = prior_information(path.span_s) * path.is_linked[:, None, None]
     diagonal = np.zeros((k, 2, n, 2, n))
     above = np.zeros((k - 1, 2, n, 2, n))
     # Errors are those of the end in the axes of pose and rate; the start predicts without error.

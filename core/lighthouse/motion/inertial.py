@@ -64,6 +64,9 @@ WINDOW_S = 0.2
 NOISE_WINDOW_S = 1.0
 """Time over which the density of the noise is averaged."""
 
+SAMPLE_MARGIN_S = 2.0
+"""Time before and after a path from which samples are used."""
+
 MAX_MISFIT = np.array([0.8, 1.5])
 """Largest residual of gyroscope and accelerometer, relative to the motion of the path."""
 
@@ -210,10 +213,13 @@ def select_intervals(
     """
     time_s = np.asarray((samples.time_ns - start_ns) * 1e-9, np.float64)
     interval = np.flatnonzero(path.is_linked & is_own[:-1])
+    if not len(interval):
+        return None
     start_s, end_s = path.time_s[interval], path.time_s[interval + 1]
+    is_near = (time_s > start_s[0] - SAMPLE_MARGIN_S) & (time_s < end_s[-1] + SAMPLE_MARGIN_S)
     integrals, covered = [], []
     for value in (samples.angular_rate, samples.acceleration):
-        rows = np.flatnonzero(np.isfinite(value).all(axis=1))
+        rows = np.flatnonzero(is_near & np.isfinite(value).all(axis=1))
         integral = SampleIntegral.of(time_s[rows], value[rows]) if len(rows) > 1 else None
         integrals.append(integral)
         is_covered = np.zeros(len(interval), bool)
@@ -500,7 +506,7 @@ def make_factors(
     start_ns: int,
     *,
     with_force: bool,
-) -> tuple[InertialFactors | None, CommonParameters, tuple[str, ...]]:
+) -> tuple[InertialFactors | None, CommonParameters, tuple[str, ...], tuple[str, ...]]:
     """Compare IMUs with the path, and make factors of those that agree with it.
 
     Parameters
@@ -521,13 +527,15 @@ def make_factors(
         None without an IMU that agrees.
     common : CommonParameters
         With the parameters of the IMUs.
-    contradicting : tuple of str
-        Devices whose IMU contradicts the light.
+    contradicting, uncovered : tuple of str
+        Devices whose IMU contradicts the light, and those with too few samples of a gyroscope.
     """
-    imus, starts, densities, gravities, contradicting = [], [], [], [], []
+    imus, starts, densities, gravities = [], [], [], []
+    contradicting, uncovered = [], []
     for own, is_own in samples:
         imu = select_intervals(own, path, is_own, start_ns)
         if imu is None or _measured_s(imu, imu.has_gyro) < MIN_COMPARED_S:
+            uncovered.append(own.device)
             continue
         if _measured_s(imu, imu.has_force) < MIN_COMPARED_S:
             imu = replace(imu, has_force=np.zeros_like(imu.has_force))
@@ -541,7 +549,7 @@ def make_factors(
         if np.any(imu.has_force):
             gravities.append(gravity)
     if not imus:
-        return None, common, tuple(contradicting)
+        return None, common, tuple(contradicting), tuple(uncovered)
     first = len(common.value)
     size = 3 + IMU_PARAMETERS * len(imus)
     weak = np.full(3, 1e-6)
@@ -552,7 +560,8 @@ def make_factors(
         gauge=np.concatenate([common.gauge, np.zeros((size, common.gauge.shape[1]))]),
         value=np.concatenate([common.value, np.mean(gravities or [np.zeros(3)], axis=0), *starts]),
     )
-    return InertialFactors(tuple(imus), first, densities), common, tuple(contradicting)
+    factors = InertialFactors(tuple(imus), first, densities)
+    return factors, common, tuple(contradicting), tuple(uncovered)
 
 
 def _measured_s(imu: ImuIntervals, is_measured: Mask) -> float:

@@ -36,6 +36,9 @@ MAX_START_GAP_S = 0.25
 MAX_JUMP_RAD = 0.6
 """Largest turn between neighbouring rough poses: 30 rad/s at 50 poses a second."""
 
+MAX_TURN_RATE_RAD_S = 3.0
+"""Largest rate of turn during a gap between rough poses, in addition."""
+
 MAX_FLIP_S = 3.0
 """Longest time with a wrong orientation that is interpolated."""
 
@@ -150,9 +153,9 @@ def without_flips(trajectory: Trajectory) -> Trajectory:
         last = int(far[longest])
         for part in parts:
             is_long = time_ns[stop[part] - 1] - time_ns[start[part]] > MAX_FLIP_S * 1e9
-            is_late = abs(time_ns[near[part]] - time_ns[last]) > MAX_FLIP_S * 1e9
+            gap_s = 1e-9 * abs(time_ns[near[part]] - time_ns[last])
             turn = _turn(quaternion[last], quaternion[near[part]])
-            if is_long or is_late or turn < MAX_JUMP_RAD:
+            if is_long or turn < MAX_JUMP_RAD + MAX_TURN_RATE_RAD_S * gap_s:
                 last = int(far[part])
             else:
                 kept[start[part] : stop[part]] = False

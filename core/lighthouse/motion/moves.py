@@ -53,7 +53,9 @@ def find_moves(first: PathEstimate, last: PathEstimate) -> list[StationMove]:
         step = after[0] - before[0]
         turn = Rotation.from_matrix(after[1] @ before[1].T).as_rotvec()
         change = np.concatenate([step, turn])
-        ratio = float(change @ np.linalg.solve(before[2] + after[2], change))
+        # Of two stations without a scale, the covariance along the baseline is zero.
+        inverse = np.linalg.pinv(before[2] + after[2], 1e-9, hermitian=True)
+        ratio = float(change @ inverse @ change)
         move = StationMove(pair, float(np.linalg.norm(step)), float(np.linalg.norm(turn)))
         is_large = move.distance_m > MIN_MOVE_M or move.turn_rad > MIN_TURN_RAD
         if is_large and ratio > MOVED_SIGMAS**2:
@@ -62,8 +64,11 @@ def find_moves(first: PathEstimate, last: PathEstimate) -> list[StationMove]:
 
 
 def moved_stations(moves: Sequence[StationMove], count: int) -> tuple[int, ...]:
-    """Return the stations that moved relative to most of the others; with two, both of them."""
-    pairs = np.bincount([i for move in moves for i in move.stations], minlength=count)
+    """Return the stations that moved relative to most of the others; with two, both of them.
+
+    ``count`` is the number of stations that are compared.
+    """
+    pairs = np.bincount([i for move in moves for i in move.stations])
     return tuple(np.flatnonzero(pairs > (count - 1) / 2).tolist())
 
 

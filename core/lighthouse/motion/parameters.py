@@ -242,9 +242,9 @@ class CommonParameters:
 
 
 def scene_size(stations: Array, positions: Array) -> float:
-    """Return the median distance of positions (n, 3) from the centre of stations (s, 3)."""
-    distance = np.linalg.norm(positions - stations.mean(axis=0), axis=1)
-    return float(np.median(distance)) if len(distance) else 1.0
+    """Return the median distance of positions (n, 3) from the single stations (s, 3)."""
+    distance = np.linalg.norm(positions[:, None] - stations, axis=2)
+    return float(np.median(distance)) if distance.size else 1.0
 
 
 def distortion_basis(local: Array) -> Array:

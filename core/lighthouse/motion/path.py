@@ -58,6 +58,11 @@ class Path:
         return len(self.time_s)
 
     @property
+    def span_s(self) -> Array:
+        """Times (k - 1,) from each knot to the next; 1 where they are not linked."""
+        return np.where(self.is_linked, np.diff(self.time_s), 1.0)
+
+    @property
     def pose_size(self) -> int:
         """Unknowns of a pose: 3 or 6."""
         return 3 if self.rotation is None else 6
@@ -126,7 +131,7 @@ class Path:
 
     def prior_errors(self) -> Array:
         """Return how far each state (k - 1, 2, n) is from the one that follows from the last."""
-        span_s = np.diff(self.time_s)[:, None]
+        span_s = self.span_s[:, None]
         parts = [
             np.stack(
                 [

@@ -19,6 +19,7 @@ from locatk.core.errors import DegenerateError
 from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.devices.device_sweeps import DeviceSweeps
 from locatk.core.lighthouse.motion.frames import PathFrame
+from locatk.core.lighthouse.motion.inertial import MIN_COMPARED_S
 from locatk.core.lighthouse.motion.layout import interpolate_flips
 from locatk.core.lighthouse.motion.moves import find_moves, moved_stations
 from locatk.core.lighthouse.motion.parameters import CommonParameters
@@ -27,7 +28,12 @@ from locatk.core.lighthouse.motion.results import (
     interpolate_trajectory,
     make_trajectory,
 )
-from locatk.core.lighthouse.motion.solver import PathEstimate, estimate_paths, follow_path
+from locatk.core.lighthouse.motion.solver import (
+    MIN_USED_FRACTION,
+    PathEstimate,
+    estimate_paths,
+    follow_path,
+)
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -41,8 +47,8 @@ MAX_SAMPLE_ENTRIES = 40_000_000
 the common parameters. They bound the memory to 1.5 GB; a device of two stations may move for 120 s.
 """
 
-MAX_SAMPLE_DEVICES = 8
-"""Most devices from which stations are estimated."""
+MAX_SAMPLE_DEVICES, MIN_SAMPLE_WINDOWS = 8, 8
+"""Most devices from which stations are estimated, and fewest windows of each."""
 
 SAMPLE_WINDOW_S = 5.0
 VISIT_WINDOW_S = 1.0
@@ -56,6 +62,14 @@ MIN_END_S, MAX_END_S = 3.0, 60.0
 
 PART_S, PART_OVERLAP_S = 20.0, 1.0
 """Length of the parts of a path, and the overlap with each neighbour."""
+
+
+class MovedStationError(DegenerateError):
+    """The sweeps contradict every path since a station was moved: ``move`` states which."""
+
+    def __init__(self, message: str, move: str) -> None:
+        super().__init__(message)
+        self.move = move
 
 
 @dataclass(frozen=True)
@@ -168,7 +182,14 @@ class PathRecording:
 
     def warnings(self, sample: PathSample, channels: Sequence[int]) -> list[SolverWarning]:
         """Return the doubts about IMUs and stations. The channels are those of the stations."""
-        warnings = [_imu_warning(device) for device in sample.estimate.contradicting_imus]
+        warnings = [
+            _imu_warning(code, device)
+            for code, devices in (
+                ("imu_contradicts_light", sample.estimate.contradicting_imus),
+                ("imu_not_used", sample.estimate.uncovered_imus),
+            )
+            for device in devices
+        ]
         if np.mean(sample.estimate.is_used) < USUAL_USED_FRACTION:
             message = self.move_message(channels)
             if message is not None:
@@ -179,7 +200,10 @@ class PathRecording:
         """Return which station was moved during the recording, if one was."""
         ends = self._estimate_ends() if len(channels) > 1 else None
         moves = [] if ends is None else find_moves(*ends)
-        moved = [channels[i] for i in moved_stations(moves, len(channels))]
+        if ends is None or not moves:
+            return None
+        compared = int(np.count_nonzero(~(ends[0].is_left_out | ends[1].is_left_out)))
+        moved = [channels[i] for i in moved_stations(moves, compared)]
         if not moved:
             return None
         largest = max(moves, key=lambda move: move.distance_m)
@@ -223,14 +247,15 @@ class PathRecording:
 
         Raises
         ------
+        MovedStationError
+            The sweeps contradict every path since a station was moved.
         DegenerateError
-            It states if a station was moved.
         """
         try:
             return self.estimate_sample()
         except DegenerateError as error:
             message = self.move_message(channels)
-            raise error if message is None else DegenerateError(message) from None
+            raise error if message is None else MovedStationError(str(error), message) from None
 
     def _max_knots(self, devices: Sequence[int]) -> int:
         """Return the largest number of knots of devices that are estimated at once."""
@@ -241,8 +266,9 @@ class PathRecording:
 
     def _sample_rows(self, device: int, cells: IntArray, count: int) -> IntArray:
         """Return the sweeps of a device in about ``count`` knots, with those on markers."""
-        length = min(max(1, round(SAMPLE_WINDOW_S * 1e9) // self.knot_ns), count)
-        windows = np.array_split(cells, max(1, count // length))
+        usual = max(1, round(SAMPLE_WINDOW_S * 1e9) // self.knot_ns)
+        windows = np.array_split(cells, max(count // usual, min(count, MIN_SAMPLE_WINDOWS)))
+        length = min(usual, count // len(windows))
         chosen = [window[:length] for window in windows]
         for visit in self.visits:
             if visit.device == device:
@@ -299,8 +325,13 @@ class PathRecording:
         sweep = np.flatnonzero(
             (estimate.sweep >= first) & (estimate.sweep < first + len(self.sweeps[device]))
         )
+        rows = estimate.sweep[sweep] - first
+        is_testable = ~estimate.is_left_out[self.sweeps[device].station[rows]]
+        if np.mean(estimate.is_used[sweep][is_testable]) < MIN_USED_FRACTION:
+            none = np.zeros(0, np.int64)
+            return _Part(None, none, none, none, len(self.start[device]))
         knots = np.flatnonzero(estimate.device == device)
-        return _Part(estimate, knots, sweep, estimate.sweep[sweep] - first)
+        return _Part(estimate, knots, sweep, rows)
 
     def _parts(self, device: int, sample: PathSample) -> Iterator[_Part]:
         """Estimate the path of a device part by part."""
@@ -331,7 +362,12 @@ class PathRecording:
                 continue
             response = np.zeros((*made.response.shape[:2], len(covariance)))
             response[:, :, column] = made.response
-            estimate = replace(made, response=response, common_covariance=covariance)
+            estimate = replace(
+                made,
+                device=np.full(len(made.path), device),
+                response=response,
+                common_covariance=covariance,
+            )
             knots = np.flatnonzero(_within(estimate.time_ns, start_ns, end_ns))
             rows = rows[estimate.sweep]
             sweep = np.flatnonzero(_within(own.time_ns[rows], start_ns, end_ns))
@@ -426,12 +462,16 @@ class _Part:
     rough_poses: int = 0
 
 
-def _imu_warning(device: str) -> SolverWarning:
-    return SolverWarning(
-        "imu_contradicts_light",
-        f"{device}: its IMU measures another motion than the sweeps and was not used: its axes or "
-        "units differ from those of the device, or its time stamps are wrong",
-    )
+IMU_DOUBTS = {
+    "imu_contradicts_light": "its IMU measures another motion than the sweeps and was not used: "
+    "its axes or units differ from those of the device, or its time stamps are wrong",
+    "imu_not_used": f"its IMU was not used: less than {MIN_COMPARED_S:g} s of its path have "
+    "samples of a gyroscope",
+}
+
+
+def _imu_warning(code: str, device: str) -> SolverWarning:
+    return SolverWarning(code, f"{device}: {IMU_DOUBTS[code]}")
 
 
 def _within(time_ns: IntArray, start_ns: int, end_ns: int) -> Mask:

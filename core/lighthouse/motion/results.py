@@ -132,6 +132,7 @@ def refined_scene(
 ) -> Scene:
     """Return a scene with the estimated stations and their joint covariance.
 
+    Stations that are not estimated keep their pose; then there is no joint covariance.
     ``covariance`` (m, m) is that of the common parameters in the frame of the poses.
     """
     positions, rotations, calibrations = estimate.common.stations
@@ -141,7 +142,8 @@ def refined_scene(
     for station in scene.stations:
         i = order.get(station.channel)
         if i is None:
-            return scene
+            stations.append(station)
+            continue
         first = i * STATION_PARAMETERS
         pose = slice(first, first + 6)
         calibration = calibrations[i]
@@ -157,6 +159,8 @@ def refined_scene(
             )
         )
         rows.append(first + np.arange(JOINT_PARAMETERS))
+    if len(rows) < len(stations):
+        return replace(scene, stations=tuple(stations), covariance=None)
     index = np.concatenate(rows)
     joint = covariance[np.ix_(index, index)]
     return replace(scene, stations=tuple(stations), covariance=joint)

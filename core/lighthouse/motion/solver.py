@@ -129,8 +129,9 @@ class PathEstimate:
     is_left_out : (s,) bool ndarray
         Stations that contradict the others.
     inertial : InertialFactors, optional
-    contradicting_imus : tuple of str
-        Devices whose IMU contradicts the light and was left out.
+    contradicting_imus, uncovered_imus : tuple of str
+        Devices whose IMU contradicts the light and was left out, and those whose IMU has too few
+        samples of a gyroscope.
     """
 
     path: Path
@@ -148,6 +149,7 @@ class PathEstimate:
     is_left_out: Mask
     inertial: InertialFactors | None = None
     contradicting_imus: tuple[str, ...] = ()
+    uncovered_imus: tuple[str, ...] = ()
 
 
 def estimate_paths(
@@ -284,6 +286,7 @@ class PathProblem:
         self.is_left_out = np.zeros(len(common.positions), bool)
         self.inertial: InertialFactors | None = None
         self.contradicting_imus: tuple[str, ...] = ()
+        self.uncovered_imus: tuple[str, ...] = ()
 
     @property
     def is_testable(self) -> Mask:
@@ -315,41 +318,43 @@ class PathProblem:
         """Remove the pull of the prior towards a smaller scene from the gradients.
 
         The power of the motion is proportional to the square of the size of the scene, the rms
-        distance of the paths from the centre of the stations. With the derivative of its
-        normalization, the prior does not depend on the size.
+        distance of the paths from the stations. With the derivative of its normalization, the prior
+        does not depend on the size.
         """
         error = self.path.prior_errors()[:, :, :3]
-        unit = prior_information(np.diff(self.path.time_s))[:, 2:, 2:]
+        unit = prior_information(self.path.span_s)[:, 2:, 2:]
         energy = np.einsum("kia,kij,kja->k", error, unit, error) * self.path.is_linked
         pull = float(np.sum(energy / self.power[:, 0]))
-        stations = self.common.stations[0]
-        offset = self.path.position - stations.mean(axis=0)
-        by_position = pull * offset / float(np.sum(offset**2))
-        equations.gradient[:, :3] -= by_position
+        positions, stations = self.path.position, self.common.stations[0]
+        to_path, to_station = positions - stations.mean(axis=0), stations - positions.mean(axis=0)
+        squares = np.mean(np.sum(to_path**2, axis=1)) + np.sum(np.var(stations, axis=0))
+        equations.gradient[:, :3] -= pull * to_path / (len(positions) * squares)
         of_stations = equations.common_gradient[: len(stations) * STATION_PARAMETERS]
-        of_stations.reshape(-1, STATION_PARAMETERS)[:, :3] += by_position.sum(axis=0) / len(
-            stations
+        of_stations.reshape(-1, STATION_PARAMETERS)[:, :3] -= (
+            pull * to_station / (len(stations) * squares)
         )
 
     def move(self, equations: NormalEquations, *, with_common: bool) -> float:
         """Take a step; return its largest change of a position, relative to the scene.
 
-        The step is shortened if the residuals grow by more than their noise explains.
+        The step is shortened, or not taken, if the residuals grow by more than their noise
+        explains.
         """
         shared = np.zeros(len(self.common.value))
         if with_common:
             change, shared = equations.step()
         else:
             change = equations.states_step()
-        path, common = self.path, self.common
+        path, common, residuals = self.path, self.common, self.residuals
         limit = max(MAX_GROWTH * self._usual_residual(), 5 * self.sigma)
         for length in STEP_LENGTHS:
             self.path = path.stepped(length * change)
             self.common = common.stepped(length * shared)
             self.residuals = linearize(self.sweeps, self.path, self.common)
             if self._usual_residual() <= limit:
-                break
-        return length * float(np.max(np.abs(change[:, :3]))) / self.size_m
+                return length * float(np.max(np.abs(change[:, :3]))) / self.size_m
+        self.path, self.common, self.residuals = path, common, residuals
+        return 0.0
 
     def _usual_residual(self) -> float:
         """Return the median residual of the accepted sweeps; infinite if most have none."""
@@ -360,7 +365,9 @@ class PathProblem:
         """Take a step with the accepted sweeps; return the equations and the largest change."""
         with_common = with_common and not self.is_held
         equations = self.equations(self.weight, with_common=with_common)
-        return equations, self.move(equations, with_common=with_common)
+        change = self.move(equations, with_common=with_common)
+        self.is_used &= np.isfinite(self.residuals.residual)
+        return equations, change
 
     def fit_robustly(self) -> None:
         """Fit the paths with a Cauchy loss that narrows from the gate to the noise.
@@ -416,9 +423,6 @@ class PathProblem:
             with_common = number % 2 == 1
             equations, _ = self.iterate(with_common=with_common)
             consistency = self.update_noise(equations)
-            if self.inertial is not None:
-                self.inertial.update_density(self.path, self.common, equations.states)
-                self.inertial.loosen_position_prior(self.power)
             leaving, returning = find_contradictions(self.sweeps, consistency, self.is_used)
             returning &= (return_count < 2) & self.is_testable
             return_count += returning
@@ -471,7 +475,7 @@ class PathProblem:
             start_ns,
             with_force=len(self.common.positions) == 1,
         )
-        self.inertial, self.common, self.contradicting_imus = made
+        self.inertial, self.common, self.contradicting_imus, self.uncovered_imus = made
         if self.inertial is not None:
             self.inertial.loosen_position_prior(self.power)
             self.reject_contradictions()
@@ -489,15 +493,18 @@ class PathProblem:
         ------
         DegenerateError
         """
-        fraction = float(np.mean(self.is_used))
+        fraction = float(np.mean(self.is_used[self.is_testable]))
         if fraction < MIN_USED_FRACTION:
             raise DegenerateError(f"{1 - fraction:.0%} of the sweeps contradict every path")
 
     def update_noise(self, equations: NormalEquations) -> Consistency:
-        """Estimate the noise of an angle and the power of the motion; return the residuals."""
+        """Estimate the noise of the sensors and the power of the motion; return the residuals."""
         consistency = self.check(equations)
         self.update_power(equations)
         self.update_sigma(consistency)
+        if self.inertial is not None:
+            self.inertial.update_density(self.path, self.common, equations.states)
+            self.inertial.loosen_position_prior(self.power)
         return consistency
 
     def check(self, equations: NormalEquations) -> Consistency:
@@ -525,7 +532,7 @@ class PathProblem:
             return
         diagonal, above = equations.states.inverse_blocks
         error = self.path.prior_errors()
-        span_s = np.diff(self.path.time_s)
+        span_s = self.path.span_s
         unit = prior_information(span_s)
         k, n = len(self.path), self.path.pose_size
         own = diagonal.reshape(k, 2, n, 2, n)
@@ -577,4 +584,5 @@ class PathProblem:
             self.is_left_out,
             self.inertial,
             self.contradicting_imus,
+            self.uncovered_imus,
         )

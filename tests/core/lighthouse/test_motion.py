@@ -42,6 +42,7 @@ from locatk.core.lighthouse.motion.parameters import (
     CommonParameters,
     gauge_directions,
     make_parameters,
+    scene_size,
 )
 from locatk.core.lighthouse.motion.path import Path, prior_information
 from locatk.core.lighthouse.motion.results import pose_covariances
@@ -353,6 +354,19 @@ def test_a_pause_separates_the_states() -> None:
     assert np.abs(above[0]).max() > 1e-9
 
 
+def test_a_device_may_start_when_another_one_ends() -> None:
+    problem = Problem(is_rigid=True, is_estimated=False)
+    is_linked = np.array([True, False, True, True])
+    problem.weight[problem.sweeps.knot == 1] = 0.0
+    changes = []
+    for shift_s in (0.0, problem.path.time_s[2] - problem.path.time_s[1]):
+        time_s = problem.path.time_s - shift_s * (np.arange(5) > 1)
+        problem.path = replace(problem.path, is_linked=is_linked, time_s=time_s)
+        changes.append(problem.equations().step()[0])
+    np.testing.assert_allclose(changes[0][:2], changes[1][:2], rtol=1e-6)
+    assert np.isfinite(changes[1]).all()
+
+
 @pytest.mark.parametrize("kind", ["bias", "lever"])
 def test_columns_of_biases_and_photodiodes(kind: str) -> None:
     problem = Problem(is_rigid=True, is_estimated=False)
@@ -604,6 +618,17 @@ def test_a_flip_after_a_pause_is_kept() -> None:
     assert len(without_flips(replace(trajectory, time_ns=time_ns))) == 25
 
 
+def test_a_device_may_turn_while_it_is_hidden() -> None:
+    trajectory = spinning("." * 20 + "f" * 5)
+    turned = Rotation.from_rotvec([1.2, 0.0, 0.0])
+    quaternion = trajectory.quaternion.copy()
+    quaternion[20:] = (Rotation.from_quat(quaternion[:5]) * turned).as_quat()
+    time_ns = trajectory.time_ns.copy()
+    assert len(without_flips(replace(trajectory, quaternion=quaternion))) == 20
+    time_ns[20:] += 400_000_000
+    assert len(without_flips(replace(trajectory, quaternion=quaternion, time_ns=time_ns))) == 25
+
+
 # ---- outliers
 
 
@@ -729,6 +754,14 @@ def test_a_station_that_contradicts_the_others_is_left_out() -> None:
     estimation = PathProblem(lost, problem.common, problem.path)
     estimation.leave_out_stations()
     assert not estimation.is_left_out.any()
+
+
+def test_the_power_of_a_motion_does_not_depend_on_its_place() -> None:
+    """A device in the middle of four stations is as far from them as one below."""
+    corners = np.array([[2.0, 2.0, 2.0], [-2.0, 2.0, 2.0], [-2.0, -2.0, 2.0], [2.0, -2.0, 2.0]])
+    near = np.random.default_rng(0).normal(0.0, 0.05, (50, 3))
+    assert scene_size(corners, near + [0.0, 0.0, 2.0]) == pytest.approx(2.83, abs=0.05)
+    assert scene_size(corners, near) == pytest.approx(3.46, abs=0.05)
 
 
 def test_windows_do_not_cross_from_one_path_to_another() -> None:
