@@ -69,6 +69,9 @@ INITIAL_SIGMA_RAD = 2e-3
 given scene or the dimensions of a device may be off by. With that of exact geometry, rates would
 explain errors of the geometry, and spoil the prediction of the neighbouring epochs."""
 
+WEAK_INFORMATION = 1e-3
+"""Information of each unknown of a pose that no sweep determines: a standard deviation of 30 m."""
+
 LOSS_SCALE_RAD = 3e-3
 """Scale of the Cauchy loss in radians while the noise is unknown; the residuals of reflections are
 far larger."""
@@ -770,7 +773,9 @@ def pose_covariance(
     is_generic = any(c.is_generic for c in problem.stations[2])
     variance = sigma**2 + (ROTATIONS_PER_WINDOW - 1.0) * lasting_sigma**2
     variance += ROTATIONS_PER_WINDOW * CALIBRATION_SIGMA_RAD**2 if is_generic else 0.0
-    covariance = np.linalg.inv(fit.information)[:, :6, :6] * variance / fit_sigma**2
+    # What no sweep determines has a large covariance, not an infinite one.
+    information = fit.information + WEAK_INFORMATION * np.eye(fit.information.shape[1])
+    covariance = np.linalg.inv(information)[:, :6, :6] * variance / fit_sigma**2
     unmodelled = unmodelled_motion(
         problem.windows.time_ns[epochs], fit.poses.rate, problem.half_width_ns
     )

@@ -36,11 +36,14 @@ MAX_START_GAP_S = 0.25
 MAX_JUMP_RAD = 0.6
 """Largest turn between neighbouring rough poses: 30 rad/s at 50 poses a second."""
 
-MAX_TURN_RATE_RAD_S = 3.0
+MAX_TURN_RATE_RAD_S = 1.0
 """Largest rate of turn during a gap between rough poses, in addition."""
 
-MAX_FLIP_S = 3.0
-"""Longest time with a wrong orientation that is interpolated."""
+MAX_FLIP_S = 1.5
+"""Half the longest time with a wrong orientation that is interpolated."""
+
+MAX_CHAIN_PARTS = 200
+"""Most parts between two parts of which one follows from the other."""
 
 
 @dataclass(frozen=True)
@@ -137,28 +140,33 @@ def _fill_gaps(edge: IntArray, max_count: int) -> IntArray:
 def without_flips(trajectory: Trajectory) -> Trajectory:
     """Return a trajectory without short parts in which a device has a wrong orientation.
 
-    A coplanar device has two poses that explain its angles almost equally. From the longest part
-    without a jump of the orientation, in both directions, short parts are left out whose
-    orientation does not continue that of the last part.
+    A coplanar device has two poses that explain its angles almost equally. Of the parts between
+    jumps of the orientation, those are kept that follow from each other and have the most poses; a
+    jump that remains costs as many poses as :data:`MAX_FLIP_S` has.
     """
     if len(trajectory) < 2:
         return trajectory
-    quaternion, time_ns = trajectory.quaternion, trajectory.time_ns
+    quaternion, time_s = trajectory.quaternion, 1e-9 * (trajectory.time_ns - trajectory.time_ns[0])
     edge = np.flatnonzero(_turn(quaternion[:-1], quaternion[1:]) > MAX_JUMP_RAD) + 1
     start, stop = np.r_[0, edge], np.r_[edge, len(trajectory)]
-    longest = int(np.argmax(stop - start))
-    kept = np.ones(len(trajectory), bool)
-    forward, backward = range(longest + 1, len(start)), range(longest - 1, -1, -1)
-    for parts, near, far in ((forward, start, stop - 1), (backward, stop - 1, start)):
-        last = int(far[longest])
-        for part in parts:
-            is_long = time_ns[stop[part] - 1] - time_ns[start[part]] > MAX_FLIP_S * 1e9
-            gap_s = 1e-9 * abs(time_ns[near[part]] - time_ns[last])
-            turn = _turn(quaternion[last], quaternion[near[part]])
-            if is_long or turn < MAX_JUMP_RAD + MAX_TURN_RATE_RAD_S * gap_s:
-                last = int(far[part])
-            else:
-                kept[start[part] : stop[part]] = False
+    jump_cost = MAX_FLIP_S / float(np.median(np.diff(time_s)))
+    # The largest number of poses in a chain that ends with each part, and the part before it.
+    poses, previous = (stop - start).astype(float), np.full(len(start), -1)
+    for part in range(1, len(start)):
+        before = np.arange(max(0, part - MAX_CHAIN_PARTS), part)
+        end, begin = stop[before] - 1, start[part]
+        turn = _turn(quaternion[end], quaternion[begin][None])
+        limit = MAX_JUMP_RAD + MAX_TURN_RATE_RAD_S * (time_s[begin] - time_s[end])
+        chain = poses[before] - np.where(turn < limit, 0.0, jump_cost)
+        best = int(np.argmax(chain))
+        if chain[best] > 0.0:
+            poses[part] += chain[best]
+            previous[part] = before[best]
+    kept = np.zeros(len(trajectory), bool)
+    part = int(np.argmax(poses))
+    while part >= 0:
+        kept[start[part] : stop[part]] = True
+        part = int(previous[part])
     return trajectory.select(kept)
 
 

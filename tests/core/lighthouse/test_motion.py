@@ -620,7 +620,7 @@ def test_a_flip_after_a_pause_is_kept() -> None:
 
 def test_a_device_may_turn_while_it_is_hidden() -> None:
     trajectory = spinning("." * 20 + "f" * 5)
-    turned = Rotation.from_rotvec([1.2, 0.0, 0.0])
+    turned = Rotation.from_rotvec([0.9, 0.0, 0.0])
     quaternion = trajectory.quaternion.copy()
     quaternion[20:] = (Rotation.from_quat(quaternion[:5]) * turned).as_quat()
     time_ns = trajectory.time_ns.copy()
