@@ -136,11 +136,14 @@ def find_contested(sweeps: PathSweeps, is_used: Mask) -> Mask:
 
 
 def agrees_with_most(sweeps: PathSweeps, agrees: Mask) -> Mask:
-    """Return the sweeps (n,) whose station agrees with the path in most sweeps around them."""
+    """Return the sweeps (n,) whose station agrees with the path in most sweeps around them.
+
+    Of a reflection, a few sweeps agree with any path by chance, and would hold it there.
+    """
     result = np.zeros(len(sweeps), bool)
     for station in np.unique(sweeps.station):
         rows = np.flatnonzero(sweeps.station == station)
-        share = _used_share(sweeps.knot[rows], agrees[rows], NEIGHBOUR_KNOTS)
+        share = _used_share(sweeps.knot[rows], agrees[rows], 2 * NEIGHBOUR_KNOTS + 1)
         result[rows] = share[sweeps.knot[rows]] >= 0.5
     return result
 

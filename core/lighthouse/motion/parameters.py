@@ -63,9 +63,10 @@ FACTORY_SIGMA[[OGEEMAG, OGEEPHASE]] = 0.12
 (bitcraze/positioning_dataset), tilts are up to 1 mrad and phases up to 2.5 mrad beside them, and
 the sign of the ogee terms cannot be told: its deviation is half a usual magnitude."""
 
-PHOTODIODE_SIGMA_M = 3e-4
+PHOTODIODE_SIGMA_M = 4.5e-4
 """Standard deviation of each coordinate of a photodiode: the place where light meets it, and the
-tolerance of the board. It is 1 % of the length of a Lighthouse deck, and 2 % of its width."""
+tolerance of the board. It is 1.5 % of the length of a Lighthouse deck, and 3 % of its width; those
+of a scene without other dimensions come from the deck."""
 
 BIAS_SIGMA_RAD = 1.5e-4
 """Standard deviation of the bias of an angle that is particular to a photodiode and a plane: cover

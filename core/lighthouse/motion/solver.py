@@ -425,6 +425,9 @@ class PathProblem:
             consistency = self.update_noise(equations)
             leaving, returning = find_contradictions(self.sweeps, consistency, self.is_used)
             returning &= (return_count < 2) & self.is_testable
+            agrees = agrees_with_most(self.sweeps, (self.is_used & ~leaving) | returning)
+            leaving |= self.is_used & ~agrees
+            returning &= agrees
             return_count += returning
             self.is_used = (self.is_used & ~leaving) | returning
             if number >= MIN_ROUNDS and with_common and not np.any(leaving | returning):

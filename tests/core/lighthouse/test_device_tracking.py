@@ -292,7 +292,10 @@ def test_the_noise_that_repeats_from_rotation_to_rotation_is_separated() -> None
 def covariance_of(
     calibration: Calibration, lasting_sigma: float, acceleration: float = 0.0
 ) -> Array:
-    """Return the covariance of three epochs with unit information."""
+    """Return the covariance of three epochs with an information of 1e8, times 1e8.
+
+    That of the turn about the first axis is zero in the last epoch.
+    """
     problem = problem_at_rest(
         (np.zeros((1, 3)), np.eye(3)[None], (calibration,)), [2.0, 0, 0], np.eye(3), rotations=3
     )
@@ -300,9 +303,10 @@ def covariance_of(
     rate = np.zeros((m, 6))
     rate[:, 0] = acceleration * problem.windows.time_ns * 1e-9
     poses = DeviceStates(np.zeros((m, 3)), np.tile(np.eye(3), (m, 1, 1)), rate)
-    information = np.tile(np.eye(12), (m, 1, 1))
+    information = np.tile(1e8 * np.eye(12), (m, 1, 1))
+    information[-1, 9, 9] = information[-1, 3, 3] = 0.0
     fit = PoseFit(poses, np.zeros((m, 1)), information, np.zeros(m))
-    return pose_covariance(problem, np.arange(m), fit, 2e-4, 3e-4, lasting_sigma)
+    return 1e8 * pose_covariance(problem, np.arange(m), fit, 2e-4, 3e-4, lasting_sigma)
 
 
 def test_the_covariance_contains_lasting_noise_calibration_and_unmodelled_motion() -> None:
@@ -317,8 +321,12 @@ def test_the_covariance_contains_lasting_noise_calibration_and_unmodelled_motion
     assert with_calibration == pytest.approx(np.eye(6) * 2 * CALIBRATION_SIGMA_RAD**2 / 2e-4**2)
     accelerated = covariance_of(factory, 0.0, acceleration=5.0)
     displacement = 0.5 * 5.0 * (PERIOD_NS * 1e-9) ** 2 / 3
-    assert accelerated[1, 0, 0] - variance[0, 0] == pytest.approx(displacement**2, rel=1e-6)
+    assert accelerated[1, 0, 0] - variance[0, 0] == pytest.approx(1e8 * displacement**2, rel=1e-6)
     assert accelerated[1, 1, 1] == pytest.approx(variance[1, 1])
+    # A turn that no sweep determines is not known, and the rest of the pose is.
+    undetermined = covariance_of(factory, 0.0)[-1] / 1e8
+    assert undetermined[3, 3] > 10.0
+    assert undetermined[0, 0] == pytest.approx(variance[0, 0] / 1e8)
 
 
 @pytest.mark.parametrize(("scale", "is_determined"), [(1.0, True), (0.1, False)])
