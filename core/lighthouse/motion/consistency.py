@@ -37,10 +37,11 @@ MIN_REDUNDANCY = 0.02
 coordinate has none, and cannot be tested."""
 
 
-CONTESTED_KNOTS = 20
-MAX_REJECTED_FRACTION = 0.35
-"""Width of the stretches around a contradiction in knots, and the largest fraction of their sweeps
-that may be rejected: wrong sweeps come singly, reflections in runs."""
+CONTESTED_KNOTS = (20, 6)
+MAX_REJECTED_FRACTION = (0.35, 0.4)
+"""Widths of the stretches around a contradiction in knots, and the largest fractions of their
+sweeps that may be rejected. Reflections come in runs; wrong sweeps come singly, but a few at a time
+may agree with each other and not with the right ones."""
 
 MODEL_SIGMA_RAD = 1e-4
 """Standard deviation of what the common parameters may still explain of an angle: a sweep within a
@@ -129,10 +130,12 @@ def find_contradictions(
 
 def find_contested(sweeps: PathSweeps, is_used: Mask) -> Mask:
     """Return the sweeps (n,) in stretches of which many sweeps are rejected."""
-    share = _used_share(sweeps.knot, is_used, CONTESTED_KNOTS)
-    is_contested = share < 1.0 - MAX_REJECTED_FRACTION
-    wide = maximum_filter1d(is_contested.astype(np.int8), CONTESTED_KNOTS) > 0
-    return np.asarray(wide[sweeps.knot])
+    result = np.zeros(len(sweeps), bool)
+    for width, fraction in zip(CONTESTED_KNOTS, MAX_REJECTED_FRACTION, strict=True):
+        is_contested = _used_share(sweeps.knot, is_used, width) < 1.0 - fraction
+        wide = maximum_filter1d(is_contested.astype(np.int8), width) > 0
+        result |= wide[sweeps.knot]
+    return result
 
 
 def agrees_with_most(sweeps: PathSweeps, agrees: Mask) -> Mask:
