@@ -2785,6 +2785,15 @@ static PyMethodDef methods[] = {
      " residual, redundancy, /)\n--\n\n"
      "Intersect the light planes of epochs; twin of"
      " locatk.core.lighthouse.localization.positions.intersect_planes_numpy."},
+    {"solve_band", solve_band, METH_VARARGS,
+     "solve_band($module, factor, n, band, m, is_half, solution, /)\n--\n\n"
+     "Solve banded systems in place by their Cholesky factor; twin of LAPACK's dpbtrs and dtbtrs in"
+     " locatk.core.block_tridiagonal."},
+    {"couple_sweeps", couple_sweeps, METH_VARARGS,
+     "couple_sweeps($module, knot, jacobian, column, value, n, k, d, width, m, coupling,"
+     " information, /)\n--\n\n"
+     "Sum the products of the derivatives of sweeps; twin of"
+     " locatk.core.lighthouse.motion.equations.couple_numpy."},
     {NULL, NULL, 0, NULL},
 };
 

@@ -106,6 +106,9 @@ PyObject *bar_fields(PyObject *self, PyObject *args);
 PyObject *scan_landmarks(PyObject *self, PyObject *args);
 /* core/_maps.c */
 PyObject *search_map(PyObject *self, PyObject *args);
+/* core/_paths.c */
+PyObject *solve_band(PyObject *self, PyObject *args);
+PyObject *couple_sweeps(PyObject *self, PyObject *args);
 /* core/_light.c */
 PyObject *window_edges(PyObject *self, PyObject *args);
 PyObject *light_bits(PyObject *self, PyObject *args);

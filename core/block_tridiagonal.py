@@ -1,6 +1,6 @@
 """Symmetric positive definite block-tridiagonal systems: the normal equations of a chain of states.
 
-Solutions take the banded Cholesky factorization of LAPACK. The blocks of the inverse on and beside
+The Cholesky factorization is the banded one of LAPACK. The blocks of the inverse on and beside
 the diagonal, which are the covariances of the states, follow from the factor in one backward pass
 (Takahashi, Fagan and Chen 1973; for chains the smoother of Rauch, Tung and Striebel 1965).
 """
@@ -12,8 +12,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 
 from locatk.core.errors import DegenerateError
+from locatk.core.kernels import kernels
 
 Array = NDArray[np.float64]
 
@@ -51,13 +53,30 @@ class BlockTridiagonal:
 
     def solve(self, right: Array) -> Array:
         """Return the solution for a right-hand side (k, d) or (k, d, m), of the same shape."""
+        if kernels is not None:
+            return self._solve_compiled(right, is_half=False)
         flat = right.reshape(self.count * self.size, -1)
         solution = cho_solve_banded((self._factor, True), flat, check_finite=False)
         return np.asarray(solution.reshape(right.shape))
 
-    def log_determinant(self) -> float:
-        """Return the logarithm of the determinant of the matrix."""
-        return float(2.0 * np.sum(np.log(self._factor[0])))
+    def half_solve(self, right: Array) -> Array:
+        """Return L^-1 right for a right-hand side (k, d) or (k, d, m), of the same shape.
+
+        The matrix is L L^T: for two right-hand sides, the scalar product of these is that of one
+        with the solution for the other.
+        """
+        if kernels is not None:
+            return self._solve_compiled(right, is_half=True)
+        flat = right.reshape(self.count * self.size, -1)
+        return np.asarray(dtbtrs(self._factor, flat, uplo="L")[0].reshape(right.shape))
+
+    def _solve_compiled(self, right: Array, *, is_half: bool) -> Array:
+        assert kernels is not None
+        solution = np.array(right, np.float64, order="C")
+        factor = np.ascontiguousarray(self._factor.T)
+        columns = solution.size // len(factor)
+        kernels.solve_band(factor, len(factor), factor.shape[1], columns, is_half, solution)
+        return solution
 
     @cached_property
     def inverse_blocks(self) -> tuple[Array, Array]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from locatk.core import block_tridiagonal
 from locatk.core.block_tridiagonal import BlockTridiagonal
 from locatk.core.errors import DegenerateError
 
@@ -29,22 +32,28 @@ def random_blocks(count: int, size: int, seed: int) -> tuple[Array, Array, Array
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(1, 7), st.integers(1, 5), st.integers(0, 1000))
+@given(st.integers(1, 7), st.integers(1, 5), st.integers(0, 1000), st.sampled_from([1, 3, 32, 70]))
 def test_solutions_and_inverse_are_those_of_the_dense_matrix(
-    count: int, size: int, seed: int
+    count: int, size: int, seed: int, columns: int
 ) -> None:
     diagonal, above, dense = random_blocks(count, size, seed)
     system = BlockTridiagonal(diagonal, above)
     rng = np.random.default_rng(seed)
-    one, several = rng.normal(size=(count, size)), rng.normal(size=(count, size, 3))
+    one, several = rng.normal(size=(count, size)), rng.normal(size=(count, size, columns))
     solution = system.solve(one)
     assert solution.shape == one.shape
     np.testing.assert_allclose(dense @ solution.ravel(), one.ravel(), atol=1e-8)
     solution = system.solve(several)
     assert solution.shape == several.shape
-    flat = (count * size, 3)
+    flat = (count * size, columns)
     np.testing.assert_allclose(dense @ solution.reshape(flat), several.reshape(flat), atol=1e-8)
-    assert system.log_determinant() == pytest.approx(np.linalg.slogdet(dense)[1], abs=1e-9)
+    half = system.half_solve(several)
+    assert half.shape == several.shape
+    with patch.object(block_tridiagonal, "kernels", None):
+        np.testing.assert_allclose(half, system.half_solve(several), atol=1e-9)
+        np.testing.assert_allclose(solution, system.solve(several), atol=1e-9)
+    half, flat_right = half.reshape(flat), several.reshape(flat)
+    np.testing.assert_allclose(half.T @ half, flat_right.T @ solution.reshape(flat), atol=1e-8)
     inverse = np.linalg.inv(dense).reshape(count, size, count, size).swapaxes(1, 2)
     index = np.arange(count)
     own, beside = system.inverse_blocks

@@ -384,6 +384,37 @@ def light_positions() -> Arguments:
     }
 
 
+def solve_band() -> Arguments:
+    n, band, m = 12, 4, 35
+    factor = 0.1 * doubles(n, band)
+    factor[:, 0] = 1.0
+    return {
+        "factor": factor,
+        "n": n,
+        "band": band,
+        "m": m,
+        "is_half": False,
+        "solution": doubles(n, m),
+    }
+
+
+def couple_sweeps() -> Arguments:
+    n, k, d, width, m = 9, 4, 3, 2, 5
+    return {
+        "knot": random().integers(0, k - 1, n),
+        "jacobian": doubles(n, 2 * d),
+        "column": random().integers(0, m, (n, width)),
+        "value": doubles(n, width),
+        "n": n,
+        "k": k,
+        "d": d,
+        "width": width,
+        "m": m,
+        "coupling": np.zeros((k, d, m)),
+        "information": np.zeros((m, m)),
+    }
+
+
 CASES: dict[str, Callable[[], Arguments]] = {
     case.__name__: case
     for case in (
@@ -403,6 +434,8 @@ CASES: dict[str, Callable[[], Arguments]] = {
         light_expected,
         light_epochs,
         light_positions,
+        solve_band,
+        couple_sweeps,
     )
 }
 """A valid call of each kernel, by the names of its arguments."""
@@ -424,6 +457,8 @@ OUTPUTS = {
     "light_expected": ("rows",),
     "light_epochs": ("epoch",),
     "light_positions": ("position", "information", "residual", "redundancy"),
+    "solve_band": ("solution",),
+    "couple_sweeps": ("coupling", "information"),
 }
 
 ANY_SIZE = {("fit_lattices", "ring_radii"), ("light_bits", "value")}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from locatk.core.block_tridiagonal import BlockTridiagonal
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse.motion.inertial import InertialFactors
 from locatk.core.lighthouse.motion.parameters import CommonParameters
 from locatk.core.lighthouse.motion.path import Path, lever_jacobian, prior_information
@@ -127,14 +128,10 @@ class NormalEquations:
 
     def step(self) -> tuple[Array, Array]:
         """Return the change of the states (k, d) and of the common parameters (m,)."""
-        right = np.concatenate([self.coupling, self.gradient[:, :, None]], axis=2)
-        solved = self.states.solve(right)
-        response, own = solved[:, :, :-1], solved[:, :, -1]
-        covariance = self._common_covariance(response)
-        flat = self.coupling.reshape(-1, self.coupling.shape[2])
-        reduced = self.common_gradient - flat.T @ own.ravel()
-        change = -covariance @ reduced
-        return -(own + response @ change), change
+        half = self._half_solved_coupling()
+        own = self.states.half_solve(self.gradient).ravel()
+        change = -self._common_covariance(half) @ (self.common_gradient - half.T @ own)
+        return -self.states.solve(self.gradient + self.coupling @ change), change
 
     def states_step(self) -> Array:
         """Return the change of the states (k, d) while the common parameters are held."""
@@ -145,13 +142,14 @@ class NormalEquations:
 
         The response (k, d, m) is the change of the states per change of the common parameters.
         """
-        response = self.states.solve(self.coupling)
-        covariance = self._common_covariance(response)
-        return covariance, -response
+        covariance = self._common_covariance(self._half_solved_coupling())
+        return covariance, -self.states.solve(self.coupling)
 
-    def _common_covariance(self, response: Array) -> Array:
-        flat = self.coupling.reshape(-1, self.coupling.shape[2])
-        reduced = self.common - flat.T @ response.reshape(flat.shape)
+    def _half_solved_coupling(self) -> Array:
+        return self.states.half_solve(self.coupling).reshape(-1, self.coupling.shape[2])
+
+    def _common_covariance(self, half: Array) -> Array:
+        reduced = self.common - half.T @ half
         basis = _complement(self.gauge)
         inner = basis.T @ reduced @ basis
         # Scaled to unit diagonal: metres, radians and curvatures differ by many orders.
@@ -230,20 +228,68 @@ def assemble(
         return NormalEquations(
             states, gradient, np.zeros((k, d, 0)), np.zeros((0, 0)), empty, np.zeros((0, 0))
         )
-    rows = np.arange(len(sweeps) + 1)
-    width = residuals.column.shape[1]
     by_common = np.where(is_used[:, None], residuals.by_common, 0.0) * root[:, None]
-    shared = csr_array(
-        (by_common.ravel(), residuals.column.ravel(), rows * width), (len(sweeps), count)
-    )
-    columns = (sweeps.knot * d)[:, None] + np.arange(2 * d)
-    own = csr_array((jacobian.ravel(), columns.ravel(), rows * 2 * d), (len(sweeps), k * d))
-    coupling = np.asarray((own.T @ shared).toarray()).reshape(k, d, count)
-    information = (shared.T @ shared).toarray() + common.information
-    common_gradient = shared.T @ residual + common.information @ common.value
+    coupling, information = couple(sweeps.knot, jacobian, residuals.column, by_common, k, count)
+    information += common.information
+    push = (by_common * residual[:, None]).ravel()
+    common_gradient = np.bincount(residuals.column.ravel(), push, count)
+    common_gradient += common.information @ common.value
     if inertial is not None:
         inertial.add_to_common(path, common, coupling, information, common_gradient)
     return NormalEquations(states, gradient, coupling, information, common_gradient, common.gauge)
+
+
+def couple(
+    knot: IntArray, jacobian: Array, column: IntArray, value: Array, knots: int, count: int
+) -> tuple[Array, Array]:
+    """Sum the products of the derivatives of sweeps.
+
+    Parameters
+    ----------
+    knot : (n,) int ndarray
+        Knot before each sweep.
+    jacobian : (n, 2 d) ndarray
+        Derivatives by the states at the knot and at the next one.
+    column : (n, w) int ndarray
+    value : (n, w) ndarray
+        Common parameters on which each sweep depends, and its derivatives by them.
+    knots, count : int
+        Number of knots and of common parameters.
+
+    Returns
+    -------
+    coupling : (k, d, m) ndarray
+        Of states and common parameters.
+    information : (m, m) ndarray
+        Of the common parameters.
+    """
+    n, width = value.shape
+    d = jacobian.shape[1] // 2
+    if kernels is None:
+        return couple_numpy(knot, jacobian, column, value, knots, count)
+    coupling, information = np.empty((knots, d, count)), np.empty((count, count))
+    arrays = (
+        np.ascontiguousarray(knot, np.int64),
+        np.ascontiguousarray(jacobian),
+        np.ascontiguousarray(column, np.int64),
+        np.ascontiguousarray(value),
+    )
+    kernels.couple_sweeps(*arrays, n, knots, d, width, count, coupling, information)
+    return coupling, information
+
+
+def couple_numpy(
+    knot: IntArray, jacobian: Array, column: IntArray, value: Array, knots: int, count: int
+) -> tuple[Array, Array]:
+    """Twin of the kernel of :func:`couple`."""
+    n, width = value.shape
+    d = jacobian.shape[1] // 2
+    rows = np.arange(n + 1)
+    shared = csr_array((value.ravel(), column.ravel(), rows * width), (n, count))
+    states = (knot * d)[:, None] + np.arange(2 * d)
+    own = csr_array((jacobian.ravel(), states.ravel(), rows * 2 * d), (n, knots * d))
+    coupling = np.asarray((own.T @ shared).toarray()).reshape(knots, d, count)
+    return coupling, np.asarray((shared.T @ shared).toarray())
 
 
 def prior_equations(path: Path, power: Array) -> tuple[Array, Array, Array]:

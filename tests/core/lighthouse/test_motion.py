@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from locatk.core.kernels import kernels
 from locatk.core.lighthouse import solve
 from locatk.core.lighthouse.calibration import (
     FACTORY_LINEAR_PARAMETERS,
@@ -30,6 +31,8 @@ from locatk.core.lighthouse.motion.equations import (
     NormalEquations,
     PathSweeps,
     assemble,
+    couple,
+    couple_numpy,
     linearize,
 )
 from locatk.core.lighthouse.motion.frames import PathFrame
@@ -352,6 +355,17 @@ def test_a_pause_separates_the_states() -> None:
     _, above = problem.equations().states.inverse_blocks
     np.testing.assert_allclose(above[1], 0.0, atol=1e-15)
     assert np.abs(above[0]).max() > 1e-9
+
+
+@pytest.mark.skipif(kernels is None, reason="the compiled kernels were not built")
+def test_the_compiled_products_are_those_of_sparse_matrices(problem: Problem) -> None:
+    residuals = linearize(problem.sweeps, problem.path, problem.common)
+    k, count = len(problem.path), len(problem.common.value)
+    jacobian = np.random.default_rng(0).normal(size=(len(problem.sweeps), 24))
+    arguments = (problem.sweeps.knot, jacobian, residuals.column, residuals.by_common, k, count)
+    for found, expected in zip(couple(*arguments), couple_numpy(*arguments), strict=True):
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
 def test_a_device_may_start_when_another_one_ends() -> None:
