@@ -271,16 +271,13 @@ def _assign_planes(
     return np.where(reported_plane == UNKNOWN, plane, reported_plane)
 
 
-def _is_aliased(times_s: Array, is_above: Mask) -> Mask:
+def _is_aliased(times_s: Array, is_above: Mask, interval_s: float) -> Mask:
     """Return a mask of the windows (m, k) in which an oscillation in step with reports has levels.
 
-    The level is then a function of the number of the report modulo a small period.
+    The level is then a function of the number of the report modulo a small period. Reports are
+    ``interval_s`` apart.
     """
-    elapsed_s = times_s - times_s[:, :1]
-    interval_s = np.diff(times_s, axis=1)
-    if not np.any(interval_s > 0):
-        return np.zeros(len(times_s), bool)
-    report = np.rint(elapsed_s / np.median(interval_s[interval_s > 0]))
+    report = np.rint((times_s - times_s[:, :1]) / interval_s)
     is_aliased = np.zeros(len(times_s), bool)
     for period in ALIASED_PERIODS:
         is_function = np.ones(len(times_s), bool)
@@ -321,7 +318,11 @@ def _angle_evidence(time_s: Array, angle_rad: Array) -> tuple[float, float]:
         (switches >= MIN_LEVEL_SWITCHES) & (smaller >= MIN_LEVEL_SWEEPS) & (gap > MIN_LEVEL_GAP_RAD)
     )
     has_levels = is_alternating & (gap > MIN_GAP_RATIO * level_range)
-    has_levels &= ~_is_aliased(times[is_complete], is_above)
+    interval_s = np.diff(time_s)
+    if np.any(interval_s > 0):
+        rows = np.flatnonzero(has_levels)
+        usual_s = float(np.median(interval_s[interval_s > 0]))
+        has_levels[rows] = ~_is_aliased(times[is_complete][rows], is_above[rows], usual_s)
     two_levels = int(np.count_nonzero(has_levels))
     one, two = ONE_STATION_WINDOW_FRACTION, TWO_STATION_WINDOW_FRACTION
 

@@ -329,8 +329,11 @@ def _agree_with_neighbours(rotation: IntArray, values: Array) -> Mask:
     if not n:
         return np.zeros(0, bool)
     is_row &= np.abs(rotation[rows] - rotation[:, None]) <= MAX_NEIGHBOUR_ROTATIONS
-    neighbours = np.where(is_row[:, :, None], values[rows], np.nan)
-    deviation = np.abs(values - np.nanmedian(neighbours, axis=1))
+    ordered = np.sort(np.where(is_row[:, :, None], values[rows], np.inf), axis=1)
+    # The median of the rows around each: the mean of the two in their middle.
+    count, row = np.count_nonzero(is_row, axis=1), np.arange(n)
+    median = (ordered[row, (count - 1) // 2] + ordered[row, count // 2]) / 2
+    deviation = np.abs(values - median)
     return np.asarray(np.all(deviation <= MAX_PATH_DEVIATION_TURNS, axis=1))
 
 

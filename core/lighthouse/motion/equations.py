@@ -232,8 +232,8 @@ def assemble(
     coupling, information = couple(sweeps.knot, jacobian, residuals.column, by_common, k, count)
     information += common.information
     push = (by_common * residual[:, None]).ravel()
-    common_gradient = np.bincount(residuals.column.ravel(), push, count)
-    common_gradient += common.information @ common.value
+    common_gradient = common.information @ common.value
+    common_gradient += np.bincount(residuals.column.ravel(), push, count)
     if inertial is not None:
         inertial.add_to_common(path, common, coupling, information, common_gradient)
     return NormalEquations(states, gradient, coupling, information, common_gradient, common.gauge)
