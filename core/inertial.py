@@ -42,3 +42,6 @@ class InertialSamples:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def __repr__(self) -> str:
+        return f"<InertialSamples of {self.device!r}: {len(self)}>"

@@ -103,6 +103,12 @@ class Solution:
         """Number of accepted poses over all devices."""
         return sum(len(t) for t in self.trajectories)
 
+    def __repr__(self) -> str:
+        return (
+            f"<Solution: {self.system} by {self.method}, {self.poses} poses of "
+            f"{len(self.trajectories)} devices, {len(self.warnings)} warnings>"
+        )
+
 
 def add_counts(*tables: Mapping[str, int]) -> dict[str, int]:
     """Add numbers of rejected observations by reason, and drop those that are zero."""

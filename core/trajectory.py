@@ -64,6 +64,10 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.time_ns)
 
+    def __repr__(self) -> str:
+        span_s = float(self.time_ns[-1] - self.time_ns[0]) * 1e-9 if len(self) else 0.0
+        return f"<Trajectory of {self.device!r}: {len(self)} poses, {span_s:.1f} s, {self.frame!r}>"
+
     @classmethod
     def from_positions(
         cls,

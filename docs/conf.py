@@ -33,6 +33,7 @@ MENU = {
     "Systems": ["lighthouse", "light", "lighthouse-signal", "dots", "polaris", "landmarks"],
     "From port to viewer": ["capture", "batch", "viewers"],
     "Reference": [
+        "Python <python>",
         "Commands <commands>",
         "File formats <formats>",
         "The four papers <papers>",

@@ -84,8 +84,15 @@ def test_mentioned_commands_and_options_are_there(root: Path, page: str) -> None
         assert {word for word in words if word.startswith("-")} <= known, line
 
 
-def test_python_example_runs(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_python_example_runs(
+    root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
     text = (root / "README.md").read_text(encoding="utf-8")
     [code] = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
     exec(code, {})
     assert len(capsys.readouterr().out.splitlines()) == 3
+    assert (tmp_path / "two.html").stat().st_size > 10_000

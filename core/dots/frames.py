@@ -33,3 +33,6 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def __repr__(self) -> str:
+        return f"<Frames of {self.device!r}: {len(self)}>"

@@ -166,6 +166,13 @@ class Evaluation:
             ),
         }
 
+    def __repr__(self) -> str:
+        ape = self.ape_translation
+        return (
+            f"<Evaluation of {ape.n} poses, align {self.align!r}: APE median "
+            f"{1e3 * ape.median:.3g} mm, rmse {1e3 * ape.rmse:.3g} mm, p95 {1e3 * ape.p95:.3g} mm>"
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON form: everything but the arrays of poses, with figures per device."""
         overall = {

@@ -75,3 +75,6 @@ class HallSamples:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def __repr__(self) -> str:
+        return f"<HallSamples of {self.device!r}: {len(self)}>"

@@ -95,6 +95,9 @@ class Sweeps:
     def __len__(self) -> int:
         return len(self.time_ns)
 
+    def __repr__(self) -> str:
+        return f"<Sweeps: {len(self)} of {len(self.devices)} devices>"
+
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Sweeps:
         """Select sweeps by a mask or by indices; ``devices`` stays the same."""
         columns = (f.name for f in fields(self) if f.name != "devices")

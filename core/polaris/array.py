@@ -81,3 +81,6 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.time_ns)
+
+    def __repr__(self) -> str:
+        return f"<Samples of {self.device!r}: {len(self)}>"

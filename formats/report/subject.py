@@ -84,12 +84,31 @@ def load_subject(
     DegenerateError
         The poses do not determine the alignment or the offset.
     """
-    solution = _sort_devices(read_solution(path))
-    facts = Session.open(path).facts
+    solution, facts = read_solution(path), Session.open(path).facts
     if session is not None:
         recording: Session | None = _open_session(session, solution)
     else:
-        recording = _find_session(Path(path), facts, solution)
+        recording = find_session(Path(path), facts, solution)
+    return make_subject(
+        Path(path).name, solution, facts, recording, truth=truth, align=align, offset_s=offset_s
+    )
+
+
+def make_subject(
+    name: str,
+    solution: Solution,
+    facts: Mapping[str, str],
+    recording: Session | None,
+    *,
+    truth: str | os.PathLike[str] | None = None,
+    align: str = "none",
+    offset_s: float | Literal["auto"] = 0.0,
+) -> Subject:
+    """Return the subject of a solution and its recording, evaluated.
+
+    See :func:`load_subject` for the parameters and the errors.
+    """
+    solution = _sort_devices(solution)
     reference = () if truth is None else tuple(trajectories.read(Path(truth), role="truth"))
     # The truth of the session may be damaged: the report is on the solution.
     evaluation, obstacle = None, ""
@@ -104,7 +123,7 @@ def load_subject(
         if align != "none" or offset_s != 0.0:
             raise
         obstacle = f"The truth cannot be used: {error.message}."
-    return Subject(Path(path).name, solution, facts, recording, reference, evaluation, obstacle)
+    return Subject(name, solution, facts, recording, reference, evaluation, obstacle)
 
 
 def _sort_devices(solution: Solution) -> Solution:
@@ -130,7 +149,7 @@ def _open_session(path: str | os.PathLike[str], solution: Solution) -> Session:
     return session
 
 
-def _find_session(path: Path, facts: Mapping[str, str], solution: Solution) -> Session | None:
+def find_session(path: Path, facts: Mapping[str, str], solution: Solution) -> Session | None:
     """Return the session that the solution names, in its folder; None if there is none.
 
     A file of this name from another time is another recording.

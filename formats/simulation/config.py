@@ -151,6 +151,11 @@ class SimulationConfig:
         file = f"<{self._format}>"
         return self._parse(toml.loads(text, file), file, Path())
 
+    def from_tables(self, tables: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """Return the settings of tables as :meth:`read` does, relative to the working folder."""
+        document = header(self._format, FORMAT_VERSION) | {k: dict(v) for k, v in tables.items()}
+        return self._parse(document, "settings", Path())
+
     @property
     def _format(self) -> str:
         return f"locatk-simulation-{self.system}"

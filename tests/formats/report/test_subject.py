@@ -16,7 +16,7 @@ from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.tum import write_tum
 from locatk.formats.report.evaluation import why_not_evaluated
-from locatk.formats.report.subject import _find_session, load_subject
+from locatk.formats.report.subject import find_session, load_subject
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.solutions import write_solution
 
@@ -114,9 +114,9 @@ def test_other_names_are_not_followed(session: Path, tmp_path: Path, source: str
     (tmp_path / "in").mkdir()
     path = solved(tmp_path / "in" / "solved.mcap")
     named = source if source != "/run.mcap" else str(session)
-    assert _find_session(path, {"source": named}, SOLUTION) is None
+    assert find_session(path, {"source": named}, SOLUTION) is None
     there = solved(tmp_path / "solved.mcap")
-    assert _find_session(there, {"source": "run.mcap"}, SOLUTION) is not None
+    assert find_session(there, {"source": "run.mcap"}, SOLUTION) is not None
 
 
 def test_a_session_of_another_system_is_refused(session: Path, tmp_path: Path) -> None:

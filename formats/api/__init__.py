@@ -1,0 +1,1 @@
+"""What ``import locatk`` offers: sessions, solutions, and functions on them."""

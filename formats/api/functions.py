@@ -1,0 +1,186 @@
+"""Functions of ``import locatk``: open, solve, evaluate, simulate."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Literal
+
+from locatk.core.errors import InputError
+from locatk.core.evaluation import Evaluation, EvaluationOptions, pair_devices
+from locatk.core.evaluation import evaluate as evaluate_pairs
+from locatk.core.trajectory import Trajectory
+from locatk.formats.api.session import Session
+from locatk.formats.api.solution import Solution, require_poses
+from locatk.formats.importers import trajectories as files
+from locatk.formats.pipeline import provenance
+from locatk.formats.pipeline.systems import SYSTEMS, SolveRequest, solve_session
+from locatk.formats.sessions.reader import Session as StoredSession
+
+Location = str | os.PathLike[str]
+Poses = Solution | Location | Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
+"""What poses are taken from: a solution, a file, or trajectories."""
+
+
+def open(path: Location) -> Session | Solution:
+    """Open a session or a solution.
+
+    Parameters
+    ----------
+    path : path
+        An MCAP file of ``locatk``.
+
+    Returns
+    -------
+    Session or Solution
+
+    Raises
+    ------
+    MissingDataError, FormatError
+        There is no such file, or it is no MCAP file.
+    """
+    if StoredSession.open(path).facts.get("kind") == "solution":
+        return Solution.read(path)
+    return Session(path)
+
+
+def solve(session: Session | Location, **options: Any) -> Solution:
+    """Solve a session into poses.
+
+    Parameters
+    ----------
+    session : Session or path
+    **options
+        Those of ``locatk solve``: ``artifact`` and ``camera`` (paths), ``method``, ``scene``,
+        ``speed``, ``tag`` (paths), ``rate`` and more
+        (:class:`locatk.formats.pipeline.systems.SolveRequest`).
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    InputError
+        An option is unknown or of another system.
+    LocatkError
+        The session cannot be read or solved.
+    """
+    known = [field.name for field in fields(SolveRequest)]
+    unknown = [name for name in options if name not in known]
+    if unknown:
+        raise InputError(f"no option {unknown[0]!r}", hint=f"Known options: {', '.join(known)}")
+    for name in ("artifact", "camera"):
+        if options.get(name) is not None:
+            options[name] = Path(options[name])
+    if options.get("tag") is not None:
+        tags = options["tag"]
+        options["tag"] = tuple(map(Path, [tags] if isinstance(tags, str | Path) else tags))
+    path = session.path if isinstance(session, Session) else Path(session)
+    solved = solve_session(path, SolveRequest(**options))
+    facts = provenance.source_facts(path)
+    return Solution(solved.solution, path.name, facts, StoredSession.open(path))
+
+
+def evaluate(
+    estimate: Poses,
+    truth: Poses | Session | None = None,
+    *,
+    align: str = "none",
+    offset_s: float | Literal["auto"] = 0.0,
+    names: Mapping[str, str] | None = None,
+    **options: Any,
+) -> Evaluation:
+    """Compare poses with reference poses.
+
+    Parameters
+    ----------
+    estimate : Solution, path, Trajectory, or several
+    truth : Solution, Session, path, Trajectory, or several, optional
+        By default the truth in the session of a solution.
+    align : str
+        One of :data:`locatk.core.evaluation.ALIGNMENTS`.
+    offset_s : float or "auto"
+        Added to the stamps of the estimate.
+    names : mapping of str to str, optional
+        Names of devices in the estimate to those in the truth.
+    **options
+        Those of :class:`locatk.core.evaluation.EvaluationOptions`.
+
+    Raises
+    ------
+    InputError
+        There is no truth for the poses.
+    DegenerateError
+        The poses do not determine the alignment or the offset.
+    """
+    if truth is None:
+        if isinstance(estimate, str | os.PathLike):
+            estimate = Solution.read(estimate)
+        if not isinstance(estimate, Solution) or estimate.session is None:
+            raise InputError("no truth is given, and there is no session that contains it")
+        truth = Session(estimate.session.path)
+    pairs, _ = pair_devices(_poses(estimate, "estimate"), _poses(truth, "truth"), names or {})
+    if not pairs:
+        raise InputError(
+            "no device has truth", hint="Name the devices: names={'in estimate': 'in truth'}"
+        )
+    return evaluate_pairs(pairs, EvaluationOptions(align=align, offset_s=offset_s, **options))
+
+
+def _poses(source: Poses | Session, role: files.Role) -> list[Trajectory]:
+    if isinstance(source, Solution):
+        return list(require_poses(source).values())
+    if isinstance(source, Session):
+        return list(source.truth.values())
+    if isinstance(source, Trajectory):
+        return [source]
+    if isinstance(source, str | os.PathLike):
+        return files.read(Path(source), role=role)
+    return list(source.values()) if isinstance(source, Mapping) else list(source)
+
+
+def simulate(
+    system: str,
+    path: Location,
+    settings: Mapping[str, Mapping[str, Any]] | Location | None = None,
+    *,
+    seed: int | None = None,
+    overwrite: bool = False,
+) -> Session:
+    """Simulate a session with known truth.
+
+    Parameters
+    ----------
+    system : str
+        ``"lighthouse"``, ``"polaris"``, ``"dots"`` or ``"landmarks"``.
+    path : path
+        The session to write.
+    settings : mapping or path, optional
+        Tables and keys of the file that ``locatk simulate SYSTEM --print-config`` prints, as in
+        ``{"robots": {"count": 20}}``, or such a file.
+    seed : int, optional
+        Seed of all random numbers, in place of that of the settings.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    InputError
+        The system is unknown, or a setting is unknown, out of range or contradicts another.
+    OutputExistsError
+        ``path`` exists and ``overwrite`` is false.
+    """
+    if system not in SYSTEMS:
+        raise InputError(f"no system {system!r}", hint=f"Known systems: {', '.join(SYSTEMS)}")
+    module = importlib.import_module(f"locatk.formats.simulation.{system}")
+    if isinstance(settings, str | os.PathLike):
+        chosen = module.CONFIG.read(settings)
+    else:
+        chosen = module.CONFIG.from_tables(settings or {})
+    own = {} if seed is None else {"random.seed": seed}
+    module.write_simulation(path, module.CONFIG.merge(chosen, own), overwrite=overwrite)
+    return Session(path)
