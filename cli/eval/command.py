@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
-from locatk.core.errors import InputError
+from locatk.core.errors import LocatkError
+
+if TYPE_CHECKING:
+    from locatk.formats.evaluation import EvaluatedFile
 
 ALIGNMENTS = ("none", "se2", "se3", "sim2", "sim3", "yaw", "origin")
 """Copy of :data:`locatk.core.evaluation.ALIGNMENTS`, which imports numpy."""
@@ -63,11 +68,13 @@ offset_option = click.option(
 
 
 @click.command(cls=Command, short_help="Compare poses with ground truth.")
-@options.input_argument("estimate")
+@click.argument("estimates", metavar="ESTIMATE...", type=options.PATH, nargs=-1, required=True)
 @options.input_option(
     "--truth",
     required=True,
-    help="Session with truth, another solution, or a TUM, KITTI or CSV file.",
+    metavar="FILE|FOLDER",
+    help="Session with truth, another solution, or a TUM, KITTI or CSV file. In a folder, the file "
+    "with the name of the session.",
 )
 @click.option(
     "--pair",
@@ -130,11 +137,18 @@ offset_option = click.option(
 @section(
     "Output",
     click.option("--full", is_flag=True, help="Print all statistics and assumptions."),
+    click.option(
+        "--table",
+        type=options.PATH,
+        metavar="FILE",
+        help="Write one row for each device of each estimate (.csv, .json, .parquet, .tex).",
+    ),
+    options.overwrite,
 )
 @options.as_json
 @options.verbosity
 def command(
-    estimate: Path,
+    estimates: tuple[Path, ...],
     truth: Path,
     align: str,
     offset: float | str,
@@ -145,22 +159,27 @@ def command(
     names: tuple[str, ...],
     all_pairs: bool,
     full: bool,
+    table: Path | None,
+    overwrite: bool,
     onboard: bool,
     as_json: bool,
 ) -> None:
     """Compare the poses of ESTIMATE with a reference, for each device.
 
-    ESTIMATE is a solution (.mcap), a TUM, KITTI or CSV file, or a session with truth. The
-    absolute pose error (APE) is the difference between a pose and the truth, the relative pose
-    error (RPE) the error of the motion from one pose to the next; both have a part in
-    millimetres or metres and one in degrees. Coverage is the fraction of the time of the truth
-    with a pose. --full adds drift, the consistency of the covariances with the errors, and the
-    other statistics.
+    ESTIMATE is a solution (.mcap), a TUM, KITTI or CSV file, or a session with truth. Several, also
+    folders of solutions and patterns, are each compared with the truth of their session, and
+    solutions of the same sessions by several methods or settings with each other. The absolute pose
+    error (APE) is the difference between a pose and the truth, the relative pose error (RPE) the
+    error of the motion from one pose to the next; both have a part in millimetres or metres and one
+    in degrees. Coverage is the fraction of the time of the truth with a pose. --full adds drift,
+    the consistency of the covariances with the errors, and the other statistics.
 
     \b
     Examples:
       locatk eval solved.mcap --truth run.mcap
       locatk eval solved.mcap --truth run.mcap --full
+      locatk eval solved/ --truth recordings/ --table errors.csv
+      locatk eval bundle/ paper/ --truth recordings/
       locatk eval solved.mcap --truth grid.mcap --align sim3 --json
       locatk eval solved.mcap --truth camera.tum --offset auto
       locatk eval flight.mcap --onboard --truth solved.mcap --align se3
@@ -168,71 +187,90 @@ def command(
       locatk eval solved.mcap --truth mocap.csv --pair 785b=red --pair dffa=blue
     """
     from locatk.cli.eval import text as eval_text
-    from locatk.core.evaluation import Delta, EvaluationOptions, evaluate, pair_devices
-    from locatk.formats.importers import trajectories as files
+    from locatk.core.evaluation import Delta, EvaluationOptions
+    from locatk.formats.evaluation import evaluate_file, find_estimates, find_truth
 
-    rpe_delta = Delta.parse(delta)
-    estimated = files.open_file(estimate, role="onboard" if onboard else "estimate")
-    true = files.open_file(truth, role="truth")
-    files.check_kinds(estimated, true)
-    if not estimated.solved:
-        if estimate.samefile(truth):
-            raise InputError(
-                "no solved poses", file=estimate, hint="Solve it first: `locatk solve`"
-            )
-        console.warn(f"{estimate} has no solved poses: its truth is used as the estimate")
-    true_names = parse_pairs(names)
-    pairs, unpaired = pair_devices(estimated.trajectories, true.trajectories, true_names)
-    if not pairs:
-        estimated_devices, true_devices = (
-            ", ".join(each.device for each in side.trajectories) for side in (estimated, true)
-        )
-        raise InputError(
-            f"none of its devices is in {truth}",
-            file=estimate,
-            hint=f"Name the pairs by --pair NAME=NAME: one of {estimated_devices}, and one of "
-            f"{true_devices}",
-        )
-    # TUM and KITTI files do not name their device.
-    has_names = not {estimated.kind, true.kind} & set(files.EVO_KINDS)
-    for track, reference in pairs:
-        device = track.device
-        if has_names and reference.device != device and device not in true_names:
-            console.say(f"{device} is compared with {reference.device}, the only other device")
-        if align == "none" and track.frame and reference.frame and track.frame != reference.frame:
-            console.warn(
-                f"the poses of {device} are in the frame {track.frame!r}, its truth in "
-                f"{reference.frame!r}: unless they are the same, errors need --align"
-            )
-    if unpaired:
-        console.warn(f"no truth for {', '.join(unpaired)}")
-    if match == "auto":
-        is_evo = estimated.kind in files.EVO_KINDS and true.kind in files.EVO_KINDS
-        match = "nearest" if is_evo else "interpolate"
-    evaluation = evaluate(
-        pairs,
-        EvaluationOptions(
-            align=align,
-            offset_s=offset,  # type: ignore[arg-type]
-            match=match,
-            max_diff_s=max_diff,
-            # Rows of KITTI are stamped by the second.
-            max_gap_s=max(1.0, max_gap) if estimated.kind == "kitti" else max_gap,
-            delta=rpe_delta,
-            all_pairs=all_pairs,
-        ),
+    chosen = EvaluationOptions(
+        align=align,
+        offset_s=offset,  # type: ignore[arg-type]
+        max_diff_s=max_diff,
+        max_gap_s=max_gap,
+        delta=Delta.parse(delta),
+        all_pairs=all_pairs,
     )
-    if evaluation.time_offset.coarse_method == "first stamps":
-        console.warn(
-            "the motions differ too much to estimate the time offset: the first stamps were matched"
+    true_names = parse_pairs(names)
+
+    def evaluated(file: Path) -> EvaluatedFile:
+        return evaluate_file(
+            file, find_truth(file, truth), chosen, names=true_names, match=match, onboard=onboard
         )
-    if evaluation.time_offset.alternatives:
-        console.warn("the motion is periodic and fits several time offsets: give --offset")
+
+    found, is_several = find_estimates(estimates)
+    if is_several or table is not None:
+        evaluate_several(found, evaluated, table, overwrite=overwrite, as_json=as_json)
+        return
+    options.must_exist(found)
+    one = evaluated(found[0])
+    for note in one.notes:
+        console.say(note)
+    for warning in one.warnings:
+        console.warn(warning)
     if as_json:
-        facts = {"version": 1, "estimate": estimate, "truth": truth, **evaluation.as_dict()}
-        console.emit_json(facts)
+        facts = {"version": 1, "estimate": one.estimate, "truth": one.truth}
+        console.emit_json({**facts, **one.evaluation.as_dict()})
     else:
-        console.result(eval_text.text(evaluation, full=full))
+        console.result(eval_text.text(one.evaluation, full=full))
+
+
+def evaluate_several(
+    found: Sequence[Path],
+    evaluated: Callable[[Path], EvaluatedFile],
+    table: Path | None,
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Evaluate files, write the table, and print a row for each.
+
+    Raises
+    ------
+    LocatkError
+        At the end, if a file could not be evaluated; the others are.
+    """
+    from locatk.cli.eval import text as eval_text
+    from locatk.formats.evaluation import COLUMNS, label_runs, summarize_runs
+    from locatk.formats.tables.writing import ENDINGS, write_table
+
+    if table is not None:
+        options.check_ending(table, ENDINGS)
+        options.guard_output(table, overwrite=overwrite, inputs=list(found))
+    results, failures = [], []
+    with console.progress(found, "Evaluating") as items:
+        for file in items:
+            try:
+                results.append(evaluated(file))
+            except LocatkError as error:
+                failures.append({"estimate": file, "error": error.message, "hint": error.hint})
+    for failure in failures:
+        console.warn(f"{failure['estimate']} was not evaluated: {failure['error']}")
+    for text in dict.fromkeys(warning for each in results for warning in each.warnings):
+        console.warn(text)
+    runs = label_runs(results)
+    rows = [row for each, run in zip(results, runs, strict=True) for row in each.rows(run)]
+    summaries = summarize_runs(results, runs) if results else []
+    if table is not None:
+        write_table(table, COLUMNS, rows, overwrite=overwrite)
+        console.say(f"Wrote {table}: {len(rows)} rows")
+    if as_json:
+        runs_json = [asdict(summary) for summary in summaries]
+        console.emit_json({"version": 1, "rows": rows, "runs": runs_json, "failures": failures})
+    elif results:
+        console.result(eval_text.several(rows, summaries))
+    if failures:
+        raise LocatkError(
+            f"{len(failures)} of {len(found)} files could not be evaluated",
+            hint="The warnings above say why",
+        )
 
 
 def parse_pairs(names: tuple[str, ...]) -> dict[str, str]:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console
 
 if TYPE_CHECKING:
     from locatk.core.evaluation import Evaluation, Statistics
+    from locatk.formats.evaluation import RunSummary
 
 SUMMARY = ("rmse", "mean", "median", "p95", "max")
 """Statistics that are shown by default."""
+
+MAIN = ("median", "rmse", "p95", "max")
+"""Statistics of each of several files."""
 
 STATISTICS = (*SUMMARY, "std", "min", "sse")
 
@@ -45,6 +49,40 @@ def text(evaluation: Evaluation, *, full: bool = False) -> str:
             *map(console.wrapped, lines),
         ]
     )
+
+
+def several(rows: Sequence[Mapping[str, Any]], summaries: Sequence[RunSummary]) -> str:
+    """Format the errors of several files, of all of each run, and the differences of runs."""
+    has_runs = len(summaries) > 1
+    factor, unit = (1.0, "m") if max(row["max_m"] or 0.0 for row in rows) >= 1.0 else (1e3, "mm")
+    header = ("session", "device", "n", *(f"{name} [{unit}]" for name in MAIN), "coverage")
+    cells = []
+    for row in rows:
+        session = f"{row['run']}/{row['session']}" if has_runs else row["session"]
+        errors = (_cell(row[f"{name}_m"], factor) for name in MAIN)
+        coverage = "-" if row["coverage"] is None else f"{row['coverage']:.1%}"
+        cells.append((session, row["device"], row["poses"], *errors, coverage))
+    for summary in summaries:
+        errors = (_cell(getattr(summary, f"{name}_m"), factor) for name in MAIN)
+        title = summary.run if has_runs else "all"
+        cells.append((title, f"{summary.sessions} sessions", summary.poses, *errors, ""))
+    lines = [console.table(header, cells)]
+    for summary in summaries[1:]:
+        if summary.difference_m is not None:
+            change = factor * summary.difference_m
+            lines.append(
+                console.wrapped(
+                    f"{summary.run} against {summaries[0].run}, {summary.shared} shared sessions: "
+                    f"the median error is {number(abs(change))} {unit} "
+                    f"{'smaller' if change < 0 else 'larger'} (median of the differences), and "
+                    f"smaller in {summary.better}"
+                )
+            )
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, factor: float) -> str:
+    return "-" if value is None else number(factor * value)
 
 
 def _scopes(evaluation: Evaluation) -> list[tuple[str, dict[str, Statistics | None]]]:

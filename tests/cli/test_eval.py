@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import subprocess
@@ -344,3 +345,112 @@ def test_a_single_pose_and_a_late_start_are_reported(locatk, run: Path, tmp_path
     write_csv(late, [solved(late_ns=-5_000_000_000_000)])
     said = locatk("eval", late, "--truth", run).stderr
     assert "starts 5000.000 s before the truth" in said
+
+
+# ---- several files
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    """Three sessions with truth, solved twice: with errors as stated, and three times as large."""
+    for folder in ("recordings", "good", "bad"):
+        (tmp_path / folder).mkdir()
+    for number in (1, 2, 10):
+        name = f"run-{number}"
+        session(tmp_path / "recordings" / f"{name}.mcap")
+        for folder, factor in (("good", 1.0), ("bad", 3.0)):
+            poses = Solution("dots", "lattice", (solved(factor=factor * number),))
+            path = tmp_path / folder / f"{name}-solved.mcap"
+            write_solution(path, poses, source=f"{name}.mcap")
+    return tmp_path
+
+
+def test_a_folder_is_evaluated_by_the_names_of_sessions(locatk, study: Path) -> None:
+    result = locatk("eval", study / "good", "--truth", study / "recordings")
+    lines = result.stdout.splitlines()
+    rows = [line.split() for line in lines if line.startswith("run-")]
+    assert [row[0] for row in rows] == ["run-1", "run-2", "run-10"]
+    # The error of each is that of the file alone.
+    for row, number in zip(rows, (1, 2, 10), strict=True):
+        alone = locatk(
+            "eval",
+            study / "good" / f"run-{number}-solved.mcap",
+            "--truth",
+            study / "recordings" / f"run-{number}.mcap",
+            "--json",
+        )
+        assert float(row[3]) == pytest.approx(1e3 * json.loads(alone.stdout)["median_m"], rel=1e-2)
+    assert any(line.startswith("all") and "3 sessions" in line for line in lines)
+
+
+def test_runs_are_compared_by_paired_differences(locatk, study: Path) -> None:
+    arguments = ("eval", study / "good", study / "bad", "--truth", study / "recordings")
+    facts = json.loads(locatk(*arguments, "--json").stdout)
+    good, bad = facts["runs"]
+    assert (good["run"].endswith("good"), bad["run"].endswith("bad")) == (True, True)
+    assert (good["sessions"], good["shared"], bad["shared"]) == (3, 0, 3)
+    medians = {}
+    for row in facts["rows"]:
+        medians[Path(row["run"]).name, row["session"]] = row["median_m"]
+    change = [medians["bad", f"run-{k}"] - medians["good", f"run-{k}"] for k in (1, 2, 10)]
+    assert bad["difference_m"] == pytest.approx(sorted(change)[1])
+    assert bad["better"] == 0
+    # NEES per degree of freedom tells the right covariance.
+    nees = {(Path(r["run"]).name, r["session"]): r["nees"] for r in facts["rows"]}
+    assert nees["good", "run-1"] == pytest.approx(1.0, abs=0.2)
+    assert nees["bad", "run-1"] == pytest.approx(9.0, abs=2.0)
+    text = " ".join(locatk(*arguments).stdout.split())
+    assert "3 shared sessions" in text
+    assert "larger" in text
+
+
+@pytest.mark.parametrize("ending", [".csv", ".json", ".parquet", ".tex"])
+def test_a_table_of_all_devices(locatk, study: Path, ending: str) -> None:
+    table = study / f"errors{ending}"
+    arguments = ("eval", study / "good", "--truth", study / "recordings", "--table", table)
+    locatk(*arguments)
+    if ending == ".csv":
+        rows = list(csv.DictReader(table.open(encoding="utf-8")))
+    elif ending == ".json":
+        rows = json.loads(table.read_text(encoding="utf-8"))
+    elif ending == ".parquet":
+        rows = pytest.importorskip("pyarrow.parquet").read_table(table).to_pylist()
+    else:
+        lines = table.read_text(encoding="utf-8").splitlines()
+        assert lines[0].startswith(r"\begin{tabular}{l")
+        assert sum(line.endswith(r"\\") for line in lines) == 4
+        assert r"run-10 & red & dots" in lines[6]
+        return
+    assert [row["session"] for row in rows] == ["run-1", "run-2", "run-10"]
+    assert [row["device"] for row in rows] == ["red"] * 3
+    assert float(rows[2]["median_m"]) > 3 * float(rows[0]["median_m"]) > 1e-3
+    assert locatk(*arguments).exit_code == 1
+    assert "output exists" in locatk(*arguments).stderr
+
+
+def test_files_that_fail_are_named_and_the_others_evaluated(locatk, study: Path) -> None:
+    (study / "recordings" / "run-2.mcap").unlink()
+    (study / "good" / "run-10-solved.mcap").write_bytes(b"damaged")
+    names = (study / "good" / f"run-{k}-solved.mcap" for k in (1, 2, 10))
+    table = study / "errors.csv"
+    result = locatk("eval", *names, "--truth", study / "recordings", "--table", table)
+    assert result.exit_code == 1
+    assert "2 of 3 files could not be evaluated" in result.stderr
+    assert "no truth of this name" in result.stderr
+    assert len(table.read_text().splitlines()) == 2
+    assert "run-1 " in result.stdout
+
+
+def test_several_files_without_any(locatk, study: Path) -> None:
+    truth = study / "recordings"
+    for name, message in (
+        (study / "good" / "*.tum", "no file matches"),
+        (truth, "no solution in the folder"),
+        (study / "nothing.mcap", "No such file"),
+    ):
+        result = locatk("eval", name, "--truth", truth)
+        assert result.exit_code == 1
+        assert message in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+    result = locatk("eval", study / "good", "--truth", truth, "--table", "errors.txt")
+    assert result.exit_code == 2
