@@ -19,7 +19,7 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 @click.command(cls=Command, short_help="Write an HTML page about solutions.")
-@options.input_argument("solutions", many=True)
+@click.argument("names", metavar="SOLUTIONS...", type=options.PATH, nargs=-1, required=True)
 @options.output("Page (.html), or a picture only (.png, .pdf, .svg).")
 @options.overwrite
 @section(
@@ -33,7 +33,9 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
     ),
     options.input_option(
         "--truth",
-        help="Reference poses: a session, a solution, TUM, KITTI or CSV.  "
+        metavar="FILE|FOLDER",
+        help="Reference poses: a session, a solution, TUM, KITTI or CSV. In a folder, the file "
+        "with the name of the session.  "
         "[default: those of the session]",
     ),
     align_option,
@@ -48,7 +50,7 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 @options.as_json
 @options.verbosity
 def command(
-    solutions: tuple[Path, ...],
+    names: tuple[Path, ...],
     output: Path,
     sessions: tuple[Path, ...],
     truth: Path | None,
@@ -64,7 +66,8 @@ def command(
 
     The page is one file that opens in any browser without a network connection. It contains a map
     of the trajectories over the artifact, errors if there is truth, rejected observations with
-    reasons, covariances, the recorded signals, and properties of the run.
+    reasons, covariances, the recorded signals, and properties of the run. A folder stands for its
+    solutions; a page on several begins with a table of all.
 
     \b
     Examples:
@@ -72,8 +75,13 @@ def command(
       locatk report solved.mcap -o report.html --truth camera.tum --align se3
       locatk report solved.mcap -o report.html --session /data/run.mcap --pdf
       locatk report bundle.mcap paper.mcap -o both.html --png
+      locatk report solved/ -o all.html --truth recordings/
       locatk report solved.mcap -o figure.svg
     """
+    from locatk.formats.evaluation import find_estimates, find_truth
+
+    solutions = tuple(find_estimates(names)[0])
+    options.must_exist(solutions)
     flags = zip(PICTURE_SUFFIXES, (png, pdf, svg), strict=True)
     page, pictures = plan_outputs(solutions, output, [suffix for suffix, on in flags if on])
     inputs = [*solutions, *sessions, *([] if truth is None else [truth])]
@@ -86,7 +94,13 @@ def command(
 
     with console.working("Reading"):
         subjects = [
-            load_subject(path, session=session, truth=truth, align=align, offset_s=offset)  # type: ignore[arg-type]
+            load_subject(
+                path,
+                session=session,
+                truth=None if truth is None else find_truth(path, truth),
+                align=align,
+                offset_s=offset,  # type: ignore[arg-type]
+            )
             for path, session in zip(solutions, session_of, strict=True)
         ]
     count = Counter(subject.name for subject in subjects)

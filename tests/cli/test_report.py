@@ -71,6 +71,26 @@ def test_several_solutions_share_a_page(solution: Path, locatk: Locatk, tmp_path
     assert "2 solutions" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
+def test_a_folder_stands_for_its_solutions(solution: Path, locatk: Locatk, tmp_path: Path) -> None:
+    """Each finds its truth in a folder by the name of its session."""
+    solved, recorded = tmp_path / "solved", tmp_path / "recorded"
+    for folder in (solved, recorded):
+        folder.mkdir()
+    for name in ("a-solved.mcap", "b-solved.mcap"):
+        shutil.copy(solution, solved / name)
+    shutil.copy(solution.with_name("run.mcap"), recorded / "run.mcap")
+    shutil.copy(solution.with_name("run.mcap"), solved / "run.mcap")
+    done = locatk("report", solved, "-o", tmp_path / "r.html", "--truth", recorded)
+    assert done.exit_code == 0, done.stderr
+    text = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "2 solutions" in text
+    assert text.count("Half of the poses are within 1.00 mm") == 2
+    (recorded / "run.mcap").unlink()
+    done = locatk("report", solved, "-o", tmp_path / "s.html", "--truth", recorded)
+    assert done.exit_code == 1
+    assert "no truth of this name" in done.stderr
+
+
 def test_solutions_of_one_name_have_their_paths_as_titles(
     solution: Path, locatk: Locatk, tmp_path: Path
 ) -> None:
