@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -37,6 +38,9 @@ ENDINGS = {
 MIN_AREA_MM, MAX_AREA_MM = 100, 100_000
 """Shortest and longest side of a floor of DotBots; their coordinates end at 100 m."""
 
+TABLES = ("csv", "parquet")
+"""Formats that hold several sessions."""
+
 STDOUT = Path("-")
 
 
@@ -62,7 +66,7 @@ def _parse_area(
 
 
 @click.command(cls=Command, short_help="Write poses for other tools.")
-@options.input_argument("solution")
+@click.argument("names", metavar="SOLUTION...", type=options.PATH, nargs=-1, required=True)
 @click.option(
     "--format",
     "format_name",
@@ -106,7 +110,7 @@ def _parse_area(
 @options.as_json
 @options.verbosity
 def command(
-    solution: Path,
+    names: tuple[Path, ...],
     format_name: str,
     output: Path,
     devices: tuple[str, ...],
@@ -120,7 +124,8 @@ def command(
     """Write the poses of SOLUTION, or its Lighthouse stations, in a format of other tools.
 
     SOLUTION is a solution of `locatk solve`, or a session with truth, whose truth is then exported.
-    For formats of stations it may also be a scene (scene.toml).
+    For formats of stations it may also be a scene (scene.toml). Several, also folders of solutions
+    and patterns, are written to one table (csv, parquet) with a further column, `session`.
 
     \b
     tum      time and pose, one file per device, for evo and others; an
@@ -143,6 +148,7 @@ def command(
     \b
     Examples:
       locatk export solved.mcap --format csv -o poses.csv
+      locatk export solved/ --format parquet -o all.parquet
       locatk export solved.mcap --format tum -o poses.tum
       locatk export solved.mcap --format ros2 -o poses.mcap
       locatk export solved.mcap --format csv -o -
@@ -151,6 +157,7 @@ def command(
       locatk export solved.mcap --format dotbot-calibration -o calibration.out
     """
     from locatk.core.errors import InputError
+    from locatk.formats.evaluation import find_estimates
     from locatk.formats.exporters import export as exports
     from locatk.formats.sessions.solutions import read_trajectories
 
@@ -164,6 +171,21 @@ def command(
     for option, value, owner in (("frame", frame, CONFIG), ("area", area, CALIBRATION)):
         if value is not None and format_name != owner:
             raise click.UsageError(f"--{option} is for --format {owner}.")
+    found, is_several = find_estimates(names)
+    options.must_exist(found)
+    if is_several:
+        if format_name not in TABLES or output == STDOUT:
+            raise click.UsageError(
+                f"several solutions are written to one file by --format {' or '.join(TABLES)}."
+            )
+        options.check_ending(output, ENDINGS[format_name])
+        options.guard_output(output, overwrite=overwrite, inputs=found)
+        role = "onboard" if onboard else "auto"
+        entry = export_table(found, format_name, output, devices, role, overwrite=overwrite)
+        if as_json:
+            console.emit_json({"version": 1, "inputs": found, "format": format_name, **entry})
+        return
+    solution = found[0]
     if format_name in STATION_FORMATS:
         options.check_ending(output, ENDINGS[format_name])
         if devices or onboard:
@@ -220,6 +242,47 @@ def command(
         ]
         console.emit_json({"version": 1, "input": solution, "format": format_name, "files": listed})
     check_loss(lost)
+
+
+def export_table(
+    found: Sequence[Path],
+    format_name: str,
+    output: Path,
+    devices: tuple[str, ...],
+    role: str,
+    *,
+    overwrite: bool,
+) -> dict[str, Any]:
+    """Write the poses of several files to one table; returns the file for ``--json``."""
+    from locatk.core.errors import InputError
+    from locatk.formats.evaluation import base_name
+    from locatk.formats.exporters.export import with_finite_poses
+    from locatk.formats.exporters.parquet import write_parquet
+    from locatk.formats.exporters.trajectory_csv import write_csv
+    from locatk.formats.sessions.solutions import read_trajectories
+
+    labels = [base_name(path) for path in found]
+    if len(set(labels)) < len(labels):
+        labels = [str(path) for path in found]
+    tracks: list[Trajectory] = []
+    sessions, lost = [], 0
+    with console.progress(found, "Reading") as items:
+        for path, label in zip(items, labels, strict=True):
+            for track in read_trajectories(path, role):
+                if devices and track.device not in devices:
+                    continue
+                kept = track if format_name == "parquet" else with_finite_poses(track)
+                lost += len(track) - len(kept)
+                tracks.append(kept)
+                sessions.append(label)
+    if not tracks:
+        raise InputError(f"no file has poses of {', '.join(devices)}")
+    write = write_parquet if format_name == "parquet" else write_csv
+    write(output, tracks, sessions=sessions, overwrite=overwrite)
+    poses = sum(map(len, tracks))
+    console.result(f"Wrote {output}: {poses} poses of {len(found)} files")
+    check_loss(lost)
+    return {"files": [{"path": output, "poses": poses}]}
 
 
 def export_config(source: Path, output: Path, *, is_as_is: bool, overwrite: bool) -> dict[str, Any]:

@@ -263,7 +263,7 @@ def find_truth(estimate: Path, truth: Path) -> Path:
     if not truth.is_dir():
         return truth
     stems = dict.fromkeys(
-        (session_name(estimate, _read_facts(estimate)), _base_name(estimate), estimate.stem)
+        (session_name(estimate, _read_facts(estimate)), base_name(estimate), estimate.stem)
     )
     for stem in stems:
         for ending in TRUTH_ENDINGS:
@@ -280,7 +280,7 @@ def find_truth(estimate: Path, truth: Path) -> Path:
 def session_name(estimate: Path, facts: Mapping[str, str]) -> str:
     """Return the name of the session of an estimate, without ending."""
     source = facts.get("source", "")
-    return Path(source).stem if source else _base_name(estimate)
+    return Path(source).stem if source else base_name(estimate)
 
 
 def _read_facts(path: Path) -> dict[str, str]:
@@ -290,7 +290,8 @@ def _read_facts(path: Path) -> dict[str, str]:
     return read_facts(str(path))
 
 
-def _base_name(estimate: Path) -> str:
+def base_name(estimate: Path) -> str:
+    """Return the name of a file without ending and without ``-solved``."""
     return estimate.stem.removesuffix(SOLVED_ENDING)
 
 

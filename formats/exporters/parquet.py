@@ -15,7 +15,12 @@ import numpy as np
 
 from locatk.core.errors import LocatkError
 from locatk.core.trajectory import Trajectory, has_orientation
-from locatk.formats.importers.trajectory_csv import COLUMNS, PROBABILITY_COLUMN, SIGMA_AXES
+from locatk.formats.importers.trajectory_csv import (
+    COLUMNS,
+    PROBABILITY_COLUMN,
+    SESSION_COLUMN,
+    SIGMA_AXES,
+)
 from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.messages import triangle
 
@@ -45,6 +50,7 @@ def write_parquet(
     trajectories: Sequence[Trajectory],
     *,
     facts: Mapping[str, str] | None = None,
+    sessions: Sequence[str] = (),
     overwrite: bool = False,
 ) -> None:
     """Write poses as one Parquet table, one row per pose, device after device.
@@ -57,6 +63,8 @@ def write_parquet(
         One per device.
     facts : mapping of str to str, optional
         Origin of the poses (system, method, source ...), for the metadata of the schema.
+    sessions : sequence of str
+        Name of the session of each trajectory, for a last column; empty without such a column.
     overwrite : bool
         Replace an existing file.
 
@@ -69,6 +77,13 @@ def write_parquet(
     """
     arrow, parquet = _pyarrow()
     tables = [_table(arrow, trajectory) for trajectory in trajectories]
+    if sessions:
+        tables = [
+            table.append_column(
+                SESSION_COLUMN, arrow.repeat(arrow.scalar(name, arrow.string()), len(table))
+            )
+            for table, name in zip(tables, sessions, strict=True)
+        ]
     origin = {**(facts or {}), "exported_by": f"locatk {tool_version()}"}
     metadata = {f"{PREFIX}{key}": value for key, value in origin.items()}
     table = arrow.concat_tables(tables or [_table(arrow, _empty_trajectory())])

@@ -13,16 +13,23 @@ import numpy as np
 from locatk.core.errors import InputError
 from locatk.core.printable import spreadsheet_text
 from locatk.core.trajectory import Trajectory, has_orientation
-from locatk.formats.importers.trajectory_csv import COLUMNS, SIGMA_AXES
+from locatk.formats.importers.trajectory_csv import COLUMNS, SESSION_COLUMN, SIGMA_AXES
 from locatk.formats.output import atomic_write
 from locatk.formats.tables.timestamps import format_epoch_seconds
 
 
-def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool = False) -> None:
+def write_csv(
+    path: Path,
+    trajectories: Sequence[Trajectory],
+    *,
+    sessions: Sequence[str] = (),
+    overwrite: bool = False,
+) -> None:
     """Write poses as CSV (:data:`COLUMNS`), one row a pose, device after device.
 
     Unknown orientations, sigmas and probabilities are empty cells. Numbers have the fewest digits
-    that read back equal.
+    that read back equal. With ``sessions``, the name of the session of each trajectory is the last
+    column.
 
     Raises
     ------
@@ -31,22 +38,29 @@ def write_csv(path: Path, trajectories: Sequence[Trajectory], *, overwrite: bool
     OutputExistsError
         ``path`` exists and ``overwrite`` is false.
     """
-    names = [trajectory.device for trajectory in trajectories]
+    owners = sessions or [""] * len(trajectories)
+    names = [(owner, each.device) for owner, each in zip(owners, trajectories, strict=True)]
     if len(set(names)) != len(names):
         raise InputError("a device has two trajectories", hint="Give each its own name")
     for trajectory in trajectories:
         check_exportable(trajectory)
     with atomic_write(path, overwrite=overwrite, mode="w") as stream:
-        stream.write(",".join(COLUMNS) + "\n")
-        for trajectory in trajectories:
-            stream.writelines(_csv_lines(trajectory))
+        stream.write(",".join([*COLUMNS, *([SESSION_COLUMN] if sessions else [])]) + "\n")
+        for trajectory, owner in zip(trajectories, owners, strict=True):
+            last = [_text_cell(owner)] if sessions else []
+            stream.writelines(_csv_lines(trajectory, last))
 
 
-def _csv_lines(trajectory: Trajectory) -> Iterator[str]:
-    device = spreadsheet_text(trajectory.device)
+def _text_cell(text: str) -> str:
+    text = spreadsheet_text(text)
     # The csv module of Python 3.11 leaves a carriage return unquoted and reads it as a line end.
-    if any(character in device for character in ',"\r\n'):
-        device = '"' + device.replace('"', '""') + '"'
+    if any(character in text for character in ',"\r\n'):
+        text = '"' + text.replace('"', '""') + '"'
+    return text
+
+
+def _csv_lines(trajectory: Trajectory, last: Sequence[str]) -> Iterator[str]:
+    device = _text_cell(trajectory.device)
     quaternion = np.where(has_orientation(trajectory)[:, None], trajectory.quaternion, np.nan)
     probability = trajectory.probability
     if probability is None:
@@ -56,7 +70,7 @@ def _csv_lines(trajectory: Trajectory) -> Iterator[str]:
     ).tolist()
     for time_ns, values in zip(trajectory.time_ns.tolist(), rows, strict=True):
         cells = ("" if value != value else repr(value) for value in values)
-        yield ",".join([format_epoch_seconds(time_ns), device, *cells]) + "\n"
+        yield ",".join([format_epoch_seconds(time_ns), device, *cells, *last]) + "\n"
 
 
 def check_exportable(trajectory: Trajectory) -> None:

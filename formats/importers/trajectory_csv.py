@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import InputError
 from locatk.core.printable import text_of_spreadsheet
 from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.tables.delimited import Table, read_table
@@ -31,6 +32,9 @@ COLUMNS = (
     "probability",
 )
 """Header of the file. It is part of the contract (docs/formats.md): new columns go to the end."""
+
+SESSION_COLUMN = "session"
+"""Last column of a table of several sessions."""
 
 SIGMA_AXES = (0, 1, 2, 5)
 """Rows of a pose's covariance that belong to the four sigmas."""
@@ -73,10 +77,15 @@ def read_csv(path: Path, *, frame: str = "floor") -> list[Trajectory]:
         The file is missing, or is not CSV with these columns.
     InputError
         A cell is not a number, a sigma is negative, a probability is not between 0 and 1, a
-        quaternion is far from unit length, or the time stamps of a device do not ascend.
+        quaternion is far from unit length, the time stamps of a device do not ascend, or the poses
+        are of several sessions.
     """
     table = read_table(path)
     table.require(*COLUMNS[:5])
+    if len(set(table.columns.get(SESSION_COLUMN, ()))) > 1:
+        raise InputError(
+            "poses of several sessions", file=path, hint="Export each session to its own file"
+        )
     n = len(table)
     position = read_positions(table)
     quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import shutil
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +15,12 @@ import numpy as np
 import pytest
 
 from locatk.cli import export
+from locatk.core.errors import InputError
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.exporters import export as exports
+from locatk.formats.importers.trajectory_csv import read_csv
 from locatk.formats.importers.tum import read_tum
 from locatk.formats.sessions.solutions import read_solution, write_solution
 from locatk.formats.sessions.writer import SessionWriter
@@ -70,6 +75,53 @@ def test_one_file_holds_all_devices(locatk, two: Path, tmp_path: Path, kind: str
     assert out.read_bytes() == before
     assert locatk("export", two, "--format", kind, "-o", out, "--overwrite").exit_code == 0
     assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_several_solutions_are_one_table(
+    locatk, solved: Path, two: Path, tmp_path: Path, kind: str
+) -> None:
+    out = tmp_path / f"all.{kind}"
+    folder = tmp_path / "solutions"
+    folder.mkdir()
+    for path in (solved, two):
+        path.rename(folder / path.name)
+    result = locatk("export", folder, "--format", kind, "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["files"] == [{"path": str(out), "poses": 3 * POSES}]
+    if kind == "csv":
+        rows = list(csv.DictReader(out.open(encoding="utf-8")))
+    else:
+        rows = pytest.importorskip("pyarrow.parquet").read_table(out).to_pylist()
+    keys = Counter((row["session"], row["device"]) for row in rows)
+    assert keys == {("solved", "red"): POSES, ("two", "red"): POSES, ("two", "lab/blue"): POSES}
+    (one,) = read_solution(folder / "solved.mcap").trajectories
+    x_m = [float(row["x_m"]) for row in rows if row["session"] == "solved"]
+    np.testing.assert_array_equal(x_m, one.position[:, 0])
+    # Not to be taken for one session.
+    if kind == "csv":
+        with pytest.raises(InputError, match="several sessions"):
+            read_csv(out)
+
+
+def test_files_of_one_name_keep_their_folders(locatk, solved: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    shutil.copy(solved, other / solved.name)
+    out = tmp_path / "all.csv"
+    result = locatk("export", solved, other / solved.name, "--format", "csv", "-o", out)
+    assert result.exit_code == 0, result.stderr
+    rows = list(csv.DictReader(out.open(encoding="utf-8")))
+    assert {row["session"] for row in rows} == {str(solved), str(other / solved.name)}
+
+
+@pytest.mark.parametrize("kind", ["tum", "ros2", "crazyflie-config"])
+def test_other_formats_hold_one_solution(locatk, solved: Path, tmp_path: Path, kind: str) -> None:
+    result = locatk("export", solved, solved, "--format", kind, "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "one file by --format csv or parquet" in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_kitti_writes_times_to_a_second_file(locatk, solved: Path, tmp_path: Path) -> None:
