@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.errors import InputError, MissingDataError
+from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.natural_order import natural_key
 from locatk.formats.importers import trajectories as files
@@ -219,7 +219,7 @@ def evaluate_file(
 def find_estimates(names: Sequence[Path]) -> tuple[list[Path], bool]:
     """Return the files of paths, folders and patterns, and whether there may be several.
 
-    A folder stands for its solutions.
+    A folder stands for its solutions, and for damaged files.
 
     Raises
     ------
@@ -232,7 +232,7 @@ def find_estimates(names: Sequence[Path]) -> tuple[list[Path], bool]:
         if name.is_dir():
             is_several = True
             inside = sorted(name.glob("*.mcap"), key=lambda path: natural_key(path.name))
-            solutions = [p for p in inside if _read_facts(p).get("kind") == "solution"]
+            solutions = [path for path in inside if _may_be_solution(path)]
             if not solutions:
                 raise MissingDataError(
                     "no solution in the folder", file=name, hint="Solve it: `locatk solve`"
@@ -281,6 +281,16 @@ def session_name(estimate: Path, facts: Mapping[str, str]) -> str:
     """Return the name of the session of an estimate, without ending."""
     source = facts.get("source", "")
     return Path(source).stem if source else base_name(estimate)
+
+
+def _may_be_solution(path: Path) -> bool:
+    """Return whether a file is a solution, or damaged: it is then named when it is read."""
+    from locatk.formats.sessions.reader import Session
+
+    try:
+        return Session.open(path).facts.get("kind") == "solution"
+    except LocatkError:
+        return True
 
 
 def _read_facts(path: Path) -> dict[str, str]:

@@ -258,7 +258,7 @@ def evaluate_several(
     runs = label_runs(results)
     rows = [row for each, run in zip(results, runs, strict=True) for row in each.rows(run)]
     summaries = summarize_runs(results, runs) if results else []
-    if table is not None:
+    if table is not None and rows:
         write_table(table, COLUMNS, rows, overwrite=overwrite)
         console.say(f"Wrote {table}: {len(rows)} rows")
     if as_json:

@@ -431,9 +431,8 @@ def test_a_table_of_all_devices(locatk, study: Path, ending: str) -> None:
 def test_files_that_fail_are_named_and_the_others_evaluated(locatk, study: Path) -> None:
     (study / "recordings" / "run-2.mcap").unlink()
     (study / "good" / "run-10-solved.mcap").write_bytes(b"damaged")
-    names = (study / "good" / f"run-{k}-solved.mcap" for k in (1, 2, 10))
     table = study / "errors.csv"
-    result = locatk("eval", *names, "--truth", study / "recordings", "--table", table)
+    result = locatk("eval", study / "good", "--truth", study / "recordings", "--table", table)
     assert result.exit_code == 1
     assert "2 of 3 files could not be evaluated" in result.stderr
     assert "no truth of this name" in result.stderr
