@@ -31,6 +31,10 @@ class OutputConflictError(InputError):
     """Option ``-o`` that does not suit the number or the names of the sessions."""
 
 
+FILE_ENDINGS = (".csv", ".html", ".json", ".parquet", ".pdf", ".png", ".toml", ".tum", ".txt")
+"""Endings that no new folder of solutions has: its name was meant as that of a file."""
+
+
 def plan_outputs(
     sessions: Sequence[str], output: str | None, *, is_folder: bool = False
 ) -> list[str]:
@@ -49,7 +53,8 @@ def plan_outputs(
     Raises
     ------
     OutputConflictError
-        A file for several sessions, or two sessions with the same output.
+        A file for several sessions, two sessions with the same output, or a folder with the name of
+        a file.
     OutputExistsError
         The folder is a file.
     """
@@ -61,6 +66,12 @@ def plan_outputs(
         return [output]
     if len(sessions) > 1 and output.endswith(".mcap") and (is_url or not Path(output).is_dir()):
         raise OutputConflictError(f"{len(sessions)} sessions need a folder, but -o names a file")
+    if output.lower().endswith(FILE_ENDINGS) and (is_url or not Path(output).is_dir()):
+        name = file_names.file_name(output)
+        raise OutputConflictError(
+            f"-o is a folder for the solutions here, and {name!r} is the name of a file; "
+            "`locatk export` writes tables of the solutions in a folder"
+        )
     by_stem: dict[str, str] = {}
     for session in sessions:
         stem = file_names.stem(session)

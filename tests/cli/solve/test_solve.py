@@ -217,6 +217,12 @@ def test_twins_and_files_for_folders_are_refused(locatk, record, tmp_path: Path)
     (tmp_path / "file").write_text("x")
     assert locatk("solve", *others, "-o", tmp_path / "file").exit_code == 1
     assert locatk("solve", *others, "-o", tmp_path / "file.mcap").exit_code == 2
+    refused = locatk("solve", *others, "-o", tmp_path / "poses.CSV")
+    assert refused.exit_code == 2
+    assert "`locatk export` writes tables" in refused.stderr
+    assert not (tmp_path / "poses.CSV").exists()
+    (tmp_path / "old.csv").mkdir()
+    assert locatk("solve", *others, "-o", tmp_path / "old.csv").exit_code == 0
     scene = ("--save-scene", tmp_path / "scene.toml")
     assert locatk("solve", *others, "-o", tmp_path / "out", *scene).exit_code == 2
 
