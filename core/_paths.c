@@ -11,6 +11,15 @@ enum { MAX_BAND = 256, MAX_COLUMNS = 1 << 20 };
 /* Number of right-hand sides that are solved together: their rows in a band stay in the cache. */
 enum { STRIP = 32 };
 
+/* Subtract `weight` times `other` from `sum`. A full strip has a length that the compiler knows. */
+static inline void subtract_row(double *sum, double weight, const double *other, int width)
+{
+    if (width == STRIP)
+        for (int c = 0; c < STRIP; c++) sum[c] -= weight * other[c];
+    else
+        for (int c = 0; c < width; c++) sum[c] -= weight * other[c];
+}
+
 /* Solve for `width` right-hand sides from `first`, by the factor alone if `is_half`. `factor`
  * (n, band) has in row j the elements (j, j) to (j + band - 1, j) of the Cholesky factor. */
 HOT static void solve_strip(const double *factor, long long n, int band, long long m,
@@ -20,27 +29,15 @@ HOT static void solve_strip(const double *factor, long long n, int band, long lo
     for (long long i = 0; i < n; i++) {
         double *own = solution + i * m + first;
         for (int c = 0; c < width; c++) sum[c] = own[c];
-        for (long long j = i - band + 1 > 0 ? i - band + 1 : 0; j < i; j++) {
-            const double weight = factor[j * band + (i - j)];
-            const double *other = solution + j * m + first;
-            if (width == STRIP)
-                for (int c = 0; c < STRIP; c++) sum[c] -= weight * other[c];
-            else
-                for (int c = 0; c < width; c++) sum[c] -= weight * other[c];
-        }
+        for (long long j = i - band + 1 > 0 ? i - band + 1 : 0; j < i; j++)
+            subtract_row(sum, factor[j * band + (i - j)], solution + j * m + first, width);
         for (int c = 0; c < width; c++) own[c] = sum[c] / factor[i * band];
     }
     for (long long i = is_half ? -1 : n - 1; i >= 0; i--) {
         double *own = solution + i * m + first;
         for (int c = 0; c < width; c++) sum[c] = own[c];
-        for (long long j = i + 1; j < n && j < i + band; j++) {
-            const double weight = factor[i * band + (j - i)];
-            const double *other = solution + j * m + first;
-            if (width == STRIP)
-                for (int c = 0; c < STRIP; c++) sum[c] -= weight * other[c];
-            else
-                for (int c = 0; c < width; c++) sum[c] -= weight * other[c];
-        }
+        for (long long j = i + 1; j < n && j < i + band; j++)
+            subtract_row(sum, factor[i * band + (j - i)], solution + j * m + first, width);
         for (int c = 0; c < width; c++) own[c] = sum[c] / factor[i * band];
     }
 }

@@ -70,10 +70,15 @@ class BlockTridiagonal:
         flat = right.reshape(self.count * self.size, -1)
         return np.asarray(dtbtrs(self._factor, flat, uplo="L")[0].reshape(right.shape))
 
+    @cached_property
+    def _columns(self) -> Array:
+        """The columns of the factor, contiguous: (k d, 2 d)."""
+        return np.ascontiguousarray(self._factor.T)
+
     def _solve_compiled(self, right: Array, *, is_half: bool) -> Array:
         assert kernels is not None
         solution = np.array(right, np.float64, order="C")
-        factor = np.ascontiguousarray(self._factor.T)
+        factor = self._columns
         columns = solution.size // len(factor)
         kernels.solve_band(factor, len(factor), factor.shape[1], columns, is_half, solution)
         return solution

@@ -39,8 +39,9 @@ MAX_JUMP_RAD = 0.6
 MAX_TURN_RATE_RAD_S = 1.0
 """Largest rate of turn during a gap between rough poses, in addition."""
 
-MAX_FLIP_S = 1.5
-"""Half the longest time with a wrong orientation that is interpolated."""
+JUMP_COST_S = 1.5
+"""Time of the poses that are given up rather than keep a jump of the orientation. A wrong orientation
+between two jumps is left out if it lasts less than twice as long."""
 
 MAX_CHAIN_PARTS = 200
 """Most parts between two parts of which one follows from the other."""
@@ -142,14 +143,14 @@ def without_flips(trajectory: Trajectory) -> Trajectory:
 
     A coplanar device has two poses that explain its angles almost equally. Of the parts between
     jumps of the orientation, those are kept that follow from each other and have the most poses; a
-    jump that remains costs as many poses as :data:`MAX_FLIP_S` has.
+    jump that remains costs as many poses as :data:`JUMP_COST_S` has.
     """
     if len(trajectory) < 2:
         return trajectory
     quaternion, time_s = trajectory.quaternion, 1e-9 * (trajectory.time_ns - trajectory.time_ns[0])
     edge = np.flatnonzero(_turn(quaternion[:-1], quaternion[1:]) > MAX_JUMP_RAD) + 1
     start, stop = np.r_[0, edge], np.r_[edge, len(trajectory)]
-    jump_cost = MAX_FLIP_S / float(np.median(np.diff(time_s)))
+    jump_cost = JUMP_COST_S / float(np.median(np.diff(time_s)))
     # The largest number of poses in a chain that ends with each part, and the part before it.
     poses, previous = (stop - start).astype(float), np.full(len(start), -1)
     for part in range(1, len(start)):

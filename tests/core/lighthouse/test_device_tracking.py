@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from locatk.core.geometry import rotation_exp
 from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION, Calibration, predict_angles
@@ -33,6 +34,7 @@ from locatk.core.lighthouse.devices.tracking import (
     resolve_conflicts,
     solve_seeds,
     track_device,
+    track_devices,
     truncated_cost,
 )
 from locatk.core.lighthouse.devices.verification import (
@@ -45,6 +47,7 @@ from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.trajectory import Trajectory
+from locatk.formats.benchmarks.lighthouse.flights import make_flight
 
 Array = NDArray[np.float64]
 
@@ -355,6 +358,17 @@ def test_epochs_with_too_few_sweeps_within_the_final_gate_are_rejected(
     assert len(calls) == 2
     assert len(tracked.trajectory) == len(calls[1]) - 4
     assert tracked.rejected == {"moment_with_too_few_sweeps": 4}
+
+
+@pytest.mark.slow
+def test_initial_poses_of_an_inexact_scene_have_the_right_orientations() -> None:
+    """With the noise of exact geometry, a quarter of the orientations is wrong."""
+    flight = make_flight(10, motion="agile", duration_s=3.0, geometry="given")
+    (track,) = track_devices(flight.sweeps, flight.receivers, flight.scene)
+    _, rotation = flight.true_poses(track.trajectory.time_ns)
+    error = (Rotation.from_quat(track.trajectory.quaternion) * rotation.inv()).magnitude()
+    assert len(error) > 145
+    assert np.mean(error > 0.5) < 0.05
 
 
 # ---- verification

@@ -7,7 +7,7 @@ independently of the solver.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -25,7 +25,12 @@ from locatk.core.lighthouse.calibration import (
 from locatk.core.lighthouse.devices import solver as device_solver
 from locatk.core.lighthouse.devices.tracking import TrackedDevice
 from locatk.core.lighthouse.devices.trajectories import refine_tracks
-from locatk.core.lighthouse.motion.consistency import find_contradictions, residual_statistics
+from locatk.core.lighthouse.motion.consistency import (
+    agrees_with_most,
+    find_contested,
+    find_contradictions,
+    residual_statistics,
+)
 from locatk.core.lighthouse.motion.equations import (
     WEAK_RATE_SIGMA,
     NormalEquations,
@@ -643,6 +648,18 @@ def test_a_device_may_turn_while_it_is_hidden() -> None:
     assert len(without_flips(replace(trajectory, quaternion=quaternion, time_ns=time_ns))) == 25
 
 
+def test_a_single_wrong_pose_after_a_pause_is_left_out() -> None:
+    """It follows from the pose before the pause, but not the poses after it from it."""
+    trajectory = spinning("." * 40)
+    time_ns, quaternion = trajectory.time_ns.copy(), trajectory.quaternion.copy()
+    time_ns[20:] += 500_000_000
+    quaternion[20] = (
+        Rotation.from_quat(quaternion[20]) * Rotation.from_rotvec([0.9, 0, 0])
+    ).as_quat()
+    kept = without_flips(replace(trajectory, time_ns=time_ns, quaternion=quaternion))
+    assert np.array_equal(kept.time_ns, np.delete(time_ns, 20))
+
+
 # ---- outliers
 
 
@@ -676,6 +693,43 @@ def test_rejected_sweeps_come_back_if_they_agree() -> None:
     assert contradictions({}, [250]) == ([], [250])
     assert contradictions({250: 5e-3}, [250]) == ([], [])
     assert contradictions({250: 5e-3}, [250, 251]) == ([], [251])
+
+
+def sweeps_of_knots(per_knot: int, knots: int = 60) -> PathSweeps:
+    """Return sweeps of which only knots and stations, two by turns, are known."""
+    knot = np.repeat(np.arange(knots), per_knot)
+    station = np.arange(len(knot)) % 2
+    return cast(PathSweeps, np.rec.fromarrays([knot, station], names="knot,station"))
+
+
+@pytest.mark.parametrize(
+    ("rejected", "contested"), [([], False), ([30], False), ([30, 31, 32], True)]
+)
+def test_short_runs_of_rejected_sweeps_are_contested(rejected: list[int], contested: bool) -> None:
+    sweeps = sweeps_of_knots(4)
+    result = find_contested(sweeps, ~np.isin(sweeps.knot, rejected))
+    assert result[sweeps.knot == 30].all() == contested
+    assert not result[(sweeps.knot < 20) | (sweeps.knot > 42)].any()
+
+
+def test_a_station_whose_sweeps_mostly_contradict_agrees_nowhere() -> None:
+    sweeps = sweeps_of_knots(4)
+    agrees = np.ones(len(sweeps), bool)
+    reflected = (sweeps.station == 1) & (sweeps.knot >= 20) & (sweeps.knot < 40)
+    agrees[reflected] = False
+    agrees[np.flatnonzero(reflected)[::4]] = True
+    result = agrees_with_most(sweeps, agrees)
+    assert not result[(sweeps.station == 1) & (sweeps.knot > 23) & (sweeps.knot < 36)].any()
+    assert result[sweeps.station == 0].all()
+
+
+@pytest.mark.slow
+def test_reflections_that_agree_with_each_other_are_rejected_together() -> None:
+    """Without the comparison by stations the median is 16 mm."""
+    flight = make_flight(1, motion="slow", duration_s=12.0, geometry="unknown", reflections=0.1)
+    solution = solve(flight.sweeps, flight.scene, receivers=flight.receivers)
+    score = score_flight(flight, solution.trajectories[0])
+    assert summarize(score)["rigid median"] < 9.0
 
 
 # ---- independent flights

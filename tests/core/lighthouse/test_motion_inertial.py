@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from locatk.core.geometry import rotation_exp
 from locatk.core.inertial import InertialSamples
@@ -116,6 +117,7 @@ def test_intervals_without_samples_have_no_factor() -> None:
     assert imu.interval.tolist() == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_wrong_axes_are_left_out() -> None:
     flight = make_flight(21, motion="agile", geometry="given", duration_s=8.0)
     wrong = replace(
@@ -123,13 +125,15 @@ def test_wrong_axes_are_left_out() -> None:
         acceleration=flight.imu.acceleration[:, [1, 2, 0]],
         angular_rate=flight.imu.angular_rate[:, [1, 2, 0]],
     )
+    without_rate = replace(flight.imu, angular_rate=np.full_like(flight.imu.angular_rate, np.nan))
     solutions = [
         solve(flight.sweeps, flight.scene, receivers=flight.receivers, imu=imu)
-        for imu in ((), (flight.imu,), (wrong,))
+        for imu in ((), (flight.imu,), (wrong,), (without_rate,))
     ]
     codes = [{warning.code for warning in s.warnings} for s in solutions]
-    assert ["imu_contradicts_light" in c for c in codes] == [False, False, True]
-    (without,), (_,), (contradicting,) = (s.trajectories for s in solutions)
+    assert ["imu_contradicts_light" in c for c in codes] == [False, False, True, False]
+    assert ["imu_not_used" in c for c in codes] == [False, False, False, True]
+    (without,), (_,), (contradicting,), (_,) = (s.trajectories for s in solutions)
     shared = np.isin(contradicting.time_ns, without.time_ns)
     rows = np.searchsorted(without.time_ns, contradicting.time_ns[shared])
     difference = contradicting.position[shared] - without.position[rows]

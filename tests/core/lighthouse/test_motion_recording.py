@@ -68,6 +68,7 @@ def test_parts_are_as_accurate_as_the_whole(
     assert step.max() < 2e-3
 
 
+@pytest.mark.slow
 def test_a_part_without_agreement_has_no_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = make_flight(7, duration_s=12.0, motion="slow", geometry="given")
     follow, calls = recording.follow_path, []
@@ -109,6 +110,28 @@ def test_each_device_has_its_part_of_the_poses(
     assert second.time_ns.min() >= middle_ns - 20e6
     for trajectory in (first, second):
         assert errors(flight, trajectory).max() < 0.01
+
+
+def test_a_device_without_agreement_has_no_poses() -> None:
+    """Most sweeps of the second device are rejected; the first agrees with all."""
+    device = np.repeat([0, 1], 30)
+    estimate = SimpleNamespace(
+        sweep=np.arange(60),
+        is_left_out=np.zeros(1, bool),
+        is_used=(device == 0) | (np.arange(60) % 6 == 0),
+        device=np.repeat([0, 1], 5),
+    )
+    sweeps = np.rec.fromarrays([np.zeros(30, np.int64)], names="station")
+    paths = SimpleNamespace(sweeps=[sweeps, sweeps], start=[range(9), range(9)])
+    sample = recording.PathSample(cast(recording.PathEstimate, estimate), (0, 1), True)
+    good, bad = (
+        recording.PathRecording._of_sample(cast(recording.PathRecording, paths), k, sample)
+        for k in range(2)
+    )
+    assert good.knots.tolist() == list(range(5))
+    assert good.rows.tolist() == list(range(30))
+    assert bad.estimate is None
+    assert bad.rough_poses == 9
 
 
 # ---- moved stations
