@@ -40,8 +40,8 @@ MAX_TURN_RATE_RAD_S = 1.0
 """Largest rate of turn during a gap between rough poses, in addition."""
 
 JUMP_COST_S = 1.5
-"""Time of the poses that are given up rather than keep a jump of the orientation. A wrong orientation
-between two jumps is left out if it lasts less than twice as long."""
+"""Time of the poses that are given up rather than keep a jump of the orientation. A wrong
+orientation between two jumps is left out if it lasts less than twice as long."""
 
 MAX_CHAIN_PARTS = 200
 """Most parts between two parts of which one follows from the other."""

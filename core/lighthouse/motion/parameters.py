@@ -64,9 +64,9 @@ FACTORY_SIGMA[[OGEEMAG, OGEEPHASE]] = 0.12
 the sign of the ogee terms cannot be told: its deviation is half a usual magnitude."""
 
 PHOTODIODE_SIGMA_M = 4.5e-4
-"""Standard deviation of each coordinate of a photodiode, for the tolerance of its board and the point
-that receives light. An assumption, not a measurement. A Lighthouse deck is 30 mm by 15 mm, so that
-the scale of a scene without other known distances is uncertain by 1 to 2 %."""
+"""Standard deviation of each coordinate of a photodiode, for the tolerance of its board and the
+point that receives light. An assumption, not a measurement. A Lighthouse deck is 30 mm by 15 mm, so
+that the scale of a scene without other known distances is uncertain by 1 to 2 %."""
 
 BIAS_SIGMA_RAD = 1.5e-4
 """Standard deviation of the bias of an angle that is particular to a photodiode and a plane: cover
