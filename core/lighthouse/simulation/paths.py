@@ -34,6 +34,10 @@ LEG_DURATION_S, REST_DURATION_S = (5.0, 12.0), (0.5, 2.0)
 MARKER_VISIT_S, CARRY_S = 2.0, 1.0
 """Time for which a robot rests on each marker, and for which it is carried to the next one [s]."""
 
+MIN_MARKER_VISIT_S, MIN_CARRY_S = 0.25, 0.5
+"""Shortest of these in a short session: two reports of a robot that reports ten times a second, and
+a speed that a hand reaches [s]."""
+
 FLIGHT_CENTRE_M, FLIGHT_HALF_RANGE_M = np.array([0.0, 0.0, 0.75]), np.array([0.8, 0.8, 0.4])
 """Centre of the volume in which robots fly, and half of its size [m]."""
 
@@ -147,7 +151,8 @@ class StopAndGo:
 class MarkerTour:
     """Rests on markers, before a robot moves by itself.
 
-    In a session that is too short, the markers are visited faster, in its first half.
+    It ends in the first half of the session. If this is short, rests and carries are shorter, down
+    to limits; then it takes up to three quarters of the session, and leaves out the last markers.
 
     Parameters
     ----------
@@ -169,17 +174,19 @@ class MarkerTour:
     """
 
     def __init__(self, duration_s: float, markers: Array, destination: Array) -> None:
-        k = len(markers)
-        time_scale = min(1.0, duration_s / 2 / (k * (MARKER_VISIT_S + CARRY_S))) if k else 1.0
-        arrival_s = time_scale * (MARKER_VISIT_S + CARRY_S) * np.arange(k, dtype=float)
-        departure_s = arrival_s + time_scale * MARKER_VISIT_S
+        longest_s, shortest_s = MARKER_VISIT_S + CARRY_S, MIN_MARKER_VISIT_S + MIN_CARRY_S
+        k = min(len(markers), int(0.75 * duration_s / shortest_s))
+        marker_s = min(max(0.5 * duration_s / max(k, 1), shortest_s), longest_s)
+        carry_s = max(MIN_CARRY_S, marker_s * CARRY_S / longest_s)
+        arrival_s = marker_s * np.arange(k, dtype=float)
+        departure_s = arrival_s + marker_s - carry_s
         self.visits_s = np.stack([arrival_s, departure_s], axis=1)
-        self.end_s = time_scale * (MARKER_VISIT_S + CARRY_S) * k
+        self.end_s = marker_s * k
         carry_end_s = np.r_[arrival_s[1:], [self.end_s][:k]]
         self.carry_edges_s = np.stack([departure_s, carry_end_s], axis=1).ravel()
         if k:
-            self._progress = StopAndGo(departure_s, np.full(k, time_scale * CARRY_S), np.ones(k))
-            self._stops = np.vstack([markers, destination])
+            self._progress = StopAndGo(departure_s, np.full(k, carry_s), np.ones(k))
+            self._stops = np.vstack([markers[:k], destination])
 
     def place(self, position: Array, time_s: Array) -> None:
         """Replace the positions (..., 3) at times (...) of the tour, in place."""

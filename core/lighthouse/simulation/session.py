@@ -403,11 +403,11 @@ def _to_sweeps(
 
 
 def _visited_markers(markers_m: Array, device: str, visits_s: Array) -> tuple[Marker, ...]:
-    """Return markers that a device visited at ``visits_s`` (k, 2), starts and ends."""
+    """Return the first k markers; ``visits_s`` (k, 2) are starts and ends of their visits."""
     visits_ns = stamps_ns(visits_s)
     return tuple(
         Marker(f"marker-{k + 1}", position, (MarkerVisit(device, int(start), int(end)),))
-        for k, (position, (start, end)) in enumerate(zip(markers_m, visits_ns, strict=True))
+        for k, (position, (start, end)) in enumerate(zip(markers_m, visits_ns, strict=False))
     )
 
 

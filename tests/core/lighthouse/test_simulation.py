@@ -423,6 +423,17 @@ def test_the_first_robot_rests_on_the_markers(planar: bool) -> None:
         assert not np.any((truth.time_ns > start) & (truth.time_ns < end))
 
 
+@pytest.mark.parametrize(("duration_s", "visited"), [(2.0, 2), (3.0, 3), (5.0, 4), (10.0, 4)])
+def test_short_sessions_visit_markers_without_haste(duration_s: float, visited: int) -> None:
+    session = simulate(SimulationOptions(duration_s=duration_s, robots=1, seed=3))
+    visits = [visit for marker in session.scene.markers for visit in marker.visits]
+    assert len(visits) == visited
+    times = np.array([(visit.start_ns, visit.end_ns) for visit in visits], np.float64) * 1e-9
+    assert np.min(times[:, 1] - times[:, 0]) > 0.24
+    assert np.min(times[1:, 0] - times[:-1, 1]) > 0.49
+    assert times[-1, 1] - times[0, 0] < 0.75 * duration_s - 0.49
+
+
 # ---- faults
 
 
