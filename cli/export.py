@@ -35,6 +35,12 @@ ENDINGS = {
 }
 """Endings of the names of each format."""
 
+OWN_ENDINGS = {
+    name: tuple(ending for ending in endings if ending != ".txt")
+    for name, endings in ENDINGS.items()
+}
+"""Endings by which a format is recognised."""
+
 MIN_AREA_MM, MAX_AREA_MM = 100, 100_000
 """Shortest and longest side of a floor of DotBots; their coordinates end at 100 m."""
 
@@ -71,8 +77,7 @@ def _parse_area(
     "--format",
     "format_name",
     type=click.Choice((*FORMATS, *STATION_FORMATS)),
-    required=True,
-    help="Format of the output.",
+    help="Format of the output.  [default: by the ending of the output]",
 )
 @options.output(
     "File to write; a folder for `tum` and `kitti` with several devices; `-` writes `csv` or "
@@ -111,7 +116,7 @@ def _parse_area(
 @options.verbosity
 def command(
     names: tuple[Path, ...],
-    format_name: str,
+    format_name: str | None,
     output: Path,
     devices: tuple[str, ...],
     onboard: bool,
@@ -147,9 +152,9 @@ def command(
 
     \b
     Examples:
-      locatk export solved.mcap --format csv -o poses.csv
-      locatk export solved/ --format parquet -o all.parquet
-      locatk export solved.mcap --format tum -o poses.tum
+      locatk export solved.mcap -o poses.csv
+      locatk export solved/ -o all.parquet
+      locatk export solved.mcap -o poses.tum
       locatk export solved.mcap --format ros2 -o poses.mcap
       locatk export solved.mcap --format csv -o -
       locatk export solved.mcap --format crazyflie-config -o lighthouse.yaml
@@ -161,6 +166,10 @@ def command(
     from locatk.formats.exporters import export as exports
     from locatk.formats.sessions.solutions import read_trajectories
 
+    if format_name is None:
+        if output == STDOUT:
+            raise click.UsageError("-o - needs --format csv or --format tum.")
+        format_name = options.choose_format(output, None, OWN_ENDINGS)
     if covariance and format_name != "ros2":
         raise click.UsageError(
             "--covariance is for --format ros2; csv and parquet always contain it."

@@ -206,10 +206,10 @@ def command(
         )
 
     found, is_several = find_estimates(estimates)
+    options.must_exist(found)
     if is_several or table is not None:
         evaluate_several(found, evaluated, table, overwrite=overwrite, as_json=as_json)
         return
-    options.must_exist(found)
     one = evaluated(found[0])
     for note in one.notes:
         console.say(note)

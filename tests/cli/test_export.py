@@ -124,6 +124,17 @@ def test_other_formats_hold_one_solution(locatk, solved: Path, tmp_path: Path, k
     assert not (tmp_path / "out").exists()
 
 
+def test_the_ending_is_the_format(locatk, solved: Path, tmp_path: Path) -> None:
+    for name in ("a.csv", "a.tum", "a.mcap"):
+        assert locatk("export", solved, "-o", tmp_path / name).exit_code == 0
+        assert (tmp_path / name).stat().st_size > 100
+    assert (tmp_path / "a.csv").read_text().startswith("time_s,device,")
+    for output, problem in (("a.txt", "'a.txt' is not a known format"), ("-", "--format csv")):
+        result = locatk("export", solved, "-o", output)
+        assert result.exit_code == 2
+        assert problem in result.stderr
+
+
 def test_kitti_writes_times_to_a_second_file(locatk, solved: Path, tmp_path: Path) -> None:
     out = tmp_path / "poses.txt"
     result = locatk("export", solved, "--format", "kitti", "-o", out)
