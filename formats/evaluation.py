@@ -6,7 +6,6 @@ two methods, are compared with each other by paired differences.
 
 from __future__ import annotations
 
-import glob
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.natural_order import natural_key
 from locatk.formats.importers import trajectories as files
+from locatk.formats.pipeline.file_search import expand_name
 
 TRUTH_ENDINGS = (".mcap", ".tum", ".csv", ".txt", ".kitti")
 """Endings of files with truth in a folder, in the order in which they are looked for."""
@@ -229,23 +229,19 @@ def find_estimates(names: Sequence[Path]) -> tuple[list[Path], bool]:
     found: dict[Path, None] = {}
     is_several = len(names) > 1
     for name in names:
+        expanded = expand_name(str(name))
+        if expanded is None:
+            found[name] = None
+            continue
+        is_several = True
+        candidates = [Path(file) for file in expanded]
         if name.is_dir():
-            is_several = True
-            inside = sorted(name.glob("*.mcap"), key=lambda path: natural_key(path.name))
-            solutions = [path for path in inside if _may_be_solution(path)]
-            if not solutions:
+            candidates = [file for file in candidates if _may_be_solution(file)]
+            if not candidates:
                 raise MissingDataError(
                     "no solution in the folder", file=name, hint="Solve it: `locatk solve`"
                 )
-            found.update(dict.fromkeys(solutions))
-        elif not name.exists() and glob.has_magic(str(name)):
-            is_several = True
-            matches = [Path(m) for m in glob.glob(str(name), recursive=True)]
-            if not matches:
-                raise MissingDataError("no file matches the pattern", file=name)
-            found.update(dict.fromkeys(sorted(matches, key=lambda path: natural_key(str(path)))))
-        else:
-            found[name] = None
+        found.update(dict.fromkeys(candidates))
     return list(found), is_several
 
 

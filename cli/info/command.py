@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,18 +10,24 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.command import Command
-from locatk.cli.info.text import text
+from locatk.cli.info.text import overview, text
+from locatk.core.errors import LocatkError
 
 if TYPE_CHECKING:
     from locatk.formats.sessions.reader import Session
 
+ENDINGS = (".mcap", ".toml")
+"""Endings of the files of a folder that are described."""
+
 
 @click.command(cls=Command, short_help="Describe a session, a solution or an artifact.")
-@options.input_argument("file")
+@click.argument("names", metavar="FILE...", nargs=-1, required=True)
 @options.as_json
 @options.verbosity
-def command(file: Path, as_json: bool) -> None:
+def command(names: tuple[str, ...], as_json: bool) -> None:
     """Describe FILE: a session or solution (.mcap, also of other tools), or an artifact (.toml).
+
+    Several files, a folder or a pattern are listed in a table, one line each.
 
     Artifacts are Lighthouse scenes and receivers; manifests of dot sheets and cameras; tags and
     sensor arrays; maps of landmarks and hall sensors.
@@ -38,6 +44,7 @@ def command(file: Path, as_json: bool) -> None:
     Examples:
       locatk info run.mcap
       locatk info run.mcap --json
+      locatk info recordings/
       locatk info solved.mcap
       locatk info scene.toml
       locatk info receiver.toml
@@ -45,8 +52,13 @@ def command(file: Path, as_json: bool) -> None:
       locatk info tag.toml
       locatk info map.toml
     """
-    facts = _artifact(file) if file.suffix.lower() == ".toml" else _recording(file)
-    facts = {"version": 1, "file": str(file), "bytes": file.stat().st_size, **facts}
+    from locatk.formats.pipeline.file_search import expand_name
+
+    if len(names) > 1 or expand_name(names[0], ENDINGS) is not None:
+        _describe_several(names, as_json=as_json)
+        return
+    file = Path(names[0])
+    facts = {"version": 1, **_describe(file)}
     if as_json:
         console.emit_json(facts)
     else:
@@ -54,6 +66,55 @@ def command(file: Path, as_json: bool) -> None:
     if facts.get("damage"):
         hint = "; `locatk recover` saves the rest" if facts["recoverable"] else ""
         raise failures.Incomplete(f"{file}: {facts['damage']}{hint}")
+
+
+def _describe_several(names: Sequence[str], *, as_json: bool) -> None:
+    """List files, one line each; those that cannot be read at the end."""
+    from locatk.formats.pipeline.file_search import expand_name
+
+    described: list[dict[str, Any]] = []
+    failures_by_file: dict[Path, LocatkError] = {}
+    found: dict[Path, None] = {}
+    for name in names:
+        try:
+            found.update(dict.fromkeys(map(Path, expand_name(name, ENDINGS) or [name])))
+        except LocatkError as error:
+            failures_by_file[Path(name)] = error
+    files, count = list(found), len(found) + len(failures_by_file)
+    with console.progress(files, "Reading") as items:
+        for file in items:
+            try:
+                described.append(_describe(file))
+            except LocatkError as error:
+                failures_by_file[file] = error
+    if as_json:
+        unread = [
+            {"file": file, "error": error.message, "hint": error.hint}
+            for file, error in failures_by_file.items()
+        ]
+        console.emit_json({"version": 1, "files": described, "failures": unread})
+    elif described:
+        console.result(overview(described))
+    damaged = [facts for facts in described if facts.get("damage")]
+    for facts in damaged:
+        console.warn(f"{facts['file']} is damaged: {facts['damage']}")
+    for file, error in failures_by_file.items():
+        console.warn(f"{file} was not described: {error.message}")
+    if failures_by_file:
+        raise LocatkError(
+            f"{len(failures_by_file)} of {count} files could not be described",
+            hint="The warnings above say why",
+        )
+    if damaged:
+        raise failures.Incomplete(
+            f"{len(damaged)} of {count} files are damaged; `locatk recover` saves the rest"
+        )
+
+
+def _describe(file: Path) -> dict[str, Any]:
+    """Read and describe a file."""
+    facts = _artifact(file) if file.suffix.lower() == ".toml" else _recording(file)
+    return {"file": str(file), "bytes": file.stat().st_size, **facts}
 
 
 def _artifact(file: Path) -> dict[str, Any]:

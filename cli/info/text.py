@@ -18,10 +18,16 @@ MAX_ROWS = 20
 MAX_MAP_CELLS = 5_000
 """Number of cells of the largest map that is drawn."""
 
+MAX_DEVICES = 3
+"""Number of devices that the overview of several files names."""
+
 KNOWN_METADATA = {
     ("locatk", key) for key in ("format_version", "tool_version", "kind", "system", "provisional")
 }
 """Entries that the first lines show."""
+
+POSE_PREFIX = "/pose/"
+"""Topics of the poses of a solution."""
 
 SIMULATION_PREFIX = "simulated_"
 """Prefix of the options and the truth of a simulation, which are many and long."""
@@ -329,6 +335,53 @@ def _by(pair: Sequence[float] | None) -> str:
     return "-" if pair is None else f"{pair[0]:.6g} x {pair[1]:.6g}"
 
 
+def overview(described: Sequence[dict[str, Any]]) -> str:
+    """Format the facts of several files, one line each."""
+    header = ("file", "kind", "system", "start", "duration", "poses", "devices")
+    rows = []
+    for facts in described:
+        start = when(facts.get("start_ns"))
+        rows.append(
+            (
+                facts["file"],
+                facts.get("kind") or "other",
+                facts.get("system") or "",
+                start and start[:16].replace("T", " "),
+                _seconds(facts.get("duration_s"), digits=1),
+                _poses(facts),
+                _few(_devices(facts)),
+            )
+        )
+    # Columns that are empty for all files are left out.
+    used = [i for i in range(len(header)) if any(row[i] not in (None, "") for row in rows)]
+    return console.table(
+        [header[i] for i in used], [[row[i] for i in used] for row in rows], max_width=100
+    )
+
+
+def _devices(facts: dict[str, Any]) -> list[str]:
+    """Return the devices of a session, or those with poses in a solution, in natural order."""
+    from locatk.core.natural_order import natural_key
+
+    topics = [stream["topic"] for stream in facts.get("streams", ())]
+    solved = [topic.removeprefix(POSE_PREFIX) for topic in topics if topic.startswith(POSE_PREFIX)]
+    return sorted(facts.get("devices") or solved, key=natural_key)
+
+
+def _few(devices: Sequence[str]) -> str:
+    """Name a few devices, and count the others."""
+    others = len(devices) - MAX_DEVICES
+    named = ", ".join(devices[: MAX_DEVICES if others > 1 else None])
+    return f"{named} and {others} others" if others > 1 else named
+
+
+def _poses(facts: dict[str, Any]) -> int | None:
+    """Return the number of poses of a solution."""
+    streams = facts.get("streams", ())
+    counts = [s["messages"] for s in streams if s["topic"].startswith(POSE_PREFIX)]
+    return sum(counts) if counts else None
+
+
 def when(time_ns: int | None) -> str | None:
     """Format a time of a recording in UTC."""
     if time_ns is None:
@@ -339,8 +392,8 @@ def when(time_ns: int | None) -> str | None:
         return f"{time_ns} ns"
 
 
-def _seconds(value: float | None) -> str | None:
-    return None if value is None else f"{value:.3f} s"
+def _seconds(value: float | None, digits: int = 3) -> str | None:
+    return None if value is None else f"{value:.{digits}f} s"
 
 
 def _known(value: object) -> object:

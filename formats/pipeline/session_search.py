@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import glob
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import IO
 
-from locatk.core.errors import InputError, LocatkError, MissingDataError
+from locatk.core.errors import LocatkError, MissingDataError
 from locatk.formats.pipeline.file_access import MAX_REQUESTS, remote
-from locatk.formats.pipeline.file_names import absolute, is_url, is_web
+from locatk.formats.pipeline.file_names import absolute, is_url
+from locatk.formats.pipeline.file_search import expand_name
 from locatk.formats.sessions.mcap_file import SESSION_RECORD, DamageError
 from locatk.formats.sessions.reader import Session, read_index
 
@@ -43,8 +43,7 @@ def find_sessions(
 ) -> FoundSessions:
     """Expand paths, folders, patterns and URLs to sessions.
 
-    A folder stands for its `*.mcap` files, sorted, without subfolders; a pattern for its matches,
-    with `**` for any depth. Solutions among these files are skipped.
+    See :func:`.file_search.expand_name`. Solutions in folders and patterns are skipped.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ def find_sessions(
     possible_solutions: dict[str, str] = {}
     has_folder = False
     for name in names:
-        expanded = _expand(name)
+        expanded = expand_name(name)
         has_folder = has_folder or expanded is not None
         for location in [name] if expanded is None else expanded:
             key = _link_key(location)
@@ -98,70 +97,6 @@ def _link_key(location: str) -> str:
         return location
     folder, name = os.path.split(absolute(location))
     return os.path.join(os.path.realpath(folder), name)
-
-
-def _expand(name: str) -> list[str] | None:
-    """Return the files of a folder or a pattern; None if the name is that of one file."""
-    if not name:
-        raise InputError("a file name is empty", hint="Check the variables of the shell")
-    if "\0" in name:
-        raise InputError("a file name with a zero byte", file=name)
-    if is_url(name):
-        return _expand_url(name)
-    if os.path.isdir(name):
-        files = _matching_files(os.path.join(glob.escape(name), "*.mcap"))
-        return _require_files(sorted(files), name, "no *.mcap in the folder")
-    if os.path.exists(name):
-        return None
-    if glob.has_magic(name):
-        return _require_files(sorted(_matching_files(name)), name, "no file matches the pattern")
-    raise MissingDataError(
-        "No such file or folder", file=name, hint="Check the spelling of the path"
-    )
-
-
-def _matching_files(pattern: str) -> list[str]:
-    """Return the matches of a pattern, without folders: one may be called `old.mcap`.
-
-    As in shells, `**` does not follow links to folders, which may form a circle.
-    """
-    parts = pattern.replace(os.sep, "/").split("/")
-    if "**" not in parts:
-        return [path for path in glob.glob(pattern) if not os.path.isdir(path)]
-    depth = parts.index("**")
-    below = "/".join(parts[depth + 1 :]) or "*"
-    files: list[str] = []
-    for top in glob.glob("/".join([*parts[:depth], ""])) if depth else [""]:
-        for folder, subfolders, _ in os.walk(top or os.curdir):
-            subfolders[:] = [name for name in subfolders if not name.startswith(".")]
-            start = os.path.relpath(folder) if not top else folder
-            prefix = "" if start == "." else glob.escape(start)
-            files += _matching_files(os.path.join(prefix, below))
-    return files
-
-
-def _expand_url(url: str) -> list[str] | None:
-    if is_web(url):
-        return None
-    with remote(url) as (store, key):
-        store.invalidate_cache()
-        is_pattern = glob.has_magic(url)
-        if not url.endswith("/") and not is_pattern:
-            if store.isfile(key):
-                return None
-            if not store.isdir(key):
-                raise FileNotFoundError(url)
-        pattern = key if is_pattern else f"{key.rstrip('/')}/*.mcap"
-        files = [str(store.unstrip_protocol(path)) for path in store.glob(pattern)]
-    problem = "no file matches the pattern" if is_pattern else "no *.mcap in the folder"
-    return _require_files(sorted(files), url, problem)
-
-
-def _require_files(files: list[str], name: str, problem: str) -> list[str]:
-    if not files:
-        hint = "Check the spelling, and that there are sessions"
-        raise MissingDataError(problem, file=name, hint=hint)
-    return files
 
 
 def read_facts(location: str) -> dict[str, str]:

@@ -164,9 +164,9 @@ def test_folders_patterns_and_files(
     (tmp_path / "day" / "a.mcap").rename(tmp_path / "day" / "deep" / "a.mcap")
     monkeypatch.chdir(tmp_path)
     for names, found in (
-        (["day"], ["b", "c10", "c9"]),
-        (["day/c*.mcap", "day", "day/b.mcap"], ["c10", "c9", "b"]),
-        (["day/**/*.mcap"], ["b", "c10", "c9", "deep/a"]),
+        (["day"], ["b", "c9", "c10"]),
+        (["day/c*.mcap", "day", "day/b.mcap"], ["c9", "c10", "b"]),
+        (["day/**/*.mcap"], ["b", "c9", "c10", "deep/a"]),
     ):
         result = locatk("solve", *names, "-o", "out", "--json", "--overwrite")
         assert result.exit_code == 0, result.stderr
