@@ -29,8 +29,12 @@ MAX_ROLL_WIDTH_MM = 5_000.0
 PAPER_NAME_TOLERANCE_MM = 1.0
 """Largest difference between the sides of a page and those of a paper of that name."""
 
-_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)\s*(?:mm)?", re.IGNORECASE | re.ASCII)
-_ROLL = re.compile(r"roll:(\d+(?:\.\d+)?)(?:\s*mm)?", re.IGNORECASE | re.ASCII)
+UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, '"': 25.4}
+"""Units in which sizes are given, in mm."""
+
+_NUMBER, _UNIT = r"(\d+(?:\.\d+)?)", r"(mm|cm|m|in|\")?"
+_SIZE = re.compile(rf"{_NUMBER}\s*x\s*{_NUMBER}\s*{_UNIT}", re.IGNORECASE | re.ASCII)
+_ROLL = re.compile(rf"roll:{_NUMBER}\s*{_UNIT}", re.IGNORECASE | re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class Paper:
 
 
 def parse_paper(text: str) -> Paper:
-    """Return a paper by name, by size as ``"WxHmm"``, or a roll as ``"roll:914mm"``.
+    """Return a paper by name or size as :func:`paper_size` does, or a roll as ``"roll:914mm"``.
 
     Raises
     ------
@@ -62,9 +66,12 @@ def parse_paper(text: str) -> Paper:
     if not text.lower().startswith("roll"):
         return Paper(*paper_size(text))
     match = _ROLL.fullmatch(text)
-    if match is None or not 0 < float(match[1]) <= MAX_ROLL_WIDTH_MM:
-        raise InputError(f"no paper {text!r}", hint="A roll is named by its width: roll:914mm")
-    return Paper(f"roll:{float(match[1]):g}mm", (float(match[1]), math.inf))
+    width = _millimetres(match[1], match[2]) if match else 0.0
+    if not 0 < width <= MAX_ROLL_WIDTH_MM:
+        raise InputError(
+            f"no paper {text!r}", hint="A roll is named by its width: roll:914mm or roll:36in"
+        )
+    return Paper(f"roll:{width:g}mm", (width, math.inf))
 
 
 def paper_size(text: str, *, landscape: bool | None = None) -> tuple[str, tuple[float, float]]:
@@ -73,7 +80,8 @@ def paper_size(text: str, *, landscape: bool | None = None) -> tuple[str, tuple[
     Parameters
     ----------
     text : str
-        A name in :data:`PAPER_SIZES_MM`, in upper or lower case, or ``"WxHmm"``.
+        A name in :data:`PAPER_SIZES_MM`, in upper or lower case, or width and height with a unit
+        of :data:`UNITS_MM`, by default mm: ``"600x3000mm"``, ``"24x36in"``.
     landscape : bool, optional
         Rotate it so that its width is the longer (True) or the shorter (False) side.
 
@@ -88,11 +96,13 @@ def paper_size(text: str, *, landscape: bool | None = None) -> tuple[str, tuple[
     ('A4', (297.0, 210.0))
     >>> paper_size("600x3000mm")
     ('600x3000', (600.0, 3000.0))
+    >>> paper_size("24x36in")
+    ('609.6x914.4', (609.6, 914.4))
     """
     names = {name.lower(): name for name in PAPER_SIZES_MM}
     match = _SIZE.fullmatch(text.strip())
     if match:
-        width, height = float(match[1]), float(match[2])
+        width, height = (_millimetres(side, match[3]) for side in match.groups()[:2])
         name = f"{width:g}x{height:g}"
         if not all(0 < side <= MAX_PAPER_MM for side in (width, height)):
             raise InputError(
@@ -104,11 +114,16 @@ def paper_size(text: str, *, landscape: bool | None = None) -> tuple[str, tuple[
     else:
         raise InputError(
             f"no paper {text!r}",
-            hint=f"Use {', '.join(PAPER_SIZES_MM)} or WxHmm, as in 600x3000mm",
+            hint=f"Use {', '.join(PAPER_SIZES_MM)} or a size, as in 600x3000mm or 24x36in",
         )
     if landscape is not None and landscape != (width > height):
         width, height = height, width
     return name, (width, height)
+
+
+def _millimetres(number: str, unit: str | None) -> float:
+    # Rounded to a nanometre: 0.6 m is 600 mm.
+    return round(float(number) * UNITS_MM[(unit or "mm").lower()], 6)
 
 
 def paper_name(page_mm: tuple[float, float]) -> str:

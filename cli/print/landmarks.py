@@ -59,8 +59,8 @@ DEFAULT_OVERLAP_MM = 10.0
         default="A4",
         show_default=True,
         metavar="PAPER",
-        help="A0 to A5, Letter, Tabloid, or WxHmm as in 600x900mm; with --floor also the "
-        "width of a roll as in roll:914mm.",
+        help="A0 to A5, Letter, Tabloid, or a size as in 600x900mm or 24x36in; with --floor also "
+        "the width of a roll as in roll:914mm or roll:36in.",
     ),
     click.option(
         "--margin",

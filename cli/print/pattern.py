@@ -77,7 +77,7 @@ class PairType(click.ParamType):
         "--size",
         default=None,
         metavar="PAPER",
-        help="A0 to A5, Letter, Tabloid, or WxHmm as in 600x3000mm.  [default: A4]",
+        help="A0 to A5, Letter, Tabloid, or a size as in 600x3000mm or 24x36in.  [default: A4]",
     ),
     click.option("--landscape/--portrait", default=None, help="Orientation of the paper."),
     click.option(

@@ -37,7 +37,8 @@ ENDINGS = {"pdf": (".pdf",), "svg": (".svg",)}
     default="A4",
     show_default=True,
     metavar="PAPER",
-    help="A0 to A5, Letter, Tabloid, or WxHmm as in 600x900mm, rotated if that saves pages.",
+    help="A0 to A5, Letter, Tabloid, or a size as in 600x900mm or 24x36in, rotated if that saves "
+    "pages.",
 )
 @click.option(
     "--margin",
