@@ -12,7 +12,14 @@ import numpy as np
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, PlanarPose, Tags
+from locatk.core.polaris.tag import (
+    CODECS,
+    MAX_MEANING_CHARACTERS,
+    AsBuiltTag,
+    Magnet,
+    PlanarPose,
+    Tags,
+)
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     NOT_NEGATIVE,
@@ -57,7 +64,8 @@ def _tags_of(values: Values) -> Tags:
     family = values.pop("family") or {"ids": None, "min_distance": 1}
     built = {entry.pop("id"): AsBuiltTag(**entry) for entry in _by_id(values.pop("built"), "built")}
     site = {entry.pop("id"): PlanarPose(**entry) for entry in _by_id(values.pop("site"), "site")}
-    tags = Tags(**values, **family, built=built, site=site)
+    meanings = {entry["id"]: entry["text"] for entry in _by_id(values.pop("meaning"), "meaning")}
+    tags = Tags(**values, **family, built=built, site=site, meanings=meanings)
     if tags.magnets > tags.order**2 - 1:
         raise InvalidValueError(f"expected at most {tags.order**2 - 1}, order^2 - 1", "magnets")
     if tags.magnet.diameter_m > tags.spacing_m:
@@ -88,6 +96,7 @@ def _check_ids(tags: Tags) -> None:
     keys = [("family.ids", number) for number in tags.ids or ()]
     keys += [(f"built[{k}].id", number) for k, number in enumerate(tags.built)]
     keys += [(f"site[{k}].id", number) for k, number in enumerate(tags.site)]
+    keys += [(f"meaning[{k}].id", number) for k, number in enumerate(tags.meanings)]
     for key, number in keys:
         if number >= capacity:
             raise InvalidValueError(
@@ -117,6 +126,7 @@ def _tags_values(tags: Tags) -> Values:
         "family": None if (tags.ids, tags.min_distance) == (None, 1) else family,
         "built": [{"id": number, **vars(tag)} for number, tag in sorted(tags.built.items())],
         "site": [{"id": number, **vars(pose)} for number, pose in sorted(tags.site.items())],
+        "meaning": [{"id": number, "text": text} for number, text in sorted(tags.meanings.items())],
     }
 
 
@@ -219,10 +229,27 @@ TAGS: Artifact[Tags] = Artifact(
                 ),
                 default=(),
             ),
+            Key(
+                "meaning",
+                Tables(
+                    Table(
+                        (
+                            Key("id", Integer(), "id of a tag that has a meaning, once each"),
+                            Key(
+                                "text",
+                                Text(is_blank_allowed=False, max_length=MAX_MEANING_CHARACTERS),
+                                "what the tag stands for, on one line: it is shown with the id",
+                            ),
+                        )
+                    )
+                ),
+                default=(),
+            ),
         ),
         _tags_of,
         _tags_values,
     ),
+    version=2,
 )
 """Tags as a file."""
 

@@ -118,6 +118,13 @@ class TagObservation:
         return self.tags.site.get(self.tag_id)
 
     @property
+    def meaning(self) -> str | None:
+        """Meaning of the id; None if it has none."""
+        if self.tags is None or self.tag_id is None:
+            return None
+        return self.tags.meanings.get(self.tag_id)
+
+    @property
     def array_pose(self) -> PlanarPose | None:
         """Pose of the array in the tag's frame; None without a match."""
         if self.match is None:
@@ -168,6 +175,7 @@ class TagObservation:
                 for k in self.unexplained
             ),
             design=design,
+            meaning=self.meaning,
         )
 
     def _magnet_detections(self) -> tuple[MagnetDetection, ...]:
