@@ -759,8 +759,15 @@ def survey(
     site = {each.tag_id: each.pose for each in surveyed}
     notes = _notes(surveyed, ratio, kept)
     unvisited = [tag_id for tag_id in tags.site if tag_id not in site]
+    site_sigma = {
+        each.tag_id: (float(sigma[0]), float(sigma[1]), float(sigma[2]))
+        for each in surveyed
+        if not each.is_fixed
+        for sigma in [np.sqrt(np.diag(each.covariance))]
+    }
     if unvisited and _is_in_given_frame(tags, anchors):
         site |= {tag_id: tags.site[tag_id] for tag_id in unvisited}
+        site_sigma |= {k: sigma for k, sigma in tags.site_sigma.items() if k in unvisited}
         notes.append(f"{len(unvisited)} tags of the site were not passed and keep their positions")
     elif unvisited:
         notes.append(
@@ -772,7 +779,9 @@ def survey(
     full[np.ix_(graph.is_free, graph.is_free)] = fit.covariance
     sigma = np.sqrt(np.diag(full)[3 * graph.count :]).reshape(-1, 2)
     return SurveyReport(
-        tags=replace(tags, site=dict(sorted(site.items()))),
+        tags=replace(
+            tags, site=dict(sorted(site.items())), site_sigma=dict(sorted(site_sigma.items()))
+        ),
         surveyed=surveyed,
         gauge=gauge,
         drives=len(kept),

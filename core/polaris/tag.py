@@ -131,6 +131,9 @@ class Tags:
     meanings : mapping of int to str
         Text that an id stands for, as in ``"stop"``, by id: one line of at most
         :data:`MAX_MEANING_CHARACTERS` printable characters.
+    site_sigma : mapping of int to (float, float, float)
+        Standard deviations of x and y [m] and of the heading [rad] of the poses in ``site``, by
+        id; poses without an entry are exact.
     """
 
     order: int = 3
@@ -146,6 +149,7 @@ class Tags:
     site: Mapping[int, PlanarPose] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     meanings: Mapping[int, str] = field(default_factory=dict)
+    site_sigma: Mapping[int, tuple[float, float, float]] = field(default_factory=dict)
 
     @property
     def step_rad(self) -> float:

@@ -281,6 +281,7 @@ def place_tags(tags: Tags, points: Sequence[SitePoint], min_distance: int = 1) -
         ids=tuple(members),
         min_distance=distance,
         site=dict(sorted(site.items())),
+        site_sigma={},
         meanings=dict(sorted(meanings.items())),
     )
 
