@@ -71,9 +71,9 @@ def drive(
     for k, (before, after) in enumerate(itertools.pairwise(true)):
         motion = relative(before, after)
         length = math.hypot(*motion[:2])
-        motion[:2] = motion[:2] * (1 + scale) + rng.normal(scale=2e-3 * noise * length**0.5, size=2)
-        turned = length + 0.1 * abs(motion[2])
-        motion[2] += drift * length + math.radians(noise) * turned**0.5 * rng.normal()
+        driven = length + 0.1 * abs(motion[2])
+        motion[:2] = motion[:2] * (1 + scale) + 2e-3 * noise * driven**0.5 * rng.normal(size=2)
+        motion[2] += drift * length + math.radians(noise) * driven**0.5 * rng.normal()
         motion[2] += slip_rad if k == len(true) // 2 else 0.0
         odometry.append(moved(odometry[-1], motion))
     reported = np.array(odometry)
@@ -143,7 +143,7 @@ def nees(report: SurveyReport) -> float:
 @pytest.mark.slow
 def test_errors_agree_with_covariances() -> None:
     """NEES of 30 surveys with random systematic errors of the odometry, also of a worse one."""
-    for noise in (1.0, 3.0):
+    for noise, limit in ((1.0, 1.3), (3.0, 1.5)):  # the usual noise has a weight
         values = []
         for seed in range(30):
             rng = np.random.default_rng([seed, int(noise)])
@@ -155,7 +155,7 @@ def test_errors_agree_with_covariances() -> None:
             )
             assert not report.left_out
             values.append(nees(report))
-        assert 0.7 < np.mean(values) < 1.35  # its standard deviation is 0.15
+        assert 0.7 < np.mean(values) < limit
 
 
 def test_one_survey() -> None:
