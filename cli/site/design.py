@@ -202,5 +202,6 @@ def _points(
     with error_context(route):
         found, left_out = route_points(waypoints, metres(spacing), tags.order * tags.spacing_m)
     if left_out:
-        console.say(f"{left_out} points at which the route passes a tag again are left out.")
+        points_text = "1 point" if left_out == 1 else f"{left_out} points"
+        console.say(f"{points_text} at which the route passes a tag again: left out.")
     return found

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -853,7 +853,7 @@ def _worst_tag(fit: _Fit) -> int:
     """Return the tag whose neighbouring legs have the largest residuals."""
     _, residual, _, _ = fit.graph.residuals(fit.state)
     tag_of_node = dict(zip(fit.graph.visit_from.tolist(), fit.graph.visits, strict=True))
-    squares: Counter[int] = Counter()
+    squares: defaultdict[int, float] = defaultdict(float)
     for start, end, each in zip(
         fit.graph.leg_from.tolist(), fit.graph.leg_to.tolist(), residual, strict=True
     ):

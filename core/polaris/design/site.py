@@ -344,13 +344,13 @@ def check_site(
     use = use or ReadingConditions()
     ids = tuple(tags.site)
     centre_m = np.array([[pose.x_m, pose.y_m] for pose in tags.site.values()])
-    nearest_m, nearest_ids = math.nan, ()
+    nearest_m, nearest_ids = math.nan, tuple[int, ...]()
     tree = cKDTree(centre_m)
     if len(ids) > 1:
-        distance_m, neighbour = tree.query(centre_m, 2)
-        first = int(distance_m[:, 1].argmin())
-        nearest_m = float(distance_m[first, 1])
-        nearest_ids = tuple(sorted((ids[first], ids[int(neighbour[first, 1])])))
+        distance_m, neighbour = (np.asarray(each)[:, 1] for each in tree.query(centre_m, 2))
+        first = int(distance_m.argmin())
+        nearest_m = float(distance_m[first])
+        nearest_ids = tuple(sorted((ids[first], ids[int(neighbour[first])])))
     separation_m = pass_separation(tags, use)
     findings: list[SiteFinding] = []
     pairs: set[tuple[int, int]] = set()

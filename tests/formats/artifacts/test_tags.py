@@ -67,6 +67,14 @@ def tag_sets(draw: st.DrawFn) -> Tags:
     last = capacity(tags) - 1
     ids = draw(st.none() | st.lists(st.integers(0, last), min_size=1, max_size=5, unique=True))
     some = st.integers(0, last) if ids is None else st.sampled_from(ids)
+    site = dict(
+        sorted(
+            draw(
+                st.dictionaries(some, st.builds(PlanarPose, finite, finite, finite), max_size=2)
+            ).items()
+        )
+    )
+    sigma = st.floats(0, 1e3)
     # Half the spacing is the limit, in any direction.
     offset = st.floats(-0.35 * spacing, 0.35 * spacing)
     angle = st.floats(-math.pi, math.pi)
@@ -89,15 +97,10 @@ def tag_sets(draw: st.DrawFn) -> Tags:
         None if ids is None else tuple(ids),
         draw(st.integers(1, 9)),
         dict(sorted(draw(st.dictionaries(some, built, max_size=2)).items())),
-        dict(
-            sorted(
-                draw(
-                    st.dictionaries(some, st.builds(PlanarPose, finite, finite, finite), max_size=2)
-                ).items()
-            )
-        ),
+        site,
         tuple(draw(st.lists(st.text(max_size=20), max_size=2))),
         dict(sorted(draw(st.dictionaries(some, meanings, max_size=2)).items())),
+        {tag_id: draw(st.tuples(sigma, sigma, sigma)) for tag_id in site if draw(st.booleans())},
     )
 
 
@@ -188,6 +191,9 @@ def test_tags_by_hand() -> None:
     assert tags.built[7].angle_rad[2] == math.radians(13)
     assert tags.site == {7: PlanarPose(1.5, -0.0205, math.pi / 2)}
     assert tags.meanings == {}
+    assert tags.site_sigma == {}
+    surveyed = loads_tags(TAG + MAGNET + SITE + "sigma_mm = [2, 3]")
+    assert surveyed.site_sigma == {7: (0.002, 0.003, 0.0)}
     newer = TAG.replace("version = 1", "version = 2")
     assert loads_tags(newer + MAGNET + FAMILY + MEANING).meanings == {7: "stop"}
 
@@ -236,6 +242,8 @@ def test_tags_by_hand() -> None:
         (TAG + MAGNET + SITE.replace("90", "inf"), "site[0].heading_deg", "finite"),
         (TAG + MAGNET + SITE.replace("x_mm", "x"), "site[0]", "missing key 'x_mm'"),
         (TAG + MAGNET + SITE + SITE, "site[1].id", "twice"),
+        (TAG + MAGNET + SITE + "sigma_mm = [1, -1]", "site[0].sigma_mm[1]", "of at least 0"),
+        (TAG + MAGNET + SITE + "sigma_deg = -1", "site[0].sigma_deg", "of at least 0"),
         (TAG + MAGNET + MEANING + MEANING, "meaning[1].id", "twice"),
         (TAG + MAGNET + MEANING.replace("7", "327680"), "meaning[0].id", "not an id of this"),
         (TAG + MAGNET + FAMILY + MEANING.replace("7", "5"), "meaning[0].id", "not in the family"),
