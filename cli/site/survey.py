@@ -75,7 +75,7 @@ def command(
     Examples:
       locatk site survey drive1.mcap drive2.mcap drive3.mcap -o site.toml
       locatk site survey day/*.mcap --artifact tag.toml -o site.toml --fix 202517
-      locatk site survey *.mcap --artifact known.toml --fix 7 --fix 12 -o site.toml
+      locatk site survey *.mcap --artifact old.toml --fix 7 --fix 12 -o new.toml
     """
     from locatk.core.polaris.survey import survey
     from locatk.formats.artifacts import tags as files

@@ -347,10 +347,12 @@ def check_site(
     nearest_m, nearest_ids = math.nan, tuple[int, ...]()
     tree = cKDTree(centre_m)
     if len(ids) > 1:
-        distance_m, neighbour = (np.asarray(each)[:, 1] for each in tree.query(centre_m, 2))
-        first = int(distance_m.argmin())
-        nearest_m = float(distance_m[first])
-        nearest_ids = tuple(sorted((ids[first], ids[int(neighbour[first])])))
+        distance_m, neighbour = (np.asarray(each) for each in tree.query(centre_m, 2))
+        # Of two tags at one position, either may be the first neighbour.
+        first = int(distance_m[:, 1].argmin())
+        second = next(k for k in neighbour[first].tolist() if k != first)
+        nearest_m = float(distance_m[first, 1])
+        nearest_ids = tuple(sorted((ids[first], ids[second])))
     separation_m = pass_separation(tags, use)
     findings: list[SiteFinding] = []
     pairs: set[tuple[int, int]] = set()

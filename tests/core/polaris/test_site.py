@@ -159,6 +159,9 @@ def test_findings() -> None:
     corner = [SitePoint(0.0, 0.0), SitePoint(0.2, 0.0), SitePoint(0.2, 0.2)]
     assert codes(place_tags(Tags(), corner)) == []
     assert codes(place_tags(Tags(), grid_points(1, 2, 0.06))) == ["overlap"]
+    both = check_site(place_tags(Tags(ids=FAMILY), [SitePoint(0.0, 0.0), SitePoint(0.0, 0.0)]))
+    assert (both.nearest_m, both.nearest_ids) == (0.0, (5, 77))
+    assert [finding.code for finding in both.findings] == ["overlap"]
     single = place_tags(Tags(), [SitePoint(0.0, 0.0)])
     (finding,) = check_site(single, bounds_m=(-0.035, -1, 1, 1)).findings
     assert (finding.code, finding.message) == ("out_of_bounds", "tag 0 is 5 mm out of bounds")
