@@ -62,8 +62,12 @@ LEG_FLOOR_M, LEG_FLOOR_RAD = 2e-4, math.radians(0.02)
 PRIOR_REDUNDANCY = 6.0
 """Weight of the usual variances of odometry, in redundant measurements."""
 
-VARIANCE_ROUNDS = 6
-"""Rounds of the estimation of the variance factor; it converges linearly."""
+VARIANCE_ROUNDS, VARIANCE_TOLERANCE = 8, 1e-3
+"""Largest number of rounds of the estimation of the variance factor, which converges linearly, and
+the relative change that ends it."""
+
+MIN_GAIN = 1e-7
+"""Relative gain of a step at which the least squares have converged."""
 
 MAX_CONTRADICTION_PROBABILITY = 1e-4
 """Probability of the residuals of a drive, given the others, below which it is excluded."""
@@ -543,7 +547,7 @@ class _Fit:
     cost : float
         Half of the sum of squares.
     covariance : (p, p) ndarray
-        Of the free unknowns.
+        Of the unknowns; zero for those that are fixed.
     leg_redundancy : float
         Redundancy of the legs.
     """
@@ -555,28 +559,33 @@ class _Fit:
     leg_redundancy: float
 
 
-def _fit(graph: _Graph, start: _State, factor: float | None = None) -> _Fit:
-    """Minimize the cost; with ``factor`` None, estimate the variance factor of the odometry."""
+def _fit(graph: _Graph, start: _State) -> _Fit:
+    """Minimize the cost, and estimate the variance factor of the odometry."""
     state = start
-    graph.factor = 1.0 if factor is None else factor
-    redundancy = 0.0
-    for round_ in range(VARIANCE_ROUNDS):
-        minimum = minimize(graph, state, damping=1e-6, min_gain=1e-9)
+    for _ in range(VARIANCE_ROUNDS):
+        minimum = minimize(graph, state, damping=1e-6, min_gain=MIN_GAIN)
         state = minimum.state
-        hessian = minimum.equations.hessian[0]
-        covariance = np.linalg.inv(hessian)
+        covariance = np.zeros((graph.size, graph.size))
+        free = np.ix_(graph.is_free, graph.is_free)
+        covariance[free] = np.linalg.inv(minimum.equations.hessian[0])
         _, residual, _, jacobian = graph.residuals(state)
-        full = np.zeros((graph.size, graph.size))
-        full[np.ix_(graph.is_free, graph.is_free)] = covariance
         columns = graph.leg_columns
-        blocks = full[columns[:, :, None], columns[:, None, :]]
+        blocks = covariance[columns[:, :, None], columns[:, None, :]]
         fitted = float(np.einsum("lri,lij,lrj->", jacobian, blocks, jacobian))
         redundancy = max(residual.size - fitted, 0.0)
-        if factor is not None or round_ == VARIANCE_ROUNDS - 1:
-            break
         squares = float(np.sum(residual**2)) * graph.factor
-        graph.factor = (squares + PRIOR_REDUNDANCY) / (redundancy + PRIOR_REDUNDANCY)
+        factor = (squares + PRIOR_REDUNDANCY) / (redundancy + PRIOR_REDUNDANCY)
+        if abs(factor / graph.factor - 1) < VARIANCE_TOLERANCE:
+            break
+        graph.factor = factor
     return _Fit(graph, state, float(minimum.equations.cost[0]), covariance, redundancy)
+
+
+def _least_cost(graph: _Graph, start: _State, factor: float) -> float:
+    """Return the least cost for a given variance factor of the odometry."""
+    graph.factor = factor
+    minimum = minimize(graph, start, damping=1e-6, min_gain=MIN_GAIN)
+    return float(minimum.equations.cost[0])
 
 
 # ---- contradictions
@@ -602,12 +611,13 @@ def _judge(
     keeps_start = fix_start and number != 0
     graph = _Graph(others, anchors, keeps_start)
     rest = _fit(graph, _restrict(fit, graph))
+    rest_cost = _least_cost(graph, rest.state, rest.graph.factor)
     whole = _Graph(drives, anchors, fix_start)
-    together = _fit(whole, fit.state, rest.graph.factor)
+    cost = _least_cost(whole, fit.state, rest.graph.factor)
     freedom = whole.degrees_of_freedom - graph.degrees_of_freedom
     if freedom <= 0:
         return _Verdict(0.0, "")
-    increase = max(2 * (together.cost - rest.cost), 0.0) / freedom
+    increase = max(2 * (cost - rest_cost), 0.0) / freedom
     known = PRIOR_REDUNDANCY + rest.leg_redundancy
     return _Verdict(
         float(stats.f.logsf(increase, freedom, known)), _worst_leg(drives[number], rest)
@@ -775,9 +785,7 @@ def survey(
             "are in another frame"
         )
     systematic = fit.state.systematic
-    full = np.zeros((graph.size, graph.size))
-    full[np.ix_(graph.is_free, graph.is_free)] = fit.covariance
-    sigma = np.sqrt(np.diag(full)[3 * graph.count :]).reshape(-1, 2)
+    sigma = np.sqrt(np.diag(fit.covariance)[3 * graph.count :]).reshape(-1, 2)
     return SurveyReport(
         tags=replace(
             tags, site=dict(sorted(site.items())), site_sigma=dict(sorted(site_sigma.items()))
@@ -828,8 +836,6 @@ def _surveyed_tags(
     fit: _Fit, connected: set[int], anchors: Mapping[int, PlanarPose]
 ) -> tuple[SurveyedTag, ...]:
     graph = fit.graph
-    full = np.zeros((graph.size, graph.size))
-    full[np.ix_(graph.is_free, graph.is_free)] = fit.covariance
     passes = Counter(visit.tag_id for visit in graph.visits)
     drives = Counter(
         tag_id for drive in graph.drives for tag_id in {visit.tag_id for visit in drive.visits}
@@ -841,11 +847,9 @@ def _surveyed_tags(
         x, y, heading = fit.state.pose[k].tolist()
         pose = anchors.get(tag_id) or PlanarPose(x, y, float(wrap_angle(heading)))
         rows = slice(3 * k, 3 * k + 3)
-        surveyed.append(
-            SurveyedTag(
-                tag_id, pose, full[rows, rows], passes[tag_id], drives[tag_id], tag_id in anchors
-            )
-        )
+        covariance = fit.covariance[rows, rows]
+        counts = passes[tag_id], drives[tag_id]
+        surveyed.append(SurveyedTag(tag_id, pose, covariance, *counts, tag_id in anchors))
     return tuple(surveyed)
 
 
