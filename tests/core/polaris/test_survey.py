@@ -257,6 +257,7 @@ def test_tags_that_nothing_connects_are_left_out() -> None:
     runs = [drive(rng, (1, 2, 1), name="west"), drive(rng, (3, 4, 3), name="east")]
     report = survey(Tags(), runs)
     assert sorted(report.tags.site) == [1, 2]
+    assert report.redundancy == 6  # each part has a frame of its own
     assert report.left_out == {
         "tag 3": "no drive leads from it to a fixed tag",
         "tag 4": "no drive leads from it to a fixed tag",
