@@ -22,6 +22,7 @@ from locatk.core.errors import InputError
 
 COMMANDS = {
     "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),
+    "site": ("locatk.cli.site", "Place magnetic tags on a floor, check and survey them."),
     "map": ("locatk.cli.map", "Design floors of landmarks, check and exchange them."),
     "print": ("locatk.cli.print", "Draw dot sheets and templates at true size."),
     "capture": (

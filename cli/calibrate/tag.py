@@ -55,7 +55,7 @@ def command(
 
     inputs = [*sessions, *([artifact] if artifact else [])]
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
-    tags = files.read_tags(artifact) if artifact else _attached(sessions[0])
+    tags = files.read_tags(artifact) if artifact else attached_tags(sessions[0])
     passes, left_out = _passes(sessions, tags, speed, artifact is None)
     report = calibrate(tags, passes, left_out)
     files.write_tags(output, report.tags, overwrite=overwrite)
@@ -65,7 +65,14 @@ def command(
     recordings.check_all_used(report.left_out, "pass was", "passes were")
 
 
-def _attached(path: Path) -> Tags:
+def attached_tags(path: Path) -> Tags:
+    """Return the tags of a session.
+
+    Raises
+    ------
+    InputError
+        It has none.
+    """
     from locatk.formats.sessions import observations
     from locatk.formats.sessions.reader import Session
 
@@ -103,7 +110,7 @@ def _passes(
             with recordings.skipping_unusable(path, left_out, alone=len(sessions) == 1):
                 session = Session.open(path)
                 if is_checked:
-                    _check_same(tags, _attached(path), path)
+                    check_same_design(tags, attached_tags(path), path)
                 samples = observations.read_magnetometers(session)
                 for each in samples:
                     measurements.add(str(path), each.time_ns, each.field_t)
@@ -123,7 +130,8 @@ def _passes(
     return passes, left_out
 
 
-def _check_same(tags: Tags, other: Tags, path: Path) -> None:
+def check_same_design(tags: Tags, other: Tags, path: Path) -> None:
+    """Refuse a session at ``path`` whose tags have another design."""
     design = ("codec", "order", "magnets", "orientations", "spacing_m")
     for name in design:
         if getattr(tags, name) != getattr(other, name):

@@ -9,6 +9,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import section
+from locatk.cli.table_options import parse_columns, parse_words
 
 OPTIONS = (
     "columns",
@@ -24,30 +25,6 @@ OPTIONS = (
 """Options of landmark-csv, by the names of their arguments."""
 
 MEDIAN = "median"
-
-
-def _parse_columns(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> dict[str, str] | None:
-    """Return ``t=time,x=odom_x`` as a dictionary; a click callback."""
-    if value is None:
-        return None
-    headers: dict[str, str] = {}
-    for pair in value.split(","):
-        key, equals, name = (part.strip() for part in pair.partition("="))
-        if not (key and equals and name):
-            raise click.BadParameter(f"{pair!r} is not KEY=NAME.")
-        if key in headers:
-            raise click.BadParameter(f"{key} occurs twice.")
-        headers[key] = name
-    return headers
-
-
-def _parse_words(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> tuple[str, ...] | None:
-    """Return ``s,mm,deg`` as a tuple; a click callback."""
-    return value if value is None else tuple(word.strip().lower() for word in value.split(","))
 
 
 def _parse_numbers(
@@ -74,14 +51,14 @@ landmark_options = section(
     click.option(
         "--columns",
         metavar="KEY=NAME,...",
-        callback=_parse_columns,
+        callback=parse_columns,
         help="Headers of t, x, y, heading and of the sensors front, left, rear, right (or those of "
         "--halls), if they differ from these names.",
     ),
     click.option(
         "--units",
         metavar="UNIT,...",
-        callback=_parse_words,
+        callback=parse_words,
         help="Units of columns without a unit in their names: one of s, ms, us, ns; of m, cm, mm; "
         "of rad, deg; of t, mt, ut, nt, gauss, v, mv.",
     ),

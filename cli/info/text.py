@@ -123,8 +123,15 @@ def text(facts: dict[str, Any]) -> str:
         ],
     )
     tags = facts.get("tags", [])
+    has_meaning = any(t["meaning"] for t in tags[:MAX_ROWS])
     section(
-        ("tag", "cell:orientation", "as built (passes)", "position"),
+        (
+            "tag",
+            "cell:orientation",
+            "as built (passes)",
+            "position",
+            *(["meaning"] if has_meaning else []),
+        ),
         [
             (
                 t["id"],
@@ -133,6 +140,7 @@ def text(facts: dict[str, Any]) -> str:
                 ),
                 "-" if t["passes"] is None else t["passes"],
                 "-" if t["position_mm"] is None else _pose(t),
+                *([t["meaning"] or "-"] if has_meaning else []),
             )
             for t in tags[:MAX_ROWS]
         ],

@@ -11,6 +11,9 @@ from locatk.cli import console
 if TYPE_CHECKING:
     from locatk.formats.pipeline import SolveReport
 
+SYSTEMS_WITH_FACTS = ("landmarks", "polaris")
+"""Systems whose ``facts`` are part of ``--json``."""
+
 MAX_LANDMARKS = 40
 """Number of landmarks listed as text; ``--json`` lists all."""
 
@@ -28,7 +31,7 @@ def json_entry(report: SolveReport) -> dict[str, Any]:
         "rejected": report.rejected,
         "solve_s": report.solve_s,
         "detections": to_json(report.detections),
-        **({"facts": to_json(report.facts) or {}} if report.system == "landmarks" else {}),
+        **({"facts": to_json(report.facts) or {}} if report.system in SYSTEMS_WITH_FACTS else {}),
     }
 
 
@@ -46,6 +49,7 @@ def text(report: SolveReport) -> str:
         summary,
         _detection_table(report),
         _device_table(report),
+        _heading_correction_line(report),
         console.wrapped(f"rejected: {rejected or 'nothing'}"),
     ]
     return "\n".join(part for part in parts if part)
@@ -97,6 +101,26 @@ def _format_probability(probability: float) -> str:
     from locatk.formats.report.detections import format_probability
 
     return format_probability(probability)
+
+
+def _heading_correction_line(report: SolveReport) -> str:
+    """Summarize the rotations that would have led from each tag straight to the next.
+
+    Empty without two tags of a site in a row.
+    """
+    if report.system != "polaris" or report.facts is None:
+        return ""
+    corrections = report.facts.heading_corrections
+    if not corrections:
+        return ""
+    sizes_deg = [abs(math.degrees(each.rotation_rad)) for each in corrections]
+    largest = corrections[sizes_deg.index(max(sizes_deg))]
+    return console.wrapped(
+        f"heading corrections: {len(corrections)}, mean size "
+        f"{math.fsum(sizes_deg) / len(sizes_deg):.2f} deg, largest "
+        f"{math.degrees(largest.rotation_rad):+.2f} deg from tag {largest.from_tag} to tag "
+        f"{largest.to_tag}"
+    )
 
 
 def _detection_table(report: SolveReport) -> str:

@@ -74,6 +74,7 @@ def command(
     decoded = decode_tag(
         tags, [cell for cell, _ in cells], [orientation / step for _, orientation in cells]
     )
+    meaning = None if decoded.tag_id is None else tags.meanings.get(decoded.tag_id)
     if as_json:
         console.emit_json(
             {
@@ -84,12 +85,15 @@ def command(
                 "erased": decoded.erased,
                 "symbols": decoded.symbols,
                 "refused": decoded.refused,
+                "meaning": meaning,
             }
         )
     if decoded.tag_id is None:
         reason = decoded.refused.replace("_", " ")
         raise failures.Incomplete(f"no id: {reason}, margin {decoded.margin:.2f} steps")
     console.result(str(decoded.tag_id))
+    if meaning is not None:
+        console.say(f"Meaning: {meaning}")
     console.say(
         f"Margin {decoded.margin:.2f} steps, {decoded.corrected} corrected, "
         f"{decoded.erased} erased."

@@ -49,7 +49,9 @@ def command(
     angles = symbol_angles(tags, layout.symbols).tolist()
     degrees = [symbol * 360 / tags.orientations for symbol in layout.symbols]
     capacity = codecs.capacity(tags)
-    console.result(f"Tag {tag_id} of {capacity}, codec {tags.codec}\n")
+    meaning = tags.meanings.get(tag_id)
+    shown_meaning = "" if meaning is None else f": {meaning}"
+    console.result(f"Tag {tag_id} of {capacity}, codec {tags.codec}{shown_meaning}\n")
     console.result(_drawing(tags, layout, degrees) + "\n")
     rows = [
         (f"{cell[0]},{cell[1]}", symbol, f"{angle:g}", f"{x * 1e3:g}", f"{y * 1e3:g}")
@@ -80,6 +82,7 @@ def command(
                         layout.cells, layout.symbols, degrees, positions, angles, strict=True
                     )
                 ],
+                "meaning": meaning,
             }
         )
 

@@ -133,7 +133,7 @@ class _PlanarPoses:
 def _poses_over_tag(
     samples: Samples, observation: TagObservation, tag_pose: PlanarPose
 ) -> _PlanarPoses:
-    """Return the poses of an array over one tag, with the covariance of match and path."""
+    """Return the poses of an array over one tag, with the covariance of match, path and tag."""
     magnets, match = observation.magnets, observation.match
     if match is None:
         raise ValueError("an identified tag has a match")
@@ -168,6 +168,11 @@ def _poses_over_tag(
     covariance = np.full((n, 6, 6), np.nan)
     covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] = (
         jacobian @ inner @ jacobian.transpose(0, 2, 1)
+    )
+    by_tag = np.tile(np.eye(3), (n, 1, 1))
+    by_tag[:, :2, 2] = offset @ by_heading.T
+    covariance[np.ix_(range(n), PLANAR_COMPONENTS, PLANAR_COMPONENTS)] += (
+        by_tag @ observation.site_covariance @ by_tag.transpose(0, 2, 1)
     )
     if magnets.motion_covariance is not None:
         by_motion = np.eye(3)

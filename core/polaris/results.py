@@ -104,6 +104,8 @@ class TagDetection:
         Magnets of the pass that belong to no tag and are nearest to this one.
     design : str or None
         Name of the tag's design if several were given.
+    meaning : str or None
+        Meaning of the id in the tag's design; None if it has none.
     """
 
     time_s: float
@@ -128,6 +130,7 @@ class TagDetection:
     other_sources: int
     other_magnets: tuple[OtherMagnet, ...] = ()
     design: str | None = None
+    meaning: str | None = None
 
 
 @dataclass(frozen=True)

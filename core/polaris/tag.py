@@ -21,6 +21,9 @@ Cell = tuple[int, int]
 MU0 = 4e-7 * math.pi
 """Vacuum permeability in T m/A (the value before 2019; it differs in the tenth digit)."""
 
+MAX_MEANING_CHARACTERS = 40
+"""Longest meaning of an id: it is shown in tables of 80 columns and on printed tags."""
+
 CODECS = ("mosk", "redundant", "polaris-released")
 
 
@@ -125,6 +128,12 @@ class Tags:
     site : mapping of int to PlanarPose
         Poses of the tags on the floor, by id, in the site's frame.
     notes : tuple of str
+    meanings : mapping of int to str
+        Text that an id stands for, as in ``"stop"``, by id: one line of at most
+        :data:`MAX_MEANING_CHARACTERS` printable characters.
+    site_sigma : mapping of int to (float, float, float)
+        Standard deviations of x and y [m] and of the heading [rad] of the poses in ``site``, by
+        id; poses without an entry are exact.
     """
 
     order: int = 3
@@ -139,6 +148,8 @@ class Tags:
     built: Mapping[int, AsBuiltTag] = field(default_factory=dict)
     site: Mapping[int, PlanarPose] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    meanings: Mapping[int, str] = field(default_factory=dict)
+    site_sigma: Mapping[int, tuple[float, float, float]] = field(default_factory=dict)
 
     @property
     def step_rad(self) -> float:

@@ -312,21 +312,33 @@ class Boolean:
 
 @dataclass(frozen=True)
 class Text:
-    """String, one of ``choices`` unless these are empty."""
+    """String, one of ``choices`` unless these are empty.
+
+    With ``max_length``, it is one line of at most so many printable characters.
+    """
 
     choices: tuple[str, ...] = ()
     is_blank_allowed: bool = True
     hint: str | None = None
+    max_length: int | None = None
 
     @property
     def expected(self) -> str:
         if self.choices:
             return " or ".join(f'"{choice}"' for choice in self.choices)
-        return "a string" if self.is_blank_allowed else "a string that is not blank"
+        blank = "" if self.is_blank_allowed else " that is not blank"
+        return f"a string{self._length}{blank}"
 
     @property
     def plural(self) -> str:
-        return "strings" if self.is_blank_allowed else "strings that are not blank"
+        length = self._length
+        return (
+            f"strings{length}" if self.is_blank_allowed else f"strings{length} that are not blank"
+        )
+
+    @property
+    def _length(self) -> str:
+        return "" if self.max_length is None else f" of at most {self.max_length} characters"
 
     def parse(self, value: Any, unit: Unit = NO_UNIT) -> str:
         if not isinstance(value, str):
@@ -342,6 +354,11 @@ class Text:
             )
         if not (self.is_blank_allowed or value.strip()):
             raise InvalidValueError(f"expected {self.expected}")
+        if self.max_length is not None:
+            if len(value) > self.max_length:
+                raise InvalidValueError(f"expected {self.expected}, not {len(value)}")
+            if not value.isprintable():
+                raise InvalidValueError("expected one line of printable characters")
         return value
 
     def parse_text(self, text: str) -> str:

@@ -12,7 +12,14 @@ import numpy as np
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, PlanarPose, Tags
+from locatk.core.polaris.tag import (
+    CODECS,
+    MAX_MEANING_CHARACTERS,
+    AsBuiltTag,
+    Magnet,
+    PlanarPose,
+    Tags,
+)
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     NOT_NEGATIVE,
@@ -56,8 +63,17 @@ MAX_SENSORS = 10_000
 def _tags_of(values: Values) -> Tags:
     family = values.pop("family") or {"ids": None, "min_distance": 1}
     built = {entry.pop("id"): AsBuiltTag(**entry) for entry in _by_id(values.pop("built"), "built")}
-    site = {entry.pop("id"): PlanarPose(**entry) for entry in _by_id(values.pop("site"), "site")}
-    tags = Tags(**values, **family, built=built, site=site)
+    site, site_sigma = {}, {}
+    for entry in _by_id(values.pop("site"), "site"):
+        tag_id, sigma_m, sigma_rad = (entry.pop(key) for key in ("id", "sigma_m", "sigma_rad"))
+        site[tag_id] = PlanarPose(**entry)
+        if sigma_m is not None or sigma_rad is not None:
+            x_m, y_m = (0.0, 0.0) if sigma_m is None else sigma_m.tolist()
+            site_sigma[tag_id] = (x_m, y_m, sigma_rad or 0.0)
+    meanings = {entry["id"]: entry["text"] for entry in _by_id(values.pop("meaning"), "meaning")}
+    tags = Tags(
+        **values, **family, built=built, site=site, site_sigma=site_sigma, meanings=meanings
+    )
     if tags.magnets > tags.order**2 - 1:
         raise InvalidValueError(f"expected at most {tags.order**2 - 1}, order^2 - 1", "magnets")
     if tags.magnet.diameter_m > tags.spacing_m:
@@ -88,6 +104,7 @@ def _check_ids(tags: Tags) -> None:
     keys = [("family.ids", number) for number in tags.ids or ()]
     keys += [(f"built[{k}].id", number) for k, number in enumerate(tags.built)]
     keys += [(f"site[{k}].id", number) for k, number in enumerate(tags.site)]
+    keys += [(f"meaning[{k}].id", number) for k, number in enumerate(tags.meanings)]
     for key, number in keys:
         if number >= capacity:
             raise InvalidValueError(
@@ -116,8 +133,17 @@ def _tags_values(tags: Tags) -> Values:
         **vars(tags),
         "family": None if (tags.ids, tags.min_distance) == (None, 1) else family,
         "built": [{"id": number, **vars(tag)} for number, tag in sorted(tags.built.items())],
-        "site": [{"id": number, **vars(pose)} for number, pose in sorted(tags.site.items())],
+        "site": [_site_values(tags, number) for number in sorted(tags.site)],
+        "meaning": [{"id": number, "text": text} for number, text in sorted(tags.meanings.items())],
     }
+
+
+def _site_values(tags: Tags, number: int) -> Values:
+    values = {"id": number, **vars(tags.site[number])}
+    if number in tags.site_sigma:
+        x_m, y_m, heading_rad = tags.site_sigma[number]
+        values |= {"sigma_m": np.array([x_m, y_m]), "sigma_rad": heading_rad}
+    return values
 
 
 _MAX_MAGNETS = MAX_ORDER**2 - 1
@@ -214,6 +240,37 @@ TAGS: Artifact[Tags] = Artifact(
                                 ANY_NUMBER,
                                 "from the x of the frame to the x of the tag, counter-clockwise",
                             ),
+                            Key(
+                                "sigma_mm",
+                                Array((2,), NOT_NEGATIVE),
+                                "standard deviations of x and y, as of `locatk site survey`; part "
+                                "of the covariance of solved poses",
+                                None,
+                                "0",
+                            ),
+                            Key(
+                                "sigma_deg",
+                                NOT_NEGATIVE,
+                                "standard deviation of the heading",
+                                None,
+                                "0",
+                            ),
+                        )
+                    )
+                ),
+                default=(),
+            ),
+            Key(
+                "meaning",
+                Tables(
+                    Table(
+                        (
+                            Key("id", Integer(), "id of a tag that has a meaning, once each"),
+                            Key(
+                                "text",
+                                Text(is_blank_allowed=False, max_length=MAX_MEANING_CHARACTERS),
+                                "what the tag stands for, on one line: it is shown with the id",
+                            ),
                         )
                     )
                 ),
@@ -223,6 +280,7 @@ TAGS: Artifact[Tags] = Artifact(
         _tags_of,
         _tags_values,
     ),
+    version=2,
 )
 """Tags as a file."""
 

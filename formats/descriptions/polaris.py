@@ -34,7 +34,7 @@ def describe_recording(session: Session) -> dict[str, Any]:
 def describe_tags(design: Tags) -> dict[str, Any]:
     """Describe the design of tags, and the known measurements of each."""
     magnet = design.magnet
-    numbers = set(design.ids or ()) | set(design.built) | set(design.site)
+    numbers = {*(design.ids or ()), *design.built, *design.site, *design.meanings}
     return {
         "codec": design.codec,
         "order": design.order,
@@ -69,6 +69,7 @@ def _describe_tag(design: Tags, number: int) -> dict[str, Any]:
         "angle_deg": None if built is None else np.degrees(built.angle_rad),
         "position_mm": None if pose is None else [1e3 * pose.x_m, 1e3 * pose.y_m],
         "heading_deg": None if pose is None else float(np.degrees(pose.heading_rad)),
+        "meaning": design.meanings.get(number),
     }
 
 

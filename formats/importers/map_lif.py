@@ -7,22 +7,15 @@ nodes and edges are described in :mod:`locatk.formats.exporters.map_lif`, which 
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
-from locatk.core.errors import FormatError, error_context
+from locatk.core.errors import error_context
 from locatk.core.landmarks.landmark import code_of
 from locatk.core.landmarks.map.floor import Cell, FloorMap, neighbour
 from locatk.core.landmarks.map.grid_fit import MAX_OFFSET_M, floor_from_poses
-
-MAX_COORDINATE_M = 1e4
-"""10 km, larger than any floor: larger numbers are in another unit."""
-
-LETTERS_KEY = {"1": "nodeName", "2": "nodeDescriptor"}
-"""Key of the letters of a node by the major version of LIF."""
+from locatk.formats.importers.lif import NAME_KEY, LayoutNode, LayoutReader
 
 
 def loads_lif(
@@ -52,19 +45,15 @@ def loads_lif(
     InputError
         The positions are not on a grid; the error names a deviating node.
     """
-    reader = _LayoutReader(file)
+    reader = LayoutReader(file)
     layout, major = reader.layout(text)
     codes, poses, names = [], [], []
     index: dict[str, int] = {}
-    for number, node in enumerate(reader.objects(layout, "nodes")):
-        where = f"nodes[{number}]"
-        node_id = reader.text(node, "nodeId", where)
-        if node_id in index:
-            raise reader.error(f"node {node_id!r} occurs twice", where)
-        index[node_id] = number
-        codes.append(reader.code(node, LETTERS_KEY[major], where, node_id))
-        poses.append((*reader.position(node, where), 0.0))
-        names.append(f"node {node_id!r}")
+    for number, node in enumerate(reader.nodes(layout)):
+        index[node.node_id] = number
+        codes.append(_code(reader, node, NAME_KEY[major]))
+        poses.append((node.x_m, node.y_m, 0.0))
+        names.append(f"node {node.node_id!r}")
     if not codes:
         raise reader.error("a layout without nodes", "nodes")
     with error_context(file):
@@ -92,96 +81,17 @@ def iter_passages(floor: FloorMap) -> Iterator[tuple[Cell, Cell]]:
                 yield cell, neighbour(cell, heading)
 
 
-class _LayoutReader:
-    """Checked access to the JSON; errors name ``file``."""
-
-    def __init__(self, file: str | os.PathLike[str]) -> None:
-        self._file = file
-
-    def error(self, message: str, where: str, hint: str | None = None) -> FormatError:
-        return FormatError(message, file=self._file, where=where, hint=hint)
-
-    def layout(self, text: str) -> tuple[dict[str, Any], str]:
-        """Return the only layout of the text, and the major version of its format."""
-        try:
-            data = json.loads(text.removeprefix("\ufeff"))
-        except json.JSONDecodeError as error:
-            raise FormatError(
-                f"not JSON ({error.msg})", file=self._file, where=error.lineno
-            ) from None
-        except (ValueError, RecursionError) as error:
-            raise FormatError(f"not JSON ({error})", file=self._file) from None
-        if not isinstance(data, dict):
-            raise FormatError("not LIF: expected an object", file=self._file)
-        major = self._major_version(data)
-        root = "layouts" if major == "1" else "origins"
-        if root not in data:
-            raise FormatError(f"not LIF {major}: expected the key {root!r}", file=self._file)
-        parents = [data] if major == "1" else self.objects(data, "origins")
-        layouts = [layout for parent in parents for layout in self.objects(parent, "layouts")]
-        if len(layouts) != 1:
-            raise self.error(
-                f"{len(layouts)} layouts, expected one",
-                "layouts",
-                "A landmark map is one floor: keep one layout in the file",
-            )
-        return layouts[0], major
-
-    def _major_version(self, data: dict[str, Any]) -> str:
-        """Return the stated major version; a file without one is recognized by its keys."""
-        head = data.get("metaInformation")
-        version = head.get("lifVersion") if isinstance(head, dict) else None
-        if version is None:
-            return "2" if "origins" in data else "1"
-        major = version.split(".")[0] if isinstance(version, str) else ""
-        if major not in LETTERS_KEY:
-            raise self.error(
-                f"version {version!r} of LIF is not supported",
-                "metaInformation.lifVersion",
-                "Export the layout as LIF 1.0.0 or 2.0.0",
-            )
-        return major
-
-    def objects(self, data: dict[str, Any], key: str) -> list[dict[str, Any]]:
-        """Return a list of objects."""
-        value = data.get(key)
-        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-            raise self.error("expected a list of objects", key)
-        return value
-
-    def text(self, data: dict[str, Any], key: str, where: str) -> str:
-        """Return a string that is not empty; ``where`` is the path of ``data``."""
-        value = data.get(key)
-        if not isinstance(value, str) or not value:
-            raise self.error("expected a string", f"{where}.{key}")
-        return value
-
-    def code(self, node: dict[str, Any], key: str, where: str, node_id: str) -> int:
-        """Return the code of the landmark whose letters a node has under ``key``."""
-        letters = node.get(key)
-        try:
-            return code_of(letters if isinstance(letters, str) else "")
-        except ValueError:
-            raise self.error(
-                f"the {key} of node {node_id!r} is not a landmark",
-                f"{where}.{key}",
-                f"Give the letters of its bars as {key}, as in NNSN: counter-clockwise from +x",
-            ) from None
-
-    def position(self, node: dict[str, Any], where: str) -> tuple[float, float]:
-        """Return the position of a node in metres."""
-        position = node.get("nodePosition")
-        coordinates = []
-        for axis in ("x", "y"):
-            value = position.get(axis) if isinstance(position, dict) else None
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if value is None or not is_number or not abs(value) <= MAX_COORDINATE_M:
-                raise self.error(
-                    f"expected x and y in metres, up to {MAX_COORDINATE_M:g}",
-                    f"{where}.nodePosition",
-                )
-            coordinates.append(float(value))
-        return coordinates[0], coordinates[1]
+def _code(reader: LayoutReader, node: LayoutNode, key: str) -> int:
+    """Return the code of the landmark whose letters a node has under ``key``."""
+    letters = node.data.get(key)
+    try:
+        return code_of(letters if isinstance(letters, str) else "")
+    except ValueError:
+        raise reader.error(
+            f"the {key} of node {node.node_id!r} is not a landmark",
+            f"{node.where}.{key}",
+            f"Give the letters of its bars as {key}, as in NNSN: counter-clockwise from +x",
+        ) from None
 
 
 def _cells(floor: FloorMap, poses: list[tuple[float, float, float]]) -> list[Cell]:

@@ -60,8 +60,9 @@ class SolveReport:
     detections : tuple
         As in :class:`locatk.core.solution.Solution`. A report that was made without detections
         contains those of tags and landmarks only.
-    facts : LandmarkFacts or None
-        As in the solution of landmarks; None for other systems, and without detections.
+    facts : LandmarkFacts, PolarisFacts or None
+        As in the solution of landmarks and polaris; None for other systems, and for landmarks
+        without detections.
     warnings : tuple of SolverWarning
         As in :class:`locatk.core.solution.Solution`.
     losses : tuple of SolverWarning
@@ -134,7 +135,7 @@ def summarize(
     Without detections it contains only those of tags and landmarks, which are few.
     """
     has_table = solution.system in ("polaris", "landmarks")
-    has_facts = with_detections and solution.system == "landmarks"
+    has_facts = solution.system == "polaris" or (with_detections and solution.system == "landmarks")
     return SolveReport(
         session=session,
         output=output,

@@ -31,7 +31,7 @@ DEGREES_PER_RADIAN = math.degrees(1)
 # ---- tables
 
 
-OPTIONAL_COLUMNS = ("other magnets", "design", "refused")
+OPTIONAL_COLUMNS = ("other magnets", "design", "meaning", "refused")
 """Columns that are omitted if they are empty."""
 
 
@@ -58,6 +58,7 @@ def tag_table(
             "other magnets": str(len(detection.other_magnets) or ""),
             **_pose_cells(detection, compact),
             "design": detection.design or "",
+            "meaning": detection.meaning or "",
             "refused": reason_text(detection.refused),
         }
 

@@ -175,7 +175,7 @@ def test_completion_needs_no_command_module() -> None:
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment
     )
-    assert done.stdout.splitlines() == ["plain,simulate", "plain,solve"]
+    assert done.stdout.splitlines() == ["plain,site", "plain,simulate", "plain,solve"]
 
 
 def failing(error: BaseException) -> Callable[..., Result]:

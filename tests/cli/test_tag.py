@@ -242,6 +242,24 @@ def test_encode_and_decode_are_inverse(locatk, tmp_path: Path) -> None:
         assert locatk("tag", "decode", "--symbols", *symbols).stdout.strip() == str(number)
 
 
+def test_meanings_of_ids_are_shown(locatk, tag: Path) -> None:
+    write_tags(tag, replace(Tags(), meanings={1234: "stop"}), overwrite=True)
+    encoded = locatk("tag", "encode", 1234, "--tag", tag)
+    assert encoded.stdout.splitlines()[0] == "Tag 1234 of 327680, codec mosk: stop"
+    magnets = json.loads(locatk("tag", "encode", 1234, "--tag", tag, "--json").stdout)
+    assert magnets["meaning"] == "stop"
+    cells = [f"{m['cell'][0]},{m['cell'][1]}:{m['orientation_deg']}" for m in magnets["magnets"]]
+    decoded = locatk("tag", "decode", *cells, "--tag", tag)
+    assert decoded.stdout.strip() == "1234"
+    assert "Meaning: stop" in decoded.stderr
+    assert (
+        json.loads(locatk("tag", "decode", *cells, "--tag", tag, "--json").stdout)["meaning"]
+        == "stop"
+    )
+    other = json.loads(locatk("tag", "encode", 5, "--tag", tag, "--json").stdout)
+    assert other["meaning"] is None
+
+
 def test_encode_draws_the_tag(locatk) -> None:
     """x is up and v1 at the lower left, as the tag's frame has it."""
     result = locatk("tag", "encode", 1234)

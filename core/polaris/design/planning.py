@@ -299,7 +299,7 @@ def evaluate_design(
             f"{tags.spacing_m * 1e3:g} mm"
         )
 
-    array, noise_from = _sensor_array(use)
+    array, noise_from = sensor_array(use)
     horizontal_noise = float(np.sqrt(np.mean(array.noise_t[:2] ** 2)))
     midway = use.sensor_spacing_m / 2 if use.sensors > 1 else 0.0
     peak = _field_strength(magnet, [0, 0, clearance])
@@ -386,7 +386,7 @@ def _placement_sigma(tags: Tags) -> float:
     return float(np.sqrt(np.mean(errors_rad**2)))
 
 
-def _sensor_array(use: ReadingConditions) -> tuple[SensorArray, str]:
+def sensor_array(use: ReadingConditions) -> tuple[SensorArray, str]:
     """Return the bar with its noise, and the origin of the noise."""
     settings = use.settings
     if use.noise_t is not None:

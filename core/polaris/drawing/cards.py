@@ -28,6 +28,7 @@ from locatk.core.drawing.pages import (
     check_margin,
     larger_paper_text,
     number_pages,
+    printable,
     size_text,
 )
 from locatk.core.errors import InputError
@@ -224,8 +225,11 @@ class _TagCard:
         return paragraph(lines, corner, points, spacing_em=SPACING_EM, bold=bold)
 
     def _id_lines(self, tag_id: int) -> list[str]:
+        """Return the id of the tag and its meaning, which are written above it."""
         text = f"id {tag_id}" + (", MIRRORED: seen from below" if self.mirror else "")
-        return wrap(text, ID_POINTS, self.size_mm[0] - TEXT_INDENT_MM)
+        lines = wrap(text, ID_POINTS, self.size_mm[0] - TEXT_INDENT_MM)
+        meaning = printable(self.tags.meanings.get(tag_id, ""))
+        return lines + wrap(meaning, ID_POINTS, self.size_mm[0] - TEXT_INDENT_MM)
 
     def _detail_lines(self) -> list[str]:
         """Return the design of the tag, which is written below it."""

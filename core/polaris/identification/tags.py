@@ -118,6 +118,20 @@ class TagObservation:
         return self.tags.site.get(self.tag_id)
 
     @property
+    def site_covariance(self) -> Array:
+        """Covariance (3, 3) of :attr:`site_pose`; zero if it is exact."""
+        if self.tags is None or self.tag_id is None:
+            return np.zeros((3, 3))
+        return np.diag(np.square(self.tags.site_sigma.get(self.tag_id, (0.0, 0.0, 0.0))))
+
+    @property
+    def meaning(self) -> str | None:
+        """Meaning of the id; None if it has none."""
+        if self.tags is None or self.tag_id is None:
+            return None
+        return self.tags.meanings.get(self.tag_id)
+
+    @property
     def array_pose(self) -> PlanarPose | None:
         """Pose of the array in the tag's frame; None without a match."""
         if self.match is None:
@@ -168,6 +182,7 @@ class TagObservation:
                 for k in self.unexplained
             ),
             design=design,
+            meaning=self.meaning,
         )
 
     def _magnet_detections(self) -> tuple[MagnetDetection, ...]:

@@ -118,13 +118,16 @@ def test_a_simulated_tour_is_solved_on_its_site(locatk, tmp_path: Path) -> None:
 
     site = {5: PlanarPose(0.0, 0.0, 0.0), 9: PlanarPose(0.5, 0.05, 2.0)}
     artifact, tour, out = (tmp_path / name for name in ("tag.toml", "tour.mcap", "solved.mcap"))
-    tags.write_tags(artifact, replace(Tags(), site=site))
+    tags.write_tags(artifact, replace(Tags(), site=site, meanings={9: "stop"}))
     args = ("--id", 5, "--id", 9, "--odometry", "--seed", 2)
     assert locatk("simulate", "polaris", artifact, "-o", tour, *args).exit_code == 0
     result = locatk("solve", tour, "-o", out, "--json")
     assert result.exit_code == 0, result.stderr
     (entry,) = json.loads(result.stdout)["sessions"]
     assert [seen["tag_id"] for seen in entry["detections"]] == [5, 9]
+    assert [seen.get("meaning") for seen in entry["detections"]] == [None, "stop"]
+    (correction,) = entry["facts"]["heading_corrections"]
+    assert (correction["from"], correction["to"]) == (5, 9)
     solution = solutions.read_solution(out)
     assert solution.artifact.site == site
     assert [track.frame for track in solution.trajectories] == ["site"]

@@ -17,7 +17,12 @@ import pytest
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.polaris.codec import layout_of
-from locatk.core.polaris.results import MagnetDetection, TagDetection
+from locatk.core.polaris.results import (
+    HeadingCorrection,
+    MagnetDetection,
+    PolarisFacts,
+    TagDetection,
+)
 from locatk.core.polaris.tag import (
     AsBuiltTag,
     PlanarPose,
@@ -167,17 +172,25 @@ def test_info_describes_artifacts(locatk, tmp_path: Path) -> None:
     built = AsBuiltTag(np.full((5, 2), 1e-4), np.full(5, math.radians(3)), 7)
     tags.write_tags(
         path,
-        replace(TAGS, ids=(3, 9), built={9: built}, site={3: PlanarPose(1.5, -0.2, math.pi / 2)}),
+        replace(
+            TAGS,
+            ids=(3, 9),
+            built={9: built},
+            site={3: PlanarPose(1.5, -0.2, math.pi / 2)},
+            meanings={9: "charging station"},
+        ),
     )
     facts = json.loads(locatk("info", path, "--json").stdout)
     assert (facts["kind"], facts["capacity"], facts["family"]) == ("tag", 327_680, 2)
     first, second = facts["tags"]
     assert (first["id"], first["position_mm"], first["heading_deg"]) == (3, [1500, -200], 90)
     assert (second["id"], second["passes"], second["angle_deg"]) == (9, 7, pytest.approx([3] * 5))
+    assert (first["meaning"], second["meaning"]) == (None, "charging station")
     assert second["cells"] == [list(cell) for cell in layout_of(TAGS, 9).cells]
     text = locatk("info", path).stdout
     assert "2 x 0.5 mm, N52, 1.45 T, 1.812 mA m2" in text
     assert "1500,-200 mm, 90 deg" in text
+    assert "charging" in text
 
     path = tmp_path / "array.toml"
     tags.write_array(path, SensorArray(bar(3, 0.008)))
@@ -278,6 +291,7 @@ class Solver:
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
         self.seen: list[list[TagDetection]] = []
+        self.facts: PolarisFacts | None = None
 
     def solve(
         self, samples: Any, known: Tags | None, wanted: Any, *, odometry: Any = ()
@@ -297,7 +311,14 @@ class Solver:
         )
         warnings = (SolverWarning("test", "a note"),)
         return Solution(
-            "polaris", wanted.method, (track,), {"debris": 2}, tuple(seen), known, warnings
+            "polaris",
+            wanted.method,
+            (track,),
+            {"debris": 2},
+            tuple(seen),
+            known,
+            warnings,
+            self.facts,
         )
 
 
@@ -335,6 +356,34 @@ def test_a_solution_holds_tags_and_poses(locatk, solver: Solver, tmp_path: Path)
     assert solution.detections == tuple(solver.seen[0])
     facts = json.loads(locatk("info", out, "--json").stdout)
     assert (facts["kind"], facts["system"], facts["codec"]) == ("solution", "polaris", "mosk")
+    assert "meaning" not in found
+    assert entry["facts"] == {}
+
+
+def test_meanings_and_heading_corrections_are_printed(
+    locatk, solver: Solver, tmp_path: Path
+) -> None:
+    rotations = (0.02, -0.05, 0.02)
+    solver.facts = PolarisFacts(
+        tuple(
+            HeadingCorrection("bar", 1.0 + k, 77, 78 + k, rotation, 1e-3, 0.5)
+            for k, rotation in enumerate(rotations)
+        )
+    )
+    solver.seen = [[replace(detection(TAGS, ID, (0.01, -0.02, 0.5)), meaning="stop")]]
+    session, out = record(tmp_path / "run.mcap"), tmp_path / "solved.mcap"
+    text = " ".join(locatk("solve", session, "-o", out).stdout.split())
+    assert "meaning" in text
+    assert "stop" in text
+    expected = "heading corrections: 3, mean size 1.72 deg, largest -2.86 deg from tag 77 to tag 79"
+    assert expected in text
+    result = locatk("solve", session, "-o", out, "--overwrite", "--json")
+    (entry,) = json.loads(result.stdout)["sessions"]
+    assert list(entry["detections"][0])[-1] == "meaning"
+    assert entry["detections"][0]["meaning"] == "stop"
+    turns = [each["turn_rad"] for each in entry["facts"]["heading_corrections"]]
+    assert turns == list(rotations)
+    assert solutions.read_solution(out).detections[0].meaning == "stop"
 
 
 def test_people_see_a_table_of_tags(locatk, solver: Solver, tmp_path: Path) -> None:

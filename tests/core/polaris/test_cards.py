@@ -49,6 +49,19 @@ def test_the_drawing_of_a_tag_is_within_its_cut_marks(tags: Tags, mirror: bool) 
     assert edges[1][0] - edges[0][1] == pytest.approx(CARD_GAP_MM, abs=2e-3)
 
 
+def test_the_meaning_of_an_id_is_below_it() -> None:
+    tags = Tags(meanings={5: "charge here"})
+    requested = [(tag_id, layout_of(tags, tag_id)) for tag_id in (5, 6)]
+    groups = draw_tag_cards(tags, requested, (297.0, 420.0)).pages[0].groups[1:]
+    texts = [
+        {mark.text: mark for mark in group.marks if isinstance(mark, Text)} for group in groups
+    ]
+    assert texts[0]["id 5"].position[1] > texts[0]["charge here"].position[1]
+    assert texts[0]["id 5"].points == texts[0]["charge here"].points
+    assert "id 6" in texts[1]
+    assert "charge here" not in texts[1]
+
+
 def test_the_moment_of_a_magnet_is_clockwise_from_up_and_mirrored_from_below() -> None:
     tags = Tags()
     layout = layout_of(tags, 77_777)

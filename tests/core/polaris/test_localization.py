@@ -212,6 +212,30 @@ def test_the_error_of_odometry_widens_the_covariance_between_tags(
     assert midway > 1.5e-3 > 3 * over_tag
 
 
+def test_the_uncertainty_of_a_surveyed_tag_is_part_of_its_poses(tour: tuple[Any, Samples]) -> None:
+    _, recording = tour
+    preprocessed = preprocess(recording)
+    part = find_passes(preprocessed.samples, preprocessed.noise_t)[0]
+    identified = identify_pass(detect_magnets(preprocessed, part, TAGS), recording, [TAGS])
+    assert identified is not None
+    sigma = (0.02, 0.01, 0.1)
+    exact = replace(TAGS, site=SITE)
+    surveyed = replace(exact, site_sigma={IDS[0]: sigma})
+    before, after = (
+        localize(recording, [replace(identified.observations[0], tags=tags)]).trajectories[0]
+        for tags in (exact, surveyed)
+    )
+    np.testing.assert_array_equal(after.position, before.position)
+    added = (after.covariance - before.covariance)[:, :, [0, 1, 5]][:, [0, 1, 5]]
+    # A rotation of the tag moves the array about the tag.
+    pose = SITE[IDS[0]]
+    x, y = (after.position[:, :2] - [pose.x_m, pose.y_m]).T
+    by_tag = np.tile(np.eye(3), (len(after), 1, 1))
+    by_tag[:, 0, 2], by_tag[:, 1, 2] = -y, x
+    expected = by_tag @ np.diag(np.square(sigma)) @ by_tag.swapaxes(1, 2)
+    np.testing.assert_allclose(added, expected, atol=1e-12)
+
+
 def test_the_same_tag_twice_in_a_row_has_no_correction(tour: tuple[Any, Samples]) -> None:
     _, recording = tour
     preprocessed = preprocess(recording)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import runpy
 from decimal import Decimal
 from pathlib import Path
@@ -77,7 +78,7 @@ def test_artifacts_have_different_file_names() -> None:
 @every
 def test_errors_name_the_artifact_if_there_is_no_file(artifact: Artifact[Any], value: Any) -> None:
     with pytest.raises(ArtifactError) as caught:
-        artifact.loads(artifact.dumps(value).replace("format_version = 1", "format_version = 2"))
+        artifact.loads(re.sub("format_version = .", "format_version = 9", artifact.dumps(value)))
     assert caught.value.file == f"<{artifact.file.removesuffix('.toml')}>"
     assert caught.value.where == "format_version"
 

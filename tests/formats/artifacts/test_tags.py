@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 
 from locatk.core.polaris.array import SensorArray, bar
 from locatk.core.polaris.codec import capacity
-from locatk.core.polaris.tag import CODECS, AsBuiltTag, Magnet, PlanarPose, Tags
+from locatk.core.polaris.tag import (
+    CODECS,
+    MAX_MEANING_CHARACTERS,
+    AsBuiltTag,
+    Magnet,
+    PlanarPose,
+    Tags,
+)
 from locatk.formats.artifacts.tags import (
     ARRAY,
     TAGS,
@@ -37,6 +44,13 @@ def arrays(shape: tuple[int, ...], elements: st.SearchStrategy[float]) -> st.Sea
     )
 
 
+meanings = st.text(
+    st.characters(exclude_categories=("C", "Z"), include_characters=" "),
+    min_size=1,
+    max_size=MAX_MEANING_CHARACTERS,
+).filter(lambda text: not text.isspace())
+
+
 @st.composite
 def tag_sets(draw: st.DrawFn) -> Tags:
     """Any tags, of designs of each codec."""
@@ -53,6 +67,14 @@ def tag_sets(draw: st.DrawFn) -> Tags:
     last = capacity(tags) - 1
     ids = draw(st.none() | st.lists(st.integers(0, last), min_size=1, max_size=5, unique=True))
     some = st.integers(0, last) if ids is None else st.sampled_from(ids)
+    site = dict(
+        sorted(
+            draw(
+                st.dictionaries(some, st.builds(PlanarPose, finite, finite, finite), max_size=2)
+            ).items()
+        )
+    )
+    sigma = st.floats(0, 1e3)
     # Half the spacing is the limit, in any direction.
     offset = st.floats(-0.35 * spacing, 0.35 * spacing)
     angle = st.floats(-math.pi, math.pi)
@@ -75,14 +97,10 @@ def tag_sets(draw: st.DrawFn) -> Tags:
         None if ids is None else tuple(ids),
         draw(st.integers(1, 9)),
         dict(sorted(draw(st.dictionaries(some, built, max_size=2)).items())),
-        dict(
-            sorted(
-                draw(
-                    st.dictionaries(some, st.builds(PlanarPose, finite, finite, finite), max_size=2)
-                ).items()
-            )
-        ),
+        site,
         tuple(draw(st.lists(st.text(max_size=20), max_size=2))),
+        dict(sorted(draw(st.dictionaries(some, meanings, max_size=2)).items())),
+        {tag_id: draw(st.tuples(sigma, sigma, sigma)) for tag_id in site if draw(st.booleans())},
     )
 
 
@@ -162,6 +180,7 @@ offset_mm = [[0, 0.5], [0, 0], [0, 0], [0, 0], [-0.1, 0]]
 angle_deg = [4.3, -2.2, 13.0, 0, -2.8]
 """
 SITE = "\n[[site]]\nid = 7\nx_mm = 1500\ny_mm = -20.5\nheading_deg = 90\n"
+MEANING = '\n[[meaning]]\nid = 7\ntext = "stop"\n'
 
 
 def test_tags_by_hand() -> None:
@@ -171,6 +190,12 @@ def test_tags_by_hand() -> None:
     assert tags.built[7].offset_m[0, 1] == 0.5e-3
     assert tags.built[7].angle_rad[2] == math.radians(13)
     assert tags.site == {7: PlanarPose(1.5, -0.0205, math.pi / 2)}
+    assert tags.meanings == {}
+    assert tags.site_sigma == {}
+    surveyed = loads_tags(TAG + MAGNET + SITE + "sigma_mm = [2, 3]")
+    assert surveyed.site_sigma == {7: (0.002, 0.003, 0.0)}
+    newer = TAG.replace("version = 1", "version = 2")
+    assert loads_tags(newer + MAGNET + FAMILY + MEANING).meanings == {7: "stop"}
 
 
 @pytest.mark.parametrize(
@@ -178,7 +203,7 @@ def test_tags_by_hand() -> None:
     [
         ("", None, "missing key 'format'"),
         (TAG.replace("locatk-tag", "tag") + MAGNET, "format", "expected 'locatk-tag'"),
-        (TAG.replace("version = 1", "version = 2") + MAGNET, "format_version", "newer"),
+        (TAG.replace("version = 1", "version = 3") + MAGNET, "format_version", "newer"),
         (TAG.replace('"mosk"', '"moks"') + MAGNET, "codec", "not one of mosk, redundant"),
         (TAG.replace("order = 3", "order = 1") + MAGNET, "order", "from 2 to 100"),
         (TAG.replace("magnets = 5", "magnets = 9") + MAGNET, "magnets", "at most 8"),
@@ -217,6 +242,15 @@ def test_tags_by_hand() -> None:
         (TAG + MAGNET + SITE.replace("90", "inf"), "site[0].heading_deg", "finite"),
         (TAG + MAGNET + SITE.replace("x_mm", "x"), "site[0]", "missing key 'x_mm'"),
         (TAG + MAGNET + SITE + SITE, "site[1].id", "twice"),
+        (TAG + MAGNET + SITE + "sigma_mm = [1, -1]", "site[0].sigma_mm[1]", "of at least 0"),
+        (TAG + MAGNET + SITE + "sigma_deg = -1", "site[0].sigma_deg", "of at least 0"),
+        (TAG + MAGNET + MEANING + MEANING, "meaning[1].id", "twice"),
+        (TAG + MAGNET + MEANING.replace("7", "327680"), "meaning[0].id", "not an id of this"),
+        (TAG + MAGNET + FAMILY + MEANING.replace("7", "5"), "meaning[0].id", "not in the family"),
+        (TAG + MAGNET + MEANING.replace("stop", " "), "meaning[0].text", "40 characters that is"),
+        (TAG + MAGNET + MEANING.replace("stop", 41 * "x"), "meaning[0].text", "40 characters"),
+        (TAG + MAGNET + MEANING.replace("stop", "a\\nb"), "meaning[0].text", "one line"),
+        (TAG + MAGNET + MEANING.replace('"stop"', "3"), "meaning[0].text", "not a number"),
         (TAG.replace("mosk", "polaris-released").replace("= 8", "= 16") + MAGNET, None, "released"),
     ],
 )

@@ -191,6 +191,9 @@ def test_formats_of_tables() -> None:
     assert detections.format_cell(None) == ""
     assert detections.format_cell([3, 11]) == "3,11"
     assert detections.format_clock(1e300) == "1e+300 s"
+    meant = detections.tag_table([tag(), tag(meaning="stop")])
+    assert meant.header[-1] == "meaning"
+    assert [row[-1] for row in meant.rows] == ["", "stop"]
     two = detections.tag_table([tag(), tag(device="other")], 1)
     assert two.header[0] == "array"
     assert two.omitted == 1

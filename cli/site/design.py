@@ -1,0 +1,207 @@
+"""``locatk site design``: tags on a grid, at points, or along a route."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console, options
+from locatk.cli.command import Command, section
+from locatk.cli.map.options import Size
+from locatk.cli.options import number
+from locatk.cli.site.site_text import report_check, site_entry, written_text
+from locatk.cli.table_options import parse_columns, parse_words
+from locatk.cli.tag.options import reading_conditions, reading_options
+from locatk.core.units import metres
+
+if TYPE_CHECKING:
+    from locatk.core.polaris.design.site import SitePoint
+    from locatk.core.polaris.tag import Tags
+
+
+class Position(click.ParamType):
+    """Position in mm, as in ``500,-200``."""
+
+    name = "X,Y"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float]:
+        """Parse the text; fail with the expected form."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            x, y = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not x,y in mm as in 500,-200.", param, ctx)
+        if not (abs(x) <= MAX_COORDINATE_MM and abs(y) <= MAX_COORDINATE_MM):
+            self.fail(f"{value!r} is not within 10 km.", param, ctx)
+        return x, y
+
+
+MAX_COORDINATE_MM = 1e7
+
+table_options = section(
+    "Tables",
+    click.option(
+        "--columns",
+        metavar="KEY=NAME,...",
+        callback=parse_columns,
+        help="Headers of x, y, heading, id and meaning, if they differ from these names.",
+    ),
+    click.option(
+        "--units",
+        metavar="UNIT,...",
+        callback=parse_words,
+        help="Units of columns without a unit in their names: one of m, cm, mm; of rad, deg.",
+    ),
+)
+
+
+@click.command(cls=Command)
+@options.input_argument("tag")
+@options.output("Site to write (.toml).", endings=(".toml",))
+@section(
+    "Positions",
+    click.option(
+        "--grid", type=Size(), metavar="ROWSxCOLS", help="Grid, with rows along x, from --origin."
+    ),
+    options.input_option("--points", help="Table (.csv) of positions: one tag each."),
+    options.input_option(
+        "--route",
+        help="Table (.csv) of waypoints: a tag at each, and between them so that no distance is "
+        "above --spacing, with the heading of the route.",
+    ),
+    click.option(
+        "--spacing",
+        type=options.PositiveNumber(1, 1e6),
+        metavar="MM",
+        help="Distance between neighbouring tags of --grid; largest one of --route.",
+    ),
+    click.option(
+        "--origin",
+        default="0,0",
+        type=Position(),
+        show_default=True,
+        metavar="X,Y",
+        help="Position of the first tag of --grid in mm.",
+    ),
+    number(
+        "--heading",
+        default=0.0,
+        type=click.FloatRange(-360, 360),
+        metavar="DEG",
+        help="Heading of the tags of --grid, and of --points without a heading.",
+    ),
+)
+@section(
+    "Ids",
+    number(
+        "--min-distance",
+        default=1,
+        type=click.IntRange(min=1),
+        metavar="D",
+        help="Minimum distance of two ids, in orientation steps, if TAG has no family.",
+    ),
+)
+@table_options
+@reading_options
+@options.overwrite
+@options.as_json
+@options.verbosity
+def command(
+    tag: Path,
+    output: Path,
+    grid: tuple[int, int] | None,
+    points: Path | None,
+    route: Path | None,
+    spacing: float | None,
+    origin: tuple[float, float],
+    heading: float,
+    min_distance: int,
+    columns: dict[str, str] | None,
+    units: tuple[str, ...] | None,
+    overwrite: bool,
+    as_json: bool,
+    **conditions: Any,
+) -> None:
+    """Place tags of TAG (tag.toml) on a floor, and write the site to OUTPUT.
+
+    Each tag has an id of its own: that of the table, or the next one of the family of TAG. If TAG
+    has no family, one is generated. The site is then checked as by `locatk site check`; with
+    findings it is written nevertheless, and the exit status is 3.
+
+    A table has columns x and y and, optionally, heading, id and meaning, with units in their names
+    (x_mm, heading_deg) or given by --units.
+
+    \b
+    Examples:
+      locatk site design tag.toml --grid 3x4 --spacing 1000 -o site.toml
+      locatk site design tag.toml --points stations.csv --units m,deg -o site.toml
+      locatk site design tag.toml --route aisle.csv --spacing 800 -o site.toml
+    """
+    from locatk.core.errors import error_context
+    from locatk.core.polaris.design.site import check_site, place_tags
+    from locatk.formats.artifacts.tags import read_tags, write_tags
+
+    sources = [each for each in (grid, points, route) if each is not None]
+    if len(sources) != 1:
+        raise click.UsageError("Give one of --grid, --points and --route.")
+    if points is None and spacing is None:
+        raise click.UsageError("--grid and --route need --spacing.")
+    if points is not None and spacing is not None:
+        raise click.UsageError("--spacing is for --grid and --route, not for --points.")
+    if grid is not None and (columns or units):
+        raise click.UsageError("--columns and --units are for --points and --route.")
+    table = points or route
+    inputs = [tag] if table is None else [tag, table]
+    options.guard_output(output, overwrite=overwrite, inputs=inputs)
+    tags = read_tags(tag)
+    placed_at = _points(tags, grid, points, route, spacing, origin, heading, columns, units)
+    with error_context(table or tag):
+        site = place_tags(tags, placed_at, min_distance)
+    with console.working("Checking"):
+        report = check_site(site, reading_conditions(**conditions))
+    write_tags(output, site, overwrite=overwrite)
+    console.result(written_text(output, site) + "\n")
+    report_check(report, {"output": output, "site": site_entry(site)}, as_json)
+
+
+def _points(
+    tags: Tags,
+    grid: tuple[int, int] | None,
+    points: Path | None,
+    route: Path | None,
+    spacing: float | None,
+    origin: tuple[float, float],
+    heading: float,
+    columns: dict[str, str] | None,
+    units: tuple[str, ...] | None,
+) -> list[SitePoint]:
+    """Return the points for tags."""
+    from dataclasses import replace
+
+    from locatk.core.errors import error_context
+    from locatk.core.polaris.design.site import grid_points, route_points
+    from locatk.formats.importers.site_csv import read_site_points
+
+    if grid is not None and spacing is not None:
+        x, y = origin
+        return grid_points(*grid, metres(spacing), (metres(x), metres(y)), math.radians(heading))
+    if points is not None:
+        found, has_heading = read_site_points(points, columns, units or ())
+        if has_heading:
+            return found
+        return [replace(point, heading_rad=math.radians(heading)) for point in found]
+    if route is None or spacing is None:
+        raise AssertionError("no source of points")
+    waypoints, _ = read_site_points(route, columns, units or ())
+    with error_context(route):
+        found, left_out = route_points(waypoints, metres(spacing), tags.order * tags.spacing_m)
+    if left_out:
+        points_text = "1 point" if left_out == 1 else f"{left_out} points"
+        console.say(f"{points_text} at which the route passes a tag again: left out.")
+    return found
