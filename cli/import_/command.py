@@ -187,8 +187,8 @@ FORMATS = {
         (
             "landmark-csv run.csv --map map.toml -o run.mcap",
             "landmark-csv log.csv -o run.mcap --circle 25 \\\n"
-            "      --columns t=time,x=x,y=y,heading=yaw,front=h1,left=h2,rear=h3,right=h4 \\\n"
-            "      --units ms,m,rad,v --volts-per-tesla 13 --zero-volts median",
+            "          --columns t=time,x=x,y=y,heading=yaw,front=h1,left=h2,rear=h3,right=h4 \\\n"
+            "          --units ms,m,rad,v --volts-per-tesla 13 --zero-volts median",
         ),
         landmarks.OPTIONS,
         takes_one_path=True,
