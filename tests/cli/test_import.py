@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from locatk.cli.app import app
 from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import StationReport, Sweeps
@@ -283,3 +285,38 @@ def test_a_crazyflie_config_becomes_a_scene(locatk, tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert result.stderr.startswith("Error: ")
     assert artifacts.read_scene(out).station(1) is not None
+
+
+def test_each_format_has_its_own_options_and_help() -> None:
+    """`import FORMAT --help` lists the options of the format, and no other's."""
+    help = CliRunner().invoke(app, ["import", "saleae", "--help"]).stdout
+    assert "--channel" in help
+    assert "--volts-per-tesla" not in help
+    assert "locatk import saleae capture.sal" in help
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["salea", "x.sal"], "Did you mean 'saleae'?"),
+        (["images.csv"], "is a file or folder, not a format"),
+        (["saleae", "x.sal", "--sheet", "s.toml"], "--sheet means nothing to the format saleae"),
+        (["saleae", "x.sal", "--chanel", "1"], "--channel"),
+    ],
+)
+def test_wrong_format_or_option(
+    arguments: list[str], problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A misspelled format gets a suggestion, a file in its place does not."""
+    monkeypatch.chdir(tmp_path)
+    Path("images.csv").touch()
+    result = CliRunner().invoke(app, ["import", *arguments, "-o", "o.mcap"])
+    assert result.exit_code == 2
+    assert problem in result.stderr
+
+
+def test_options_may_precede_the_format(tmp_path: Path) -> None:
+    """The order of options and format does not matter."""
+    result = CliRunner().invoke(app, ["import", "-o", "o.mcap", "saleae", str(tmp_path / "no.sal")])
+    assert result.exit_code == 1
+    assert "No such file" in result.stderr
