@@ -389,7 +389,7 @@ def test_a_disk_that_fills(line: Any, process: Any, small_disk: Path, raw_bytes:
 SYSTEMS = {
     "polaris": ("polaris-array", ("--id", "262143", "--speed", "0.3")),
     "landmarks": ("locatk", ("--strategy", "pass", "--cell", "2,2")),
-    "lighthouse": ("lighthouse-deck", ("--duration", "3")),
+    "lighthouse": ("lighthouse-deck", ("--duration", "5")),
 }
 """Device, and what makes a simulated session of some seconds."""
 

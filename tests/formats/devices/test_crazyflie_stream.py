@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.simulation.session import SimulationOptions, simulate
+from locatk.core.simulation import SESSION_START_NS
 from locatk.formats.artifacts.receiver import RECEIVER_FILE, dumps_receiver
 from locatk.formats.capture.ingestion import SerialIntake
 from locatk.formats.capture.reader_thread import ReceivedData
@@ -309,9 +310,11 @@ LOST_PACKETS = range(160, 167)
 
 def simulated_flight(duration_s: float, seed: int = 5) -> Flight:
     options = SimulationOptions(
-        planar=False, receiver=DECK, report_hz=50, duration_s=duration_s, seed=seed
+        planar=False, receiver=DECK, report_hz=50, duration_s=2 * duration_s, seed=seed
     )
     sweeps = simulate(options).sweeps
+    # In the first half it is carried from marker to marker, without sweeps in between.
+    sweeps = sweeps.take(sweeps.time_ns >= SESSION_START_NS + round(duration_s * 1e9))
     start_ns = int(sweeps.time_ns[0])
     columns = (sweeps.polynomial, sweeps.sensor, sweeps.count, (sweeps.time_ns - start_ns) * 1e-9)
     flight = Flight(sweeps=np.stack(columns, axis=1), lost=len(LOST_PACKETS))
