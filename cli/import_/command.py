@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from locatk.cli import console, failures, options
-from locatk.cli.command import Command, Group, combine
+from locatk.cli.command import SECTIONS, Command, Group, combine
 from locatk.cli.import_ import dots, landmarks, lighthouse, polaris
 
 MAX_PRINTED_WARNINGS = 10
@@ -264,6 +264,7 @@ def _format_command(name: str, chosen: Format) -> FormatCommand:
     ) -> None:
         _import(name, chosen, paths, output, given, overwrite=overwrite, as_json=as_json)
 
+    setattr(run, SECTIONS, dict.fromkeys((option.name for option in own), "Recording"))
     examples = "".join(f"\n      locatk import {example}" for example in chosen.examples)
     return FormatCommand(
         name,

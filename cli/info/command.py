@@ -21,10 +21,10 @@ ENDINGS = (".mcap", ".toml")
 
 
 @click.command(cls=Command, short_help="Describe a session, a solution or an artifact.")
-@click.argument("names", metavar="FILE...", nargs=-1, required=True)
+@click.argument("names", metavar="FILE...", type=options.PATH, nargs=-1, required=True)
 @options.as_json
 @options.verbosity
-def command(names: tuple[str, ...], as_json: bool) -> None:
+def command(names: tuple[Path, ...], as_json: bool) -> None:
     """Describe FILE: a session or solution (.mcap, also of other tools), or an artifact (.toml).
 
     Several files, a folder or a pattern are listed in a table, one line each.
@@ -54,10 +54,10 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
     """
     from locatk.formats.pipeline.file_search import expand_name
 
-    if len(names) > 1 or expand_name(names[0], ENDINGS) is not None:
+    if len(names) > 1 or expand_name(str(names[0]), ENDINGS) is not None:
         _describe_several(names, as_json=as_json)
         return
-    file = Path(names[0])
+    file = names[0]
     facts = {"version": 1, **_describe(file)}
     if as_json:
         console.emit_json(facts)
@@ -68,7 +68,7 @@ def command(names: tuple[str, ...], as_json: bool) -> None:
         raise failures.Incomplete(f"{file}: {facts['damage']}{hint}")
 
 
-def _describe_several(names: Sequence[str], *, as_json: bool) -> None:
+def _describe_several(names: Sequence[Path], *, as_json: bool) -> None:
     """List files, one line each; those that cannot be read at the end."""
     from locatk.formats.pipeline.file_search import expand_name
 
@@ -77,9 +77,9 @@ def _describe_several(names: Sequence[str], *, as_json: bool) -> None:
     found: dict[Path, None] = {}
     for name in names:
         try:
-            found.update(dict.fromkeys(map(Path, expand_name(name, ENDINGS) or [name])))
+            found.update(dict.fromkeys(map(Path, expand_name(str(name), ENDINGS) or [name])))
         except LocatkError as error:
-            failures_by_file[Path(name)] = error
+            failures_by_file[name] = error
     files, count = list(found), len(found) + len(failures_by_file)
     with console.progress(files, "Reading") as items:
         for file in items:

@@ -136,16 +136,16 @@ def test_an_internal_error_names_no_option(
 
 @pytest.mark.parametrize("system", ["dots", "lighthouse", "polaris", "landmarks"])
 def test_reports_contain_detections_and_facts_if_used(system: str) -> None:
-    """Tables of tags and landmarks are printed in any case, facts of landmarks only as JSON."""
+    """Tables of tags and landmarks are printed in any case, and the facts of tags."""
     detection = SimpleNamespace(tag_id=1, refused="")
     facts = SimpleNamespace(robots={})
     solution = Solution(system, "bundle", (track("red", 3),), detections=(detection,), facts=facts)
     full = summarize("in", "out", solution)
     small = summarize("in", "out", solution, with_detections=False)
     assert full.detections == (detection,)
-    assert full.facts is (facts if system == "landmarks" else None)
+    assert full.facts is (facts if system in ("polaris", "landmarks") else None)
     assert small.detections == ((detection,) if system in ("polaris", "landmarks") else ())
-    assert small.facts is None
+    assert small.facts is (facts if system == "polaris" else None)
     assert small.losses == full.losses
 
 
