@@ -77,7 +77,8 @@ def _describe_several(names: Sequence[Path], *, as_json: bool) -> None:
     found: dict[Path, None] = {}
     for name in names:
         try:
-            found.update(dict.fromkeys(map(Path, expand_name(str(name), ENDINGS) or [name])))
+            expanded = expand_name(str(name), ENDINGS) or [str(name)]
+            found.update((Path(file), None) for file in expanded)
         except LocatkError as error:
             failures_by_file[name] = error
     files, count = list(found), len(found) + len(failures_by_file)
@@ -98,8 +99,8 @@ def _describe_several(names: Sequence[Path], *, as_json: bool) -> None:
     damaged = [facts for facts in described if facts.get("damage")]
     for facts in damaged:
         console.warn(f"{facts['file']} is damaged: {facts['damage']}")
-    for file, error in failures_by_file.items():
-        console.warn(f"{file} was not described: {error.message}")
+    for file, failure in failures_by_file.items():
+        console.warn(f"{file} was not described: {failure.message}")
     if failures_by_file:
         raise LocatkError(
             f"{len(failures_by_file)} of {count} files could not be described",
