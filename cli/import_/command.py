@@ -12,7 +12,7 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.command import SECTIONS, Command, Group, combine
-from locatk.cli.import_ import dots, landmarks, lighthouse, polaris
+from locatk.cli.import_ import dots, landmarks, lighthouse, polaris, table
 
 MAX_PRINTED_WARNINGS = 10
 """Most warnings on stderr; ``--json`` and the log of a camera session contain all of them."""
@@ -59,6 +59,7 @@ IMPORTERS = "locatk.formats.importers."
 
 LIGHTHOUSE, DOTS = "Lighthouse base stations", "Micro-dot sheets"
 POLARIS, LANDMARKS = "Magnetic tags (polaris)", "Landmarks"
+TABLES = "Magnetic tags or landmarks"
 
 SCENE_FORMAT = "crazyflie-config"
 """Format whose output is a scene instead of a session."""
@@ -193,6 +194,24 @@ FORMATS = {
         landmarks.OPTIONS,
         takes_one_path=True,
     ),
+    "table": Format(
+        TABLES,
+        "Magnetometers, hall sensors, odometry in any table (CSV, TSV, Parquet).",
+        IMPORTERS + "any_table:read_any_table",
+        table.import_table,
+        "Magnetometers or hall sensors, and odometry, in any table: CSV with commas, semicolons or "
+        "tabs, or Parquet. Columns are recognised by usual names, as in mag0_x [uT], Bx1 (mT), "
+        "hall_front_mt, odom_x_m; --columns names others by the keys t, b0x, b0y, b0z, b1x, ..., "
+        "front, left, rear, right, x, y, heading. What was recognised is printed. Units are part "
+        "of the names or given by --units; times since 1970 and in ISO 8601 need none.",
+        (
+            "table log.csv --spacing 20 --tag tag.toml -o run.mcap",
+            "table log.tsv --columns b0x=u,b0y=v,b0z=w --units ms,ut -o run.mcap",
+            "table robot.parquet --map map.toml -o run.mcap",
+        ),
+        table.OPTIONS,
+        takes_one_path=True,
+    ),
 }
 
 LOSSES = """
@@ -217,6 +236,7 @@ FORMAT_OPTIONS = _parameters(
         dots.dots_options,
         polaris.polaris_options,
         landmarks.landmark_options,
+        table.table_options,
     )
 )
 """Options of all formats, by the names of their arguments."""
@@ -313,8 +333,8 @@ class ImportGroup(Group):
                     f"{known}.",
                     ctx,
                 )
-            similar = difflib.get_close_matches(name, FORMATS)
-            hint = f"Did you mean {' or '.join(map(repr, similar))}?" if similar else ""
+            similar = difflib.get_close_matches(name, FORMATS, n=1)
+            hint = f"Did you mean {similar[0]!r}?" if similar else ""
             raise click.UsageError(
                 f"No such format {name!r}. {hint or f'Formats are {known}.'}", ctx
             )

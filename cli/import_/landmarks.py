@@ -26,6 +26,9 @@ OPTIONS = (
 
 MEDIAN = "median"
 
+COLUMN_KEYS = ("t", "x", "y", "heading")
+"""Keys of columns besides those of the sensors."""
+
 
 def _parse_numbers(
     ctx: click.Context, param: click.Parameter, value: str | None
@@ -109,7 +112,7 @@ def import_samples(
     from locatk.formats.sessions import field_samples
 
     volts = _volts(given.get("volts_per_tesla"), given.get("zero_volts"))
-    start_ns = _start_ns(given.get("start"))
+    start_ns = parse_start(given.get("start"))
     floor = maps.read_map(given["map"]) if "map" in given else None
     sensors = _sensors(given.get("circle"), given.get("halls"), floor)
     with console.working("Reading"):
@@ -162,7 +165,8 @@ def _volts(per_tesla: tuple[float, ...] | None, zero: tuple[float, ...] | str | 
     return Volts(per_tesla, None if isinstance(zero, str) else zero)
 
 
-def _start_ns(text: str | None) -> int | None:
+def parse_start(text: str | None) -> int | None:
+    """Return the time of ``--start`` in nanoseconds since the epoch."""
     if text is None:
         return None
     from locatk.formats.tables.timestamps import parse_iso_time

@@ -75,7 +75,7 @@ def write_parquet(
     OutputExistsError, MissingDataError
         See :func:`locatk.formats.output.atomic_write`.
     """
-    arrow, parquet = _pyarrow()
+    arrow, parquet = import_pyarrow()
     tables = [_table(arrow, trajectory) for trajectory in trajectories]
     if sessions:
         tables = [
@@ -91,7 +91,14 @@ def write_parquet(
         parquet.write_table(table.replace_schema_metadata(metadata), stream)
 
 
-def _pyarrow() -> tuple[Any, Any]:
+def import_pyarrow() -> tuple[Any, Any]:
+    """Return the modules ``pyarrow`` and ``pyarrow.parquet``.
+
+    Raises
+    ------
+    LocatkError
+        They are not installed.
+    """
     try:
         import pyarrow
         import pyarrow.parquet

@@ -130,7 +130,7 @@ class ImportedHalls:
 
 
 def read_landmarks(
-    path: Path,
+    path: Path | Table,
     *,
     sensors: HallSensors,
     columns: Mapping[str, str] | None = None,
@@ -143,7 +143,7 @@ def read_landmarks(
 
     Parameters
     ----------
-    path : path
+    path : path or Table
     sensors : HallSensors
         Positions and names of the hall sensors; the names are the keys of their columns.
     columns : mapping of str to str, optional
@@ -173,7 +173,7 @@ def read_landmarks(
         raise InputError(
             f"a sensor is called {reserved[0]!r}", hint="Rename it: another column has this key"
         )
-    table = read_table(path)
+    table = path if isinstance(path, Table) else read_table(path)
     quantities = {
         TIME_KEY: ("time",),
         "x": ("length",),
@@ -182,18 +182,18 @@ def read_landmarks(
         **dict.fromkeys(sensors.names, ("field", "voltage")),
     }
     by_key = find_columns(table, quantities, columns or {}, given_units)
-    time_ns, clock = _times(by_key[TIME_KEY], start_ns)
-    odometry, repeated_poses, partial_poses = _odometry(table, by_key, time_ns)
+    time_ns, clock = read_times(by_key[TIME_KEY], start_ns)
+    odometry, repeated_poses, partial_poses = read_odometry(table, by_key, time_ns)
     readings = [by_key[name] for name in sensors.names]
     field_t = _fields(readings, volts)
     # Rows with a pose and no reading are not samples.
     rows = np.flatnonzero(~np.isnan(field_t).all(axis=1))
     if not len(rows):
-        raise InputError("no reading of any sensor", file=path, hint="Check the columns")
+        raise InputError("no reading of any sensor", file=table.file, hint="Check the columns")
     field_t = -field_t[rows] if downward else field_t[rows]
     facts = {
         "format": "landmark-csv",
-        "file": Path(path).name,
+        "file": table.file.name,
         "rows": str(len(table)),
         "columns": ", ".join(
             f"{key}={column.name}" + (f" [{column.unit}]" if column.unit else "")
@@ -218,7 +218,7 @@ def read_landmarks(
         [table.lines[row] for row in rows.tolist()],
     )
     if excluded == field_t.size:
-        raise InputError("no usable reading", file=path, hint=warnings[0].split(": ", 1)[1])
+        raise InputError("no usable reading", file=table.file, hint=warnings[0].split(": ", 1)[1])
     if partial_poses:
         warnings.append(
             f"{table.file}:{table.lines[partial_poses[0]]}: odometry is incomplete in "
@@ -228,7 +228,7 @@ def read_landmarks(
     return ImportedHalls(samples, odometry, facts, warnings, excluded, len(partial_poses))
 
 
-def _times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str]:
+def read_times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str]:
     """Return the times of the rows in nanoseconds since the epoch, and a text on their clock."""
     table, unit = column.table, column.unit
     if not unit:
@@ -323,7 +323,7 @@ def _per_sensor(name: str, values: tuple[float, ...], sensors: int) -> Array:
     return np.broadcast_to(np.array(values, float), (sensors,)).copy()
 
 
-def _odometry(
+def read_odometry(
     table: Table, columns: Mapping[str, Column], time_ns: NDArray[np.int64]
 ) -> tuple[Trajectory, int, list[int]]:
     """Return the poses of odometry, which may be slower than the sensors.
