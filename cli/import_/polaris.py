@@ -21,11 +21,11 @@ polaris_options = section(
         "--spacing",
         type=options.PositiveNumber(1e-9, 1000),
         metavar="MM",
-        help="Distance between neighbouring sensors. Required (published runs: 20).",
+        help="Distance between neighbouring sensors of a straight bar (published runs: 20).",
     ),
     options.input_option(
         "--tag",
-        help="Tags in the recording (tag.toml).  [default: the published design]",
+        help="Tags in the recording (tag.toml).  [default of polaris-csv: the published design]",
     ),
 )
 

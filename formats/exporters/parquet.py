@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from locatk.core.errors import LocatkError
 from locatk.core.trajectory import Trajectory, has_orientation
 from locatk.formats.importers.trajectory_csv import (
     COLUMNS,
@@ -23,6 +22,7 @@ from locatk.formats.importers.trajectory_csv import (
 )
 from locatk.formats.output import atomic_write, tool_version
 from locatk.formats.sessions.messages import triangle
+from locatk.formats.tables.arrow import import_pyarrow
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Axes of a pose's covariance: position, and rotation about the fixed axes x, y, z."""
@@ -89,25 +89,6 @@ def write_parquet(
     table = arrow.concat_tables(tables or [_table(arrow, _empty_trajectory())])
     with atomic_write(path, overwrite=overwrite) as stream:
         parquet.write_table(table.replace_schema_metadata(metadata), stream)
-
-
-def import_pyarrow() -> tuple[Any, Any]:
-    """Return the modules ``pyarrow`` and ``pyarrow.parquet``.
-
-    Raises
-    ------
-    LocatkError
-        They are not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise LocatkError(
-            "Parquet needs pyarrow, which is not installed",
-            hint='Install it: pip install "locatk[parquet]"',
-        ) from None
-    return pyarrow, pyarrow.parquet
 
 
 def _table(arrow: Any, trajectory: Trajectory) -> Any:

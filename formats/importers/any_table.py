@@ -28,6 +28,7 @@ from locatk.formats.files import MAX_FILE_BYTES, read_text
 from locatk.formats.importers.field_readings import exclude_readings, find_absent_readings
 from locatk.formats.importers.landmark_csv import POSE_KEYS, TIME_KEY, read_odometry, read_times
 from locatk.formats.importers.polaris_csv import ImportedSamples
+from locatk.formats.tables.arrow import import_pyarrow
 from locatk.formats.tables.delimited import Table, read_table
 from locatk.formats.tables.quantities import (
     TIME_NAMES,
@@ -127,8 +128,6 @@ def _with_decimal_points(cells: list[str]) -> list[str]:
 
 
 def _read_parquet(path: Path) -> Table:
-    from locatk.formats.exporters.parquet import import_pyarrow
-
     arrow, parquet = import_pyarrow()
     try:
         data = parquet.read_table(path)

@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from locatk.core.errors import InputError, LocatkError
+from locatk.core.errors import InputError
 from locatk.core.printable import spreadsheet_text
 from locatk.formats.output import atomic_write
+from locatk.formats.tables.arrow import import_pyarrow
 
 ENDINGS = (".csv", ".json", ".parquet", ".tex")
 
@@ -78,17 +79,10 @@ def _json(columns: Sequence[str], rows: Sequence[Row]) -> bytes:
 
 
 def _parquet(columns: Sequence[str], rows: Sequence[Row]) -> bytes:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise LocatkError(
-            "Parquet needs pyarrow, which is not installed",
-            hint='Install it: pip install "locatk[parquet]"',
-        ) from None
-    table = pyarrow.table({name: [row[name] for row in rows] for name in columns})
-    sink = pyarrow.BufferOutputStream()
-    pyarrow.parquet.write_table(table, sink)
+    arrow, parquet = import_pyarrow()
+    table = arrow.table({name: [row[name] for row in rows] for name in columns})
+    sink = arrow.BufferOutputStream()
+    parquet.write_table(table, sink)
     return bytes(sink.getvalue())
 
 
