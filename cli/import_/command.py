@@ -206,7 +206,7 @@ FORMATS = {
         "of the names or given by --units; times since 1970 and in ISO 8601 need none.",
         (
             "table log.csv --spacing 20 --tag tag.toml -o run.mcap",
-            "table log.tsv --columns b0x=u,b0y=v,b0z=w --units ut -o run.mcap",
+            "table log.tsv --columns b0x=u,b0y=v,b0z=w --units ut -o a.mcap",
             "table robot.parquet --map map.toml -o run.mcap",
         ),
         table.OPTIONS,
