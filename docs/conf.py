@@ -57,6 +57,11 @@ def menu() -> str:
     return "\n".join(parts)
 
 
+REPOSITORY = re.compile(
+    r"https://(?:github\.com/locatk/locatk/blob|raw\.githubusercontent\.com/locatk/locatk)/main/"
+)
+"""Addresses of files of the repository. README has them, as PyPI shows it, too."""
+
 ELSEWHERE = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -74,7 +79,7 @@ def linked(text: str, up: str) -> str:
 
 def included(name: str) -> str:
     """Return the text of a file above docs, with its links rewritten for docs."""
-    text = (ROOT / name).read_text(encoding="utf-8")
+    text = REPOSITORY.sub("", (ROOT / name).read_text(encoding="utf-8"))
     return re.sub(r"\]\((?!https?:|#|docs/)", "](../", text).replace("](docs/", "](")
 
 

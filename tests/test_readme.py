@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import click
@@ -17,6 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
     "README.md",
     "CONTRIBUTING.md",
+    "SECURITY.md",
     # The page of commands is made from the commands and has a test of its own.
     *(
         path.relative_to(ROOT).as_posix()
@@ -24,6 +26,11 @@ PAGES = [
         if path.stem != "commands"
     ),
 ]
+
+REPOSITORY = re.compile(
+    r"https://(?:github\.com/locatk/locatk/blob|raw\.githubusercontent\.com/locatk/locatk)/main/"
+)
+"""Addresses of files of the repository."""
 
 CONTEXT = click.Context(app, **app.context_settings)
 """Of ``locatk``. A command keeps its help option, with the names of the first context it has."""
@@ -45,8 +52,29 @@ def test_one_line_does_all(root: Path, heading: str) -> None:
 def test_links_lead_somewhere(root: Path, page: str) -> None:
     path = root / page
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text(encoding="utf-8")):
-        if not target.startswith("http"):
+        if REPOSITORY.match(target):
+            assert (root / REPOSITORY.sub("", target)).exists(), target
+        elif not target.startswith("http"):
             assert (path.parent / target).exists(), target
+
+
+def test_readme_has_no_relative_link(root: Path) -> None:
+    """PyPI shows the README without the files beside it."""
+    text = (root / "README.md").read_text(encoding="utf-8")
+    assert re.findall(r"\]\((?!https://|#)[^)]*\)", text) == []
+    assert re.findall(r"(?:src|href)=[\"'](?!https://|#)", text) == []
+    images = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", text)
+    assert images
+    assert all(image.startswith("https://raw.githubusercontent.com/") for image in images)
+
+
+def test_version_is_the_one_of_the_changelog_and_the_citation(root: Path) -> None:
+    version = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+    newest = re.search(r"^## (\S+)", (root / "CHANGELOG.md").read_text("utf-8"), re.M)
+    cited = re.search(r"^version: (\S+)$", (root / "CITATION.cff").read_text("utf-8"), re.M)
+    assert newest
+    assert cited
+    assert newest[1] == cited[1] == version
 
 
 def command_of(words: list[str]) -> tuple[click.Command, list[str]]:
