@@ -197,7 +197,7 @@ FORMATS = {
     "table": Format(
         TABLES,
         "Magnetometers, hall sensors, odometry in any table (CSV, TSV, Parquet).",
-        IMPORTERS + "any_table:read_any_table",
+        "locatk.formats.tables.dialects:read_any_table",
         table.import_table,
         "Magnetometers or hall sensors, and odometry, in any table: CSV with commas, semicolons or "
         "tabs, or Parquet. Columns are recognised by usual names, as in mag0_x [uT], Bx1 (mT), "

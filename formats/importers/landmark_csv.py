@@ -20,7 +20,8 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.importers.field_readings import exclude_readings, find_absent_readings
-from locatk.formats.tables.delimited import Table, read_table
+from locatk.formats.tables.delimited import Table
+from locatk.formats.tables.dialects import read_any_table
 from locatk.formats.tables.quantities import (
     UNITS,
     Column,
@@ -162,7 +163,7 @@ def read_landmarks(
     Raises
     ------
     MissingDataError, FormatError
-        See :func:`~locatk.formats.tables.delimited.read_table` and
+        See :func:`~locatk.formats.tables.dialects.read_any_table` and
         :func:`~locatk.formats.tables.quantities.find_columns`.
     InputError
         A unit is unknown, a cell is not a number, times do not ascend, or nothing is usable.
@@ -173,7 +174,7 @@ def read_landmarks(
         raise InputError(
             f"a sensor is called {reserved[0]!r}", hint="Rename it: another column has this key"
         )
-    table = path if isinstance(path, Table) else read_table(path)
+    table = path if isinstance(path, Table) else read_any_table(path)
     quantities = {
         TIME_KEY: ("time",),
         "x": ("length",),

@@ -16,7 +16,8 @@ from locatk.core.errors import InputError
 from locatk.core.polaris.design.site import SitePoint
 from locatk.core.polaris.tag import MAX_MEANING_CHARACTERS
 from locatk.core.printable import text_of_spreadsheet
-from locatk.formats.tables.delimited import Table, read_table
+from locatk.formats.tables.delimited import Table
+from locatk.formats.tables.dialects import read_any_table
 from locatk.formats.tables.quantities import find_columns, split_unit, units_by_quantity
 
 QUANTITIES = {"x": ("length",), "y": ("length",), "heading": ("angle",)}
@@ -57,7 +58,7 @@ def read_site_points(
     Raises
     ------
     MissingDataError, FormatError, InputError
-        See :func:`~locatk.formats.tables.delimited.read_table` and
+        See :func:`~locatk.formats.tables.dialects.read_any_table` and
         :func:`~locatk.formats.tables.quantities.find_columns`; a cell is not a number or an id, or
         a meaning is too long.
     """
@@ -67,7 +68,7 @@ def read_site_points(
         keys = ", ".join((*QUANTITIES, *TEXT_KEYS))
         raise InputError(f"unknown column key {unknown[0]!r}", hint=f"Keys are {keys}")
     given_units = units_by_quantity(units)
-    table = read_table(path)
+    table = read_any_table(path)
     has_heading = "heading" in headers or any(
         split_unit(name)[0] == "heading" for name in table.columns
     )

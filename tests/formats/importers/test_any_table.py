@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from locatk.core.errors import FormatError, InputError, LocatkError
-from locatk.formats.importers.any_table import guess_columns, read_any_table, read_magnetometers
+from locatk.formats.importers.any_table import guess_columns, read_magnetometers
+from locatk.formats.tables.dialects import read_any_table
 
 FIELD_UT = (
     np.array([[20.5, -3.25, 41.0, 21.0, -3.0, 40.5], [20.75, -3.5, 40.0, 20.0, -2.75, 41.5]] * 8)
