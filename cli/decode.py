@@ -55,8 +55,11 @@ def command(
     """
     from locatk.formats.capture.attachments import attachments
     from locatk.formats.capture.redecoding import decode, losses
+    from locatk.formats.devices import find_device
     from locatk.formats.devices.interface import Options
 
+    if device not in (None, "auto"):
+        find_device(device)
     options.guard_output(output, overwrite=overwrite, inputs=[recording, *artifact])
     with console.working("Decoding"):
         decoded = decode(

@@ -6,7 +6,6 @@ two methods, are compared with each other by paired differences.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,7 +43,7 @@ COLUMNS = (
     "nees",
 )
 """Columns of the table of several evaluations, one row for each device: absolute errors, and NEES
-per degree of freedom."""
+per degree of freedom. The coverage is that of all devices of the session."""
 
 
 @dataclass(frozen=True)
@@ -151,9 +150,10 @@ def evaluate_file(
         See :func:`locatk.formats.importers.trajectories.open_file`.
     options : EvaluationOptions
     names : mapping of str to str, optional
-        Names of devices in the estimate to those in the truth.
+        Device in the truth of each device of the estimate.
     match : str
-        That of the options, or ``"auto"``: ``"nearest"`` for two TUM or KITTI files.
+        As in the options, or ``"auto"``: ``"nearest"`` if both files are TUM or KITTI, else
+        ``"interpolate"``.
     onboard : bool
         Compare the poses that the devices of a session estimated themselves.
 
@@ -203,7 +203,7 @@ def evaluate_file(
     if match == "auto":
         is_evo = estimated.kind in files.EVO_KINDS and true.kind in files.EVO_KINDS
         match = "nearest" if is_evo else "interpolate"
-    # Rows of KITTI are stamped by the second.
+    # KITTI has no times: its rows are one second apart.
     max_gap_s = max(1.0, options.max_gap_s) if estimated.kind == "kitti" else options.max_gap_s
     evaluation = evaluate(pairs, replace(options, match=match, max_gap_s=max_gap_s))
     if evaluation.time_offset.coarse_method == "first stamps":
@@ -217,7 +217,7 @@ def evaluate_file(
 
 
 def find_estimates(names: Sequence[Path]) -> tuple[list[Path], bool]:
-    """Return the files of paths, folders and patterns, and whether there may be several.
+    """Return the files of paths, folders and patterns, and whether one name can mean several.
 
     A folder stands for its solutions, and for damaged files.
 
@@ -291,6 +291,8 @@ def _may_be_solution(path: Path) -> bool:
 
 def _read_facts(path: Path) -> dict[str, str]:
     # Text files are evaluated without the library of MCAP, which takes long to import.
+    if path.suffix.lower() != ".mcap":
+        return {}
     from locatk.formats.pipeline.session_search import read_facts
 
     return read_facts(str(path))
@@ -309,7 +311,7 @@ def label_runs(evaluated: Sequence[EvaluatedFile]) -> list[str]:
     sessions = [each.session for each in evaluated]
     if len(set(sessions)) == len(sessions):
         return [""] * len(sessions)
-    folders = [os.path.relpath(each.estimate.parent) for each in evaluated]
+    folders = [str(each.estimate.parent) for each in evaluated]
     for labels in (folders, [each.facts.get("method", "") for each in evaluated]):
         if len(set(zip(sessions, labels, strict=True))) == len(sessions):
             return labels

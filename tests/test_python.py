@@ -230,3 +230,12 @@ def test_other_systems(tmp_path: Path, system: str) -> None:
     assert result.system == system
     assert result.detections
     assert "<table>" in result._repr_html_()
+
+
+def test_devices_without_truth_are_named(
+    recorded: session.Session, solved: solution.Solution
+) -> None:
+    true = [track for device, track in recorded.truth.items() if device != "robot-02"]
+    with pytest.warns(UserWarning, match="no truth for robot-02$"):
+        errors = functions.evaluate(solved, true)
+    assert "robot-02" not in errors.devices

@@ -185,7 +185,10 @@ def command(
         raise click.UsageError("Missing PORT." if port is None else "Missing option '-o'.")
     from locatk.formats.capture import setup
     from locatk.formats.capture.recorder import Limits
+    from locatk.formats.devices import find_device
 
+    if device != "auto":
+        find_device(device)
     _refuse_unused_options(port, device, rest)
     kind, amount = rotate or ("", 0.0)
     limits = Limits(

@@ -42,6 +42,8 @@ class Format:
         Arguments after ``locatk import``; long ones continue on a second line.
     options : tuple of str
         Options that the format has.
+    required : tuple of str
+        Those of them that it needs.
     takes_one_path : bool
     """
 
@@ -52,6 +54,7 @@ class Format:
     description: str
     examples: tuple[str, ...]
     options: tuple[str, ...] = ()
+    required: tuple[str, ...] = ()
     takes_one_path: bool = False
 
 
@@ -175,6 +178,7 @@ FORMATS = {
         "microtesla. The time is the row divided by --rate.",
         ("polaris-csv RawData_1.csv --rate 40 --spacing 20 -o run.mcap",),
         polaris.OPTIONS,
+        polaris.REQUIRED,
         takes_one_path=True,
     ),
     "landmark-csv": Format(
@@ -384,6 +388,9 @@ def _import(
     given = {name: value for name, value in format_options.items() if value not in (None, ())}
     if chosen.takes_one_path and len(paths) > 1:
         raise click.UsageError(f"The format {format_name} takes one PATH.")
+    for name in chosen.required:
+        if name not in given:
+            raise click.UsageError(f"The format {format_name} needs --{name}.")
     if format_name != "images":  # patterns such as run/*.png are not names of files
         options.must_exist(paths)
     input_files = [value for value in given.values() if isinstance(value, Path)]

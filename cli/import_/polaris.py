@@ -38,9 +38,6 @@ def import_samples(
     from locatk.formats.importers.polaris_csv import PUBLISHED_TAGS
     from locatk.formats.sessions import field_samples
 
-    for name in REQUIRED:
-        if name not in given:
-            raise click.UsageError(f"The format polaris-csv needs --{name}.")
     tag = tags.read_tags(given["tag"]) if "tag" in given else PUBLISHED_TAGS
     with console.working("Reading"):
         imported = reader(paths[0], rate_hz=given["rate"], spacing_m=given["spacing"] / 1000)

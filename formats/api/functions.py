@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -54,8 +55,8 @@ def solve(session: Session | Location, **options: Any) -> Solution:
     ----------
     session : Session or path
     **options
-        Those of ``locatk solve``: ``artifact`` and ``camera`` (paths), ``method``, ``scene``,
-        ``speed``, ``tag`` (paths), ``rate`` and more
+        Those of ``locatk solve``: ``artifact``, ``camera`` and ``tag`` (paths), ``method``,
+        ``scene`` (as in ``"two-3d"``), ``speed`` [m/s], ``rate`` [Hz] and more
         (:class:`locatk.formats.pipeline.systems.SolveRequest`).
 
     Returns
@@ -65,11 +66,11 @@ def solve(session: Session | Location, **options: Any) -> Solution:
     Raises
     ------
     InputError
-        An option is unknown or of another system.
+        An option is unknown, or does not apply to the system of the session.
     LocatkError
         The session cannot be read or solved.
     """
-    known = [field.name for field in fields(SolveRequest)]
+    known = [field.name for field in fields(SolveRequest) if field.name != "setup"]
     unknown = [name for name in options if name not in known]
     if unknown:
         raise InputError(f"no option {unknown[0]!r}", hint=f"Known options: {', '.join(known)}")
@@ -78,7 +79,7 @@ def solve(session: Session | Location, **options: Any) -> Solution:
             options[name] = Path(options[name])
     if options.get("tag") is not None:
         tags = options["tag"]
-        options["tag"] = tuple(map(Path, [tags] if isinstance(tags, str | Path) else tags))
+        options["tag"] = tuple(map(Path, [tags] if isinstance(tags, str | os.PathLike) else tags))
     path = session.path if isinstance(session, Session) else Path(session)
     solved = solve_session(path, SolveRequest(**options))
     facts = provenance.source_facts(path)
@@ -106,7 +107,8 @@ def evaluate(
     offset_s : float or "auto"
         Added to the stamps of the estimate.
     names : mapping of str to str, optional
-        Names of devices in the estimate to those in the truth.
+        Device in the truth of each device of the estimate. Devices without truth are left out,
+        with a warning.
     **options
         Those of :class:`locatk.core.evaluation.EvaluationOptions`.
 
@@ -123,15 +125,19 @@ def evaluate(
         if not isinstance(estimate, Solution) or estimate.session is None:
             raise InputError("no truth is given, and there is no session that contains it")
         truth = Session(estimate.session.path)
-    pairs, _ = pair_devices(_poses(estimate, "estimate"), _poses(truth, "truth"), names or {})
+    estimated, true = _trajectories(estimate, "estimate"), _trajectories(truth, "truth")
+    pairs, unpaired = pair_devices(estimated, true, names or {})
     if not pairs:
         raise InputError(
             "no device has truth", hint="Name the devices: names={'in estimate': 'in truth'}"
         )
+    if unpaired:
+        warnings.warn(f"no truth for {', '.join(unpaired)}", stacklevel=2)
     return evaluate_pairs(pairs, EvaluationOptions(align=align, offset_s=offset_s, **options))
 
 
-def _poses(source: Poses | Session, role: files.Role) -> list[Trajectory]:
+def _trajectories(source: Poses | Session, role: files.Role) -> list[Trajectory]:
+    """Return the trajectories of a source of poses."""
     if isinstance(source, Solution):
         return list(require_poses(source).values())
     if isinstance(source, Session):

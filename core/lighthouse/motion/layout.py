@@ -25,10 +25,10 @@ IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MAX_PAUSE_S = 1.0
-"""Longest pause of the sweeps over which a path continues."""
+"""Longest time between neighbouring knots over which a path continues."""
 
 MAX_GAP_S = 0.3
-"""Longest gap without sweeps in which a path has knots."""
+"""Longest gap without sweeps that is filled with knots."""
 
 MAX_START_GAP_S = 0.25
 """Longest time from a sweep to the nearest pose of the rough trajectory."""
@@ -37,14 +37,14 @@ MAX_JUMP_RAD = 0.6
 """Largest turn between neighbouring rough poses: 30 rad/s at 50 poses a second."""
 
 MAX_TURN_RATE_RAD_S = 1.0
-"""Largest rate of turn during a gap between rough poses, in addition."""
+"""Added to :data:`MAX_JUMP_RAD` for each second of a gap between rough poses."""
 
 JUMP_COST_S = 1.5
 """Time of the poses that are given up rather than keep a jump of the orientation. A wrong
 orientation between two jumps is left out if it lasts less than twice as long."""
 
 MAX_CHAIN_PARTS = 200
-"""Most parts between two parts of which one follows from the other."""
+"""Number of earlier parts that are tried as the predecessor of a part."""
 
 
 @dataclass(frozen=True)
