@@ -34,8 +34,8 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
     options.input_option(
         "--truth",
         metavar="FILE|FOLDER",
-        help="Reference poses: a session, a solution, TUM, KITTI or CSV. In a folder, the file "
-        "with the name of the session.  "
+        help="Reference poses: a session, a solution, or a file that `locatk eval` reads. In a "
+        "folder, the file with the name of the session.  "
         "[default: those of the session]",
     ),
     align_option,

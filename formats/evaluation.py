@@ -19,7 +19,7 @@ from locatk.core.natural_order import natural_key
 from locatk.formats.importers import trajectories as files
 from locatk.formats.pipeline.file_search import expand_name
 
-TRUTH_ENDINGS = (".mcap", ".tum", ".csv", ".txt", ".kitti")
+TRUTH_ENDINGS = (".mcap", ".tum", ".csv", ".txt", ".kitti", ".tsv")
 """Endings of files with truth in a folder, in the order in which they are looked for."""
 
 SOLVED_ENDING = "-solved"
@@ -167,7 +167,7 @@ def evaluate_file(
     estimated = files.open_file(estimate, role="onboard" if onboard else "estimate")
     true = files.open_file(truth, role="truth")
     files.check_kinds(estimated, true)
-    notes, warnings = [], []
+    notes, warnings = [*estimated.notes, *true.notes], []
     if not estimated.solved:
         if estimate.samefile(truth):
             raise InputError(

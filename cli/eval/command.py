@@ -73,8 +73,8 @@ offset_option = click.option(
     "--truth",
     required=True,
     metavar="FILE|FOLDER",
-    help="Session with truth, another solution, or a TUM, KITTI or CSV file. In a folder, the file "
-    "with the name of the session.",
+    help="Session with truth, another solution, TUM, KITTI, CSV, EuRoC, a log of a Crazyflie, or "
+    "an export of Motive, Vicon or Qualisys. In a folder, the file with the name of the session.",
 )
 @click.option(
     "--pair",
@@ -166,7 +166,7 @@ def command(
 ) -> None:
     """Compare the poses of ESTIMATE with a reference, for each device.
 
-    ESTIMATE is a solution (.mcap), a TUM, KITTI or CSV file, or a session with truth. Several, also
+    ESTIMATE is a solution (.mcap), a session with truth, or any file of --truth. Several, also
     folders of solutions and patterns, are each compared with the truth of their session, and
     solutions of the same sessions by several methods or settings with each other. The absolute pose
     error (APE) is the difference between a pose and the truth, the relative pose error (RPE) the
@@ -182,6 +182,7 @@ def command(
       locatk eval bundle/ paper/ --truth recordings/
       locatk eval solved.mcap --truth grid.mcap --align sim3 --json
       locatk eval solved.mcap --truth camera.tum --offset auto
+      locatk eval solved.mcap --truth take.csv --align se3 --offset auto
       locatk eval flight.mcap --onboard --truth solved.mcap --align se3
       locatk eval slam.tum --truth mocap.tum --align se3 --delta 1m
       locatk eval solved.mcap --truth mocap.csv --pair 785b=red --pair dffa=blue

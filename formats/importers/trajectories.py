@@ -1,19 +1,28 @@
-"""Trajectories from any file that contains some: a session, a solution, TUM, KITTI or CSV."""
+"""Trajectories from any file that contains some.
+
+Sessions and solutions, TUM, KITTI, CSV, and the formats of :data:`FORMATS`: motion capture systems,
+EuRoC, and logs of a Crazyflie.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
 from locatk.formats.files import read_head
+from locatk.formats.importers import motion_capture
+from locatk.formats.importers.crazyflie_csv import read_crazyflie_csv
+from locatk.formats.importers.euroc import is_euroc, read_euroc
 from locatk.formats.importers.kitti import KITTI_COLUMNS, read_kitti
 from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.importers.tum import TUM_COLUMNS, read_tum
 
-Kind = Literal["solution", "session", "tum", "kitti", "csv"]
+ToolKind = Literal["motive", "vicon", "qualisys", "euroc", "crazyflie"]
+Kind = Literal["solution", "session", "tum", "kitti", "csv"] | ToolKind
 Role = Literal["estimate", "truth", "onboard"]
 
 EVO_KINDS = ("tum", "kitti")
@@ -26,7 +35,37 @@ GZIP_MAGIC = b"\x1f\x8b"
 HEAD_BYTES = 1 << 16
 """Beginning of a text file that has to contain the first row."""
 
-KIND_HINT = "Give a session or solution (.mcap), or a TUM, KITTI or CSV file"
+KIND_HINT = (
+    "Give a session or solution (.mcap), TUM, KITTI, CSV with time_s, EuRoC, a log of a Crazyflie, "
+    "or an export of Motive, Vicon or Qualisys"
+)
+
+Content = tuple[list[Trajectory], tuple[str, ...]]
+"""Trajectories, and notes on assumptions."""
+
+
+class TextFormat(NamedTuple):
+    """Text of another tool that is recognised by its first lines."""
+
+    kind: ToolKind
+    is_format: Callable[[Sequence[str]], bool]
+    read: Callable[[Path], Content]
+
+
+def _is_crazyflie_log(lines: Sequence[str]) -> bool:
+    return "," in lines[0] and "stateestimate." in lines[0].lower()
+
+
+FORMATS = (
+    TextFormat("motive", motion_capture.is_motive, motion_capture.read_motive),
+    TextFormat("vicon", motion_capture.is_vicon, motion_capture.read_vicon),
+    TextFormat("qualisys", motion_capture.is_qualisys, motion_capture.read_qualisys),
+    TextFormat("euroc", is_euroc, lambda path: ([read_euroc(path)], ())),
+    TextFormat(
+        "crazyflie", _is_crazyflie_log, lambda path: (list(read_crazyflie_csv([path]).onboard), ())
+    ),
+)
+"""Formats of other tools, in the order in which they are tried."""
 
 
 @dataclass(frozen=True)
@@ -37,17 +76,20 @@ class TrajectoryFile:
     ----------
     path : Path
     kind : str
-        ``"solution"``, ``"session"``, ``"tum"``, ``"kitti"`` or ``"csv"``.
+        ``"solution"``, ``"session"``, ``"tum"``, ``"kitti"``, ``"csv"``, or one of :data:`FORMATS`.
     trajectories : list of Trajectory
         One a device.
     solved : bool
         False if they are the truth of a session.
+    notes : tuple of str
+        Assumptions about axes and clocks.
     """
 
     path: Path
     kind: Kind
     trajectories: list[Trajectory]
     solved: bool
+    notes: tuple[str, ...] = ()
 
 
 def read(path: Path, *, role: Role = "estimate") -> list[Trajectory]:
@@ -62,8 +104,8 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
     ----------
     path : path
         A session (its truth), a solution (its poses), or text: CSV with a header
-        (:func:`~locatk.formats.importers.trajectory_csv.read_csv`), TUM (eight numbers a line)
-        or KITTI (twelve).
+        (:func:`~locatk.formats.importers.trajectory_csv.read_csv`), TUM (eight numbers a line),
+        KITTI (twelve), or one of :data:`FORMATS`.
     role : str
         For a file with solved poses and truth: ``"estimate"`` reads the poses, ``"truth"`` the
         truth. ``"onboard"`` reads the poses of a session that its devices estimated themselves.
@@ -87,20 +129,37 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
             file=path,
             hint="Give a session of `locatk import crazyflie-usd`, or omit --onboard",
         )
-    kind = _kind_of_text(path, head)
+    lines = _lines_of(path, head)
+    for each in FORMATS:
+        if each.is_format(lines):
+            trajectories, notes = each.read(path)
+            if not trajectories:
+                raise FormatError("no poses", file=path, hint=KIND_HINT)
+            return TrajectoryFile(path, each.kind, trajectories, True, notes)
+    kind = _kind_of_text(path, lines)
     if kind == "csv":
         return TrajectoryFile(path, kind, read_csv(path), True)
     trajectory = read_tum(path) if kind == "tum" else read_kitti(path)
     return TrajectoryFile(path, kind, [trajectory], True)
 
 
-def _kind_of_text(path: Path, head: bytes) -> Literal["tum", "kitti", "csv"]:
-    """Detect the kind from the first row that is not a comment."""
+def _lines_of(path: Path, head: bytes) -> list[str]:
+    """Return the first lines of a text.
+
+    Raises
+    ------
+    FormatError
+        The file is empty or compressed.
+    """
     if not head.strip():
         raise FormatError("an empty file", file=path, hint=KIND_HINT)
     if head.startswith(GZIP_MAGIC):
         raise FormatError("a compressed file", file=path, hint="Unpack it: `gunzip`")
-    lines = head.decode("utf-8-sig", "replace").splitlines()
+    return head.decode("utf-8-sig", "replace").lstrip("\r\n").splitlines() or [""]
+
+
+def _kind_of_text(path: Path, lines: Sequence[str]) -> Literal["tum", "kitti", "csv"]:
+    """Detect the kind from the first row that is not a comment."""
     for number, line in enumerate(lines, start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
