@@ -17,7 +17,6 @@ from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.natural_order import natural_key
 from locatk.formats.importers import trajectories as files
-from locatk.formats.pipeline.file_search import expand_name
 
 TRUTH_ENDINGS = (".mcap", ".tum", ".csv", ".txt", ".kitti", ".tsv")
 """Endings of files with truth in a folder, in the order in which they are looked for."""
@@ -229,7 +228,8 @@ def find_estimates(names: Sequence[Path]) -> tuple[list[Path], bool]:
     found: dict[Path, None] = {}
     is_several = len(names) > 1
     for name in names:
-        expanded = expand_name(str(name))
+        # A plain file needs no search, whose imports take long.
+        expanded = None if name.is_file() else _expand(str(name))
         if expanded is None:
             found[name] = None
             continue
@@ -277,6 +277,12 @@ def session_name(estimate: Path, facts: Mapping[str, str]) -> str:
     """Return the name of the session of an estimate, without ending."""
     source = facts.get("source", "")
     return Path(source).stem if source else base_name(estimate)
+
+
+def _expand(name: str) -> list[str] | None:
+    from locatk.formats.pipeline.file_search import expand_name
+
+    return expand_name(name)
 
 
 def _may_be_solution(path: Path) -> bool:

@@ -25,6 +25,7 @@ from locatk.core.errors import FormatError, InputError
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
+from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.crazyflie_usd.recording import (
     DECK_NAME,
     DEVICE,
@@ -163,6 +164,17 @@ def read_crazyflie_csv(
         imu=data.imu,
         onboard=data.onboard,
     )
+
+
+def read_estimate(path: Path) -> tuple[list[Trajectory], tuple[str, ...]]:
+    """Return the poses that a Crazyflie estimated itself; there are no notes.
+
+    Raises
+    ------
+    LocatkError
+        As :func:`read_crazyflie_csv`.
+    """
+    return list(read_crazyflie_csv([path]).onboard), ()
 
 
 def _canonical(name: str) -> str:

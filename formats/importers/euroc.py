@@ -6,7 +6,6 @@ Source: Burri et al., The EuRoC micro aerial vehicle datasets, IJRR 2016.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +18,8 @@ from locatk.formats.importers.trajectory_csv import MAX_NORM_ERROR, unknown_cova
 COLUMNS = 8
 
 
-def is_euroc(lines: Sequence[str]) -> bool:
-    """Return whether the first lines are those of EuRoC ground truth."""
-    return lines[0].startswith("#timestamp") and lines[0].count(",") >= COLUMNS - 1
-
-
-def read_euroc(path: Path) -> Trajectory:
-    """Read a file of EuRoC ground truth.
+def read_euroc(path: Path) -> tuple[list[Trajectory], tuple[str, ...]]:
+    """Read a file of EuRoC ground truth; there are no notes.
 
     Raises
     ------
@@ -52,7 +46,7 @@ def read_euroc(path: Path) -> Trajectory:
         raise FormatError("no poses", file=path, hint="The file has a header only")
     data = np.array(values)
     quaternion = data[:, [4, 5, 6, 3]]
-    return Trajectory(
+    trajectory = Trajectory(
         path.stem,
         "world",
         np.array(times, np.int64),
@@ -60,3 +54,4 @@ def read_euroc(path: Path) -> Trajectory:
         quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         unknown_covariance(len(times)),
     )
+    return [trajectory], ()

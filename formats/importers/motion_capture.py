@@ -16,7 +16,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,21 +43,6 @@ LENGTHS_M["meters"] = 1.0
 Rows = list[list[str]]
 
 CLOCK_NOTE = "times of {} begin at 0 s: use --offset auto"
-
-
-def is_motive(lines: Sequence[str]) -> bool:
-    """Return whether the first lines are those of Motive."""
-    return lines[0].startswith("Format Version,")
-
-
-def is_vicon(lines: Sequence[str]) -> bool:
-    """Return whether the first lines are those of Vicon."""
-    return any(line.startswith("Frame,Sub Frame") for line in lines[:8])
-
-
-def is_qualisys(lines: Sequence[str]) -> bool:
-    """Return whether the first lines are those of Qualisys Track Manager."""
-    return lines[0].startswith("NO_OF_FRAMES\t")
 
 
 def read_motive(path: Path) -> tuple[list[Trajectory], tuple[str, ...]]:

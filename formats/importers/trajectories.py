@@ -6,6 +6,7 @@ EuRoC, and logs of a Crazyflie.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,6 @@ from typing import Literal, NamedTuple
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
 from locatk.formats.files import read_head
-from locatk.formats.importers import motion_capture
-from locatk.formats.importers.crazyflie_csv import read_crazyflie_csv
-from locatk.formats.importers.euroc import is_euroc, read_euroc
 from locatk.formats.importers.kitti import KITTI_COLUMNS, read_kitti
 from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.importers.tum import TUM_COLUMNS, read_tum
@@ -45,24 +43,60 @@ Content = tuple[list[Trajectory], tuple[str, ...]]
 
 
 class TextFormat(NamedTuple):
-    """Text of another tool that is recognised by its first lines."""
+    """Text of another tool.
+
+    Attributes
+    ----------
+    kind : str
+    is_format : callable
+        Whether the first lines are of this format.
+    module, reader : str
+        Module and name of the function that returns the :data:`Content` of a file. It is imported
+        when it is used: it needs scipy, which takes long.
+    """
 
     kind: ToolKind
     is_format: Callable[[Sequence[str]], bool]
-    read: Callable[[Path], Content]
+    module: str
+    reader: str
 
-
-def _is_crazyflie_log(lines: Sequence[str]) -> bool:
-    return "," in lines[0] and "stateestimate." in lines[0].lower()
+    def read(self, path: Path) -> Content:
+        """Return trajectories and notes; see the reader for errors."""
+        module = importlib.import_module(f"locatk.formats.importers.{self.module}")
+        content: Content = getattr(module, self.reader)(path)
+        return content
 
 
 FORMATS = (
-    TextFormat("motive", motion_capture.is_motive, motion_capture.read_motive),
-    TextFormat("vicon", motion_capture.is_vicon, motion_capture.read_vicon),
-    TextFormat("qualisys", motion_capture.is_qualisys, motion_capture.read_qualisys),
-    TextFormat("euroc", is_euroc, lambda path: ([read_euroc(path)], ())),
     TextFormat(
-        "crazyflie", _is_crazyflie_log, lambda path: (list(read_crazyflie_csv([path]).onboard), ())
+        "motive",
+        lambda lines: lines[0].startswith("Format Version,"),
+        "motion_capture",
+        "read_motive",
+    ),
+    TextFormat(
+        "vicon",
+        lambda lines: any(line.startswith("Frame,Sub Frame") for line in lines[:8]),
+        "motion_capture",
+        "read_vicon",
+    ),
+    TextFormat(
+        "qualisys",
+        lambda lines: lines[0].startswith("NO_OF_FRAMES\t"),
+        "motion_capture",
+        "read_qualisys",
+    ),
+    TextFormat(
+        "euroc",
+        lambda lines: lines[0].startswith("#timestamp") and lines[0].count(",") >= 7,
+        "euroc",
+        "read_euroc",
+    ),
+    TextFormat(
+        "crazyflie",
+        lambda lines: "," in lines[0] and "stateestimate." in lines[0].lower(),
+        "crazyflie_csv",
+        "read_estimate",
     ),
 )
 """Formats of other tools, in the order in which they are tried."""
