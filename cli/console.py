@@ -22,6 +22,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import click
@@ -98,6 +99,18 @@ def say(text: str) -> None:
     """Print a message, unless ``-q`` was given."""
     if talks():
         message(text)
+
+
+def open_page(path: Path) -> None:
+    """Open a page in the user's browser; without one, say so."""
+    import webbrowser
+
+    try:
+        is_open = webbrowser.open(path.resolve().as_uri())
+    except webbrowser.Error:
+        is_open = False
+    if not is_open:
+        warn(f"no browser was found: open {path} yourself")
 
 
 def detail(text: str) -> None:

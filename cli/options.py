@@ -157,6 +157,8 @@ def output_option(*names: str, help: str, endings: Sequence[str], **more: Any) -
 
 overwrite = click.option("--overwrite", is_flag=True, help="Replace the output if it exists.")
 
+open_page = click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
+
 
 def _json(ctx: click.Context, param: click.Parameter, value: bool) -> bool:
     console.set_json(value)

@@ -46,6 +46,7 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
     click.option("--png", is_flag=True, help="Also write a picture of each solution: report.png."),
     click.option("--pdf", is_flag=True, help="Also write a picture as PDF."),
     click.option("--svg", is_flag=True, help="Also write a picture as SVG."),
+    options.open_page,
 )
 @options.as_json
 @options.verbosity
@@ -59,6 +60,7 @@ def command(
     png: bool,
     pdf: bool,
     svg: bool,
+    open_page: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -72,6 +74,7 @@ def command(
     \b
     Examples:
       locatk report solved.mcap -o report.html
+      locatk report solved.mcap -o report.html --open
       locatk report solved.mcap -o report.html --truth camera.tum --align se3
       locatk report solved.mcap -o report.html --session /data/run.mcap --pdf
       locatk report bundle.mcap paper.mcap -o both.html --png
@@ -138,6 +141,8 @@ def command(
         console.emit_json({"version": 1, "files": [str(path) for path in written]})
     for path in written:
         console.result(f"Wrote {path}")
+    if open_page:
+        console.open_page(written[0])
 
 
 def plan_outputs(

@@ -35,6 +35,7 @@ REPORT = "report.html"
         metavar="FOLDER",
         help="Keep sessions, solutions, pictures and the sheets to print in this folder.",
     ),
+    options.open_page,
 )
 @section(
     "Advanced",
@@ -53,6 +54,7 @@ def command(
     systems: tuple[str, ...],
     output: Path | None,
     keep: Path | None,
+    open_page: bool,
     seed: int,
     overwrite: bool,
     as_json: bool,
@@ -71,6 +73,7 @@ def command(
     Examples:
       locatk demo
       locatk demo dots -o dots.html
+      locatk demo --open
       locatk demo --keep demo
       locatk demo --seed 7 --json
     """
@@ -108,10 +111,15 @@ def command(
                 "took_s": took_s,
             }
         )
+        if open_page:
+            console.open_page(report)
         return
     console.result(table(rows))
     console.say("error: mean distance from the truth, without alignment")
-    console.result(f"Wrote {report} in {took_s:.0f} s: open it in a browser")
+    hint = "" if open_page else ": open it in a browser"
+    console.result(f"Wrote {report} in {took_s:.0f} s{hint}")
+    if open_page:
+        console.open_page(report)
     if files:
         width = max(len(str(path)) for path, _ in files)
         for path, words in files:

@@ -51,6 +51,22 @@ def test_pictures_are_written_next_to_the_page(
 
 
 @pytest.mark.slow
+def test_a_page_opens_in_a_browser(
+    solution: Path, locatk: Locatk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    for answer in (True, False):
+        monkeypatch.setattr("webbrowser.open", lambda url, a=answer: opened.append(url) or a)
+        page = tmp_path / f"{answer}.html"
+        result = locatk("report", solution, "-o", page, "--open")
+        assert result.exit_code == 0
+        assert opened[-1] == page.as_uri()
+        assert ("no browser was found" in result.stderr) != answer
+    assert locatk("report", solution, "-o", tmp_path / "closed.html").exit_code == 0
+    assert len(opened) == 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".pdf", ".SVG"])
 def test_just_a_picture(solution: Path, locatk: Locatk, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"figure{suffix}"
