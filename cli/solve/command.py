@@ -16,7 +16,7 @@ from locatk.cli.solve import text as solve_text
 
 if TYPE_CHECKING:
     from locatk.core.errors import LocatkError
-    from locatk.formats.pipeline import Outcome, SolveFailure, SolveJob
+    from locatk.formats.pipeline import Outcome, SolveFailure, SolveJob, SolveReport
 
 SCENES = ("auto", "one-planar", "two-planar", "two-3d")
 
@@ -319,7 +319,10 @@ def _solve_one(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> None:
 
 
 def _solve_several(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> None:
-    """Solve sessions, print each outcome, and raise if there were failures or losses.
+    """Solve sessions, print a line for each, and raise if there were failures or losses.
+
+    Warnings follow, each kind once, and a table of the sessions with failures or losses. Verbose
+    output has all details of each session.
 
     Raises
     ------
@@ -331,6 +334,8 @@ def _solve_several(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> N
     from locatk.formats import pipeline
 
     total, printed, failed, incomplete = len(jobs), 0, 0, 0
+    reports: list[SolveReport] = []
+    problems: list[tuple[str, str]] = []
     progress = _BatchProgress(total, as_json)
     try:
         progress.show(0)
@@ -338,13 +343,14 @@ def _solve_several(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> N
             for done, ready in outcomes:
                 progress.erase()
                 for outcome in ready:
-                    _print_outcome(outcome, jobs[printed], as_json)
+                    _print_outcome(outcome, jobs[printed], as_json, is_brief=not console.verbose())
                     if isinstance(outcome, pipeline.SolveFailure):
                         failures.print_error(_error(outcome))
+                        problems.append((outcome.session, _error(outcome).message))
                         failed += 1
                     else:
-                        for loss in outcome.losses:
-                            console.warn(f"{outcome.session}: {loss.message}")
+                        reports.append(outcome)
+                        problems += [(outcome.session, loss.message) for loss in outcome.losses]
                         incomplete += bool(outcome.losses)
                     printed += 1
                 progress.show(done)
@@ -356,6 +362,11 @@ def _solve_several(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> N
         )
         raise
     progress.erase()
+    if not console.verbose():
+        for note in solve_text.batch_notes(reports):
+            console.say(note)
+    if problems and not as_json:
+        console.say(solve_text.problem_table(problems))
     if failed == total:
         raise click.ClickException(f"none of the {total} sessions could be solved")
     if failed or incomplete:
@@ -364,8 +375,10 @@ def _solve_several(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> N
         raise failures.Incomplete(", ".join(parts))
 
 
-def _print_outcome(outcome: Outcome, job: SolveJob, as_json: bool) -> None:
-    """Print the result of one session, without its losses."""
+def _print_outcome(
+    outcome: Outcome, job: SolveJob, as_json: bool, *, is_brief: bool = False
+) -> None:
+    """Print the result of one session, without its losses; if brief, one line unless quiet."""
     from locatk.formats import pipeline
 
     if isinstance(outcome, pipeline.SolveFailure):
@@ -381,6 +394,10 @@ def _print_outcome(outcome: Outcome, job: SolveJob, as_json: bool) -> None:
         if job.resume:
             entry["resumed"] = outcome.is_resumed
         console.emit_json({"version": 1, "sessions": [entry]})
+    if is_brief:
+        if console.talks():
+            console.result(solve_text.summary(outcome))
+        return
     console.result(solve_text.text(outcome))
     for note in solve_text.notes(outcome):
         console.say(note)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,22 +38,46 @@ def json_entry(report: SolveReport) -> dict[str, Any]:
 
 def text(report: SolveReport) -> str:
     """Format a summary line, the detections, a table of devices, and the rejected observations."""
-    duration = "solved before" if report.solve_s is None else f"{report.solve_s:.3g} s"
     rejected = ", ".join(
         f"{count} {reason.replace('_', ' ')}" for reason, count in report.rejected.items()
     )
-    summary = (
-        f"{report.session} -> {report.output}: {report.poses} poses, {report.system} by "
-        f"{report.method}, {duration}"
-    )
     parts = [
-        summary,
+        summary(report),
         _detection_table(report),
         _device_table(report),
         _heading_correction_line(report),
         console.wrapped(f"rejected: {rejected or 'nothing'}"),
     ]
     return "\n".join(part for part in parts if part)
+
+
+def summary(report: SolveReport) -> str:
+    """Format one line on a session."""
+    duration = "solved before" if report.solve_s is None else f"{report.solve_s:.3g} s"
+    return (
+        f"{report.session} -> {report.output}: {report.poses} poses, {report.system} by "
+        f"{report.method}, {duration}"
+    )
+
+
+def batch_notes(reports: Sequence[SolveReport]) -> list[str]:
+    """Return the warnings of several sessions, each kind once with the number of sessions."""
+    by_code: dict[str, list[tuple[str, str]]] = {}
+    for report in reports:
+        name = Path(report.session).name
+        for code, message in {w.code: w.message for w in report.warnings}.items():
+            by_code.setdefault(code, []).append((name, message))
+    lines = []
+    for found in by_code.values():
+        name, message = found[0]
+        count = f"{len(found)} of {len(reports)} sessions, as " if len(found) > 1 else ""
+        lines.append(f"{count}{name}: {message}")
+    return lines
+
+
+def problem_table(problems: Sequence[tuple[str, str]]) -> str:
+    """Format the sessions (session, problem) that were not solved, or in part."""
+    return console.table(("session", "problem"), problems)
 
 
 def notes(report: SolveReport) -> list[str]:

@@ -698,3 +698,29 @@ def test_s3_locations(
         assert words in result.stderr
         assert result.stderr.count("\n") == 1
         assert result.stderr.startswith("Error: ")
+
+
+@pytest.mark.slow
+def test_a_batch_is_a_line_a_session(
+    locatk: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "day").mkdir()
+    for k in (1, 2, 10):
+        options = ("--duration", "3", "--seed", k)
+        locatk("simulate", "lighthouse", *options, "-o", f"day/r{k}.mcap")
+    (tmp_path / "day" / "r3.mcap").touch()
+    result = locatk("solve", "day", "-o", "solved")
+    assert result.exit_code == 3
+    lines = result.stdout.splitlines()
+    assert [line.split(" -> ")[0] for line in lines] == [f"day/r{n}.mcap" for n in (1, 2, 10)]
+    assert result.stderr.count("no factory calibration") == 1
+    assert "3 of 3 sessions, as r1.mcap: no factory calibration" in result.stderr
+    table = [line.split(maxsplit=1) for line in result.stderr.splitlines()[-3:-1]]
+    assert table == [["session", "problem"], ["day/r3.mcap", "the file is empty"]]
+    quiet = locatk("solve", "day", "-o", "solved", "--overwrite", "-q")
+    assert quiet.exit_code == 3
+    assert quiet.stdout == ""
+    assert [line.split(":")[0] for line in quiet.stderr.splitlines()] == ["Error", "Incomplete"]
+    verbose = locatk("solve", "day", "-o", "solved", "--overwrite", "-v")
+    assert verbose.stdout.count("sigma x") == 3
