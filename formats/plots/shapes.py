@@ -29,9 +29,23 @@ from locatk.formats.sessions.foxglove import tags_in_frames
 
 Array = NDArray[np.float64]
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D")
-"""Colors of devices: the palette of Okabe and Ito (Color Universal Design, 2002) without yellow and
-black, which people with any type of color vision can distinguish, and a violet."""
+BASE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D")
+"""The palette of Okabe and Ito (Color Universal Design, 2002) without yellow and black, which
+people with any type of color vision can distinguish, and a violet."""
+
+
+def _mix(color: str, other: int, fraction: float) -> str:
+    """Return a color (#rrggbb) mixed with a grey level, 0 to 255."""
+    channels = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    return "#" + "".join(f"{round((1 - fraction) * c + fraction * other):02X}" for c in channels)
+
+
+COLORS = (
+    *BASE_COLORS,
+    *(_mix(color, 0, 0.45) for color in BASE_COLORS),
+    *(_mix(color, 255, 0.5) for color in BASE_COLORS),
+)
+"""Colors of devices: the palette, then its dark and its light shades."""
 
 MAX_LEGEND_DEVICES = 8
 """Number of devices up to which a legend names all of them."""
@@ -171,9 +185,9 @@ def device_colors(names: Sequence[str]) -> dict[str, str]:
     return {name: COLORS[k % len(COLORS)] for k, name in enumerate(names)}
 
 
-def is_in_legend(index: int, devices: int) -> bool:
-    """Return whether the legend names the device with this index, of so many devices."""
-    return devices <= MAX_LEGEND_DEVICES or index < MAX_LEGEND_DEVICES - 1
+def is_in_legend(index: int, devices: int, most: int = MAX_LEGEND_DEVICES) -> bool:
+    """Return whether a legend of ``most`` entries names the device with this index."""
+    return devices <= most or index < most - 1
 
 
 def draw_artifact(solution: Solution) -> Drawing:

@@ -6,6 +6,8 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from locatk.formats.output import atomic_write, check_output, tool_version
 from locatk.formats.plots.ground import build_ground, is_shown_unscaled
 from locatk.formats.plots.series import origin_ns, overlap_in_time, pose_span_ns
@@ -78,21 +80,44 @@ def render_report(subjects: Sequence[Subject]) -> str:
 
 
 def _overview(subjects: Sequence[Subject]) -> str:
-    """Return a table of all subjects with links to them."""
-    header = ("solution", "system", "method", "poses", "APE median", "APE p95", "rejected")
+    """Return a table of all subjects with links to them, which the reader can sort."""
+    header = (
+        "solution", "system", "method", "devices", "duration", "poses", "coverage",
+        "APE median", "p95", "max", "NEES", "rejected", "warnings",
+    )  # fmt: skip
     rows = []
     for subject in subjects:
         solution, evaluation = subject.solution, subject.evaluation
         unscaled = is_shown_unscaled(solution, evaluation)
-        errors = ["-", "-"]
+        errors, coverage, nees = ["-"] * 3, "-", "-"
         if evaluation is not None:
-            lengths = (evaluation.median, evaluation.p95)
+            lengths = (evaluation.median, evaluation.p95, float(np.max(evaluation.errors)))
             errors = [format_length(value, unscaled=unscaled) for value in lengths]
-        poses = format_count(solution.poses)
-        rejected = format_count(sum(solution.rejected.values()))
-        rows.append((subject.name, solution.system, solution.method, poses, *errors, rejected))
+            if evaluation.coverage.fraction is not None:
+                coverage = f"{100 * evaluation.coverage.fraction:.1f} %"
+            known = np.isfinite(evaluation.nees)
+            if known.any() and evaluation.nees_dof[known].sum():
+                ratio = np.sum(evaluation.nees[known]) / np.sum(evaluation.nees_dof[known])
+                nees = f"{ratio:.3g}"
+        trajectories = [each for each in solution.trajectories if len(each)]
+        span_ns = pose_span_ns(solution)
+        rows.append(
+            (
+                subject.name,
+                solution.system,
+                solution.method,
+                format_count(len(trajectories)),
+                f"{1e-9 * (span_ns[1] - span_ns[0]):.1f} s" if span_ns else "-",
+                format_count(solution.poses),
+                coverage,
+                *errors,
+                nees,
+                format_count(sum(solution.rejected.values())),
+                format_count(len(solution.warnings)),
+            )
+        )
     links = [f"#s{k}" for k in range(1, len(rows) + 1)]
-    return f"<nav>{page.table(Table(header, rows), links)}</nav>"
+    return f'<nav class="sortable">{page.table(Table(header, rows), links)}</nav>'
 
 
 def _article(subject: Subject, ident: str) -> Iterator[str]:

@@ -124,6 +124,41 @@ SCRIPT = """\
   window.addEventListener("beforeprint", function () { fit(690); });
   window.addEventListener("afterprint", function () { fit(null); });
 
+  // Headers of the overview sort it; numbers with units by their size.
+  const scales = {"m": 1, "cm": 1e-2, "mm": 1e-3, "\u00b5m": 1e-6, "um": 1e-6};
+  function value(cell) {
+    const words = cell.textContent.replace(/\u202f|\u00a0/g, "").trim().split(" ");
+    const number = parseFloat(words[0].replace("\u2212", "-"));
+    return number * (scales[words[1]] || 1);
+  }
+  for (const table of document.querySelectorAll(".sortable table")) {
+    const body = table.tBodies[0];
+    const headers = Array.from(table.tHead.rows[0].cells);
+    headers.forEach(function (header, column) {
+      const button = document.createElement("button");
+      button.textContent = header.textContent;
+      header.textContent = "";
+      header.appendChild(button);
+      button.addEventListener("click", function () {
+        const falling = header.getAttribute("aria-sort") === "ascending";
+        for (const other of headers) { other.removeAttribute("aria-sort"); }
+        header.setAttribute("aria-sort", falling ? "descending" : "ascending");
+        const rows = Array.from(body.rows);
+        const order = new Intl.Collator(undefined, {numeric: true});
+        rows.sort(function (a, b) {
+          const x = value(a.cells[column]), y = value(b.cells[column]);
+          if (isNaN(x) || isNaN(y) || column === 0) {
+            if (column && isNaN(x) !== isNaN(y)) { return isNaN(x) ? 1 : -1; }
+            return (falling ? -1 : 1) *
+              order.compare(a.cells[column].textContent, b.cells[column].textContent);
+          }
+          return (falling ? -1 : 1) * (x - y);
+        });
+        body.append(...rows);
+      });
+    });
+  }
+
   for (const button of document.querySelectorAll("button.copy")) {
     button.hidden = false;
     button.addEventListener("click", function () {
@@ -157,10 +192,12 @@ a { color: #0060a0; }
 .sub { color: #5b6875; margin: 0 0 14px; overflow-wrap: anywhere; }
 .verdict { font-size: 18px; margin: 0 0 14px; max-width: 60em; }
 .tiles {
-  display: grid; gap: 10px; margin: 0 0 16px;
-  grid-template-columns: repeat(auto-fit, minmax(126px, 1fr));
+  display: flex; flex-wrap: wrap; gap: 10px; margin: 0 0 16px;
 }
-.tile { background: #fff; border: 1px solid #d5dbe1; border-radius: 8px; padding: 8px 11px 9px; }
+.tile {
+  flex: 1 1 116px; padding: 8px 11px 9px;
+  background: #fff; border: 1px solid #d5dbe1; border-radius: 8px;
+}
 .tile b {
   display: block; font-size: 19px; white-space: nowrap; line-height: 1.25; font-weight: 600;
 }
@@ -200,6 +237,11 @@ button.copy {
   margin-top: 8px; font: inherit; font-size: 14px; padding: 5px 12px; border-radius: 6px;
   border: 1px solid #b9c3cc; background: #fff; color: #1d2733; cursor: pointer;
 }
+.sortable th button {
+  font: inherit; color: inherit; background: none; border: 0; padding: 0; cursor: pointer;
+}
+.sortable th[aria-sort=ascending] button::after { content: " \u25b2"; }
+.sortable th[aria-sort=descending] button::after { content: " \u25bc"; }
 .pictures { display: flex; flex-wrap: wrap; gap: 14px; margin-top: 8px; }
 .pictures figure { margin: 0; flex: 1 1 220px; max-width: 480px; }
 .pictures img { width: 100%; height: auto; border: 1px solid #d5dbe1; display: block; }
@@ -208,7 +250,7 @@ body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bot
 @media (max-width: 600px) {
   main, body > header, body > footer { padding-left: 10px; padding-right: 10px; }
   .panel { padding: 12px 10px 8px; }
-  .tiles { grid-template-columns: repeat(2, 1fr); }
+  .tile { flex-basis: 40%; }
   .tile { padding: 8px 10px; }
   td { min-width: 13em; }
   h1 { font-size: 24px; } h2 { font-size: 21px; }

@@ -14,7 +14,7 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.plots.ground import POSITION_FORMATS, Ground, View, fit_view
 from locatk.formats.plots.series import interrupt_at_gaps
 from locatk.formats.plots.shapes import (
-    MAX_LEGEND_DEVICES,
+    COLORS,
     TRUTH,
     Label,
     Shape,
@@ -92,7 +92,7 @@ def _map_panel(
     for k, (t, count) in enumerate(zip(solution.trajectories, counts, strict=True)):
         kept = thin(len(t), count, _curvature(ground.paths[t.device]))
         shown += len(kept)
-        in_legend = is_in_legend(k, len(names))
+        in_legend = is_in_legend(k, len(names), len(COLORS))
         traces += _path_traces(t, ground, view, kept, start_ns, colors[t.device], in_legend)
     traces += _shape_traces((*ground.markers.shapes, *stations.shapes), ground, view)
     figure = Figure(traces, _layout(view, ground.unit))
@@ -107,8 +107,8 @@ def _map_panel(
         f"{format_count(outside, 'poses')} outside this view: double-click to show everything."
         if outside
         else "",
-        f"The legend names {MAX_LEGEND_DEVICES - 1} of {len(names)} devices."
-        if len(names) > MAX_LEGEND_DEVICES
+        f"The legend names {len(COLORS) - 1} of {len(names)} devices."
+        if len(names) > len(COLORS)
         else "",
         thinning_note(shown, solution.poses),
     )

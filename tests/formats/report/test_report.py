@@ -465,11 +465,13 @@ def test_ten_thousand_poses_are_thinned_and_small() -> None:
 
 @pytest.mark.slow
 def test_few_devices_are_named_and_the_rest_counted() -> None:
-    solved = solution(*[f"robot-{k}" for k in range(20)], n=5)
-    panel = figure(evaluated(solved), "Trajectory")
-    named = [t for t in panel.figure.data if t.showlegend and str(t.name).startswith("robot")]
-    assert len(named) == 7
-    assert "The legend names 7 of 20 devices" in panel.note
+    for devices, expected in ((20, 20), (30, 20)):
+        solved = solution(*[f"robot-{k}" for k in range(devices)], n=5)
+        panel = figure(evaluated(solved), "Trajectory")
+        named = [t for t in panel.figure.data if t.showlegend and str(t.name).startswith("robot")]
+        assert len(named) == expected
+        assert len({t.line.color for t in named}) == expected
+        assert ("The legend names 20 of 30 devices" in panel.note) == (devices == 30)
 
 
 @pytest.mark.slow
@@ -477,4 +479,7 @@ def test_several_subjects_are_in_a_table_with_links() -> None:
     page = render_report([evaluated(solution("red")), Subject("b.mcap", solution("blue"))])
     assert '<a href="#s2">b.mcap</a>' in page
     assert page.count('class="subject"') == 2
+    overview = page[page.index('<nav class="sortable">') : page.index("</nav>")]
+    for name in ("devices", "duration", "coverage", "APE median", "p95", "max", "NEES", "warnings"):
+        assert f">{name}</th>" in overview
     assert len(specs(page)) == len(set(specs(page)))
