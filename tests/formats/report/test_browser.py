@@ -239,3 +239,23 @@ def test_a_narrow_window_shows_all(frames: Opened) -> None:
     assert 370 <= width <= 390  # a scroll bar may take some
     assert whole_width == width  # nothing sticks out at the side
     assert map_height < 500  # 640 in a wide window
+
+
+@pytest.mark.slow
+def test_the_overview_is_sorted_by_a_click(browser: str, tmp_path: Path) -> None:
+    """Numbers by their size, in whatever unit; a second click reverses the order."""
+    path = tmp_path / "report.html"
+    write_report(path, [subject("r2", n=40), subject("r10", n=60), subject("r1", n=20)])
+    report = re.sub(r'<div class="wide">.*?</script>', "", path.read_text("utf-8"), flags=re.S)
+    click = """<script>addEventListener("load", function () {
+        const buttons = document.querySelectorAll(".sortable th button");
+        for (const clicks of [1, 2]) {
+          buttons[5].click();
+          const cells = document.querySelectorAll(".sortable tbody td:nth-child(6)");
+          document.body.append("[" + Array.from(cells).map(cell => cell.textContent) + "]");
+        }
+        document.body.append("[" + buttons[5].parentNode.getAttribute("aria-sort") + "]");
+      });</script>"""
+    path.write_text(_without_policy(report).replace("</body>", f"{click}</body>"), "utf-8")
+    dom = opened(browser, path, tmp_path / "profile").dom
+    assert "[20,40,60][60,40,20][descending]" in dom
