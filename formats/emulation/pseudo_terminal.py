@@ -45,12 +45,17 @@ class PseudoTerminal:
     Raises
     ------
     LocatkError
-        No pseudo-terminal is available.
+        No pseudo-terminal is available; Windows has none.
     """
 
     def __init__(self) -> None:
-        import tty
-
+        try:
+            import tty
+        except ImportError:
+            raise LocatkError(
+                "no pseudo-terminals on this system",
+                hint="Emulate on Linux, macOS or WSL; `locatk capture replay:FILE` works here",
+            ) from None
         try:
             self._master, slave = os.openpty()
         except OSError as error:
