@@ -49,6 +49,9 @@ MAX_SEPARATION_TAGS = 64.0
 MAX_TAGS_IN_PASS = 2
 """Number of tags in a row that the solver separates within one pass."""
 
+MAX_NAMED_IDS = 6
+"""Number of ids of a family that a message lists."""
+
 
 @dataclass(frozen=True)
 class SitePoint:
@@ -258,7 +261,9 @@ def place_tags(tags: Tags, points: Sequence[SitePoint], min_distance: int = 1) -
         if tags.ids is not None and point.tag_id not in tags.ids:
             raise InputError(
                 f"{point.name}: id {point.tag_id} is not in the family",
-                hint=f"The family has {len(tags.ids)} ids, as {tags.ids[0]}",
+                hint="Leave the column out to get ids of the family, which has "
+                + ", ".join(map(str, tags.ids[:MAX_NAMED_IDS]))
+                + (" and others" if len(tags.ids) > MAX_NAMED_IDS else ""),
             )
         given[point.tag_id] = point.name
     members, distance = tags.ids, tags.min_distance
