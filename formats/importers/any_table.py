@@ -205,6 +205,13 @@ def read_magnetometers(
         no value is usable.
     """
     numbers = guess.magnetometers
+    if not numbers:
+        raise FormatError(
+            "no columns of magnetometers",
+            file=table.file,
+            where=1,
+            hint="Name them: --columns b0x=NAME,b0y=NAME,b0z=NAME",
+        )
     if array is None:
         if spacing_m is None and len(numbers) > 1:
             raise InputError(

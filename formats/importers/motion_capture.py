@@ -16,6 +16,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -69,12 +70,14 @@ def read_motive(path: Path) -> tuple[list[Trajectory], tuple[str, ...]]:
         raise FormatError(
             "an incomplete header", file=path, hint="Export with its header, in meters"
         )
-    kinds, axes = rows[header - 1], rows[header]
+    axes = rows[header]
     columns: dict[str, dict[str, int]] = {}
-    for index, kind in enumerate(labels["Type"]):
-        if kind == "Rigid Body" and kinds[index] in ("Rotation", "Position"):
-            name = labels["Name"][index]
-            columns.setdefault(name, {})[kinds[index][0] + axes[index]] = index
+    # Rows of the header may end before the last column, which has no name.
+    for index, (body, name, kind, axis) in enumerate(
+        zip_longest(labels["Type"], labels["Name"], rows[header - 1], axes, fillvalue="")
+    ):
+        if body == "Rigid Body" and kind in ("Rotation", "Position") and index < len(axes):
+            columns.setdefault(name, {})[kind[0] + axis] = index
     data = _numbers(path, rows[header + 1 :], len(axes), header + 2)
     trajectories = []
     for name, own in columns.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.formats.importers.any_table import guess_columns, read_magnetometers
@@ -203,3 +206,26 @@ def test_tables_of_nothing_are_refused(locatk: Callable[..., Any], tmp_path: Pat
         assert problem in result.stderr
         assert not output.exists()
     assert locatk("import", "table", tmp_path / "none.csv", "-o", output).exit_code == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DIALECTS)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    start=st.floats(0, 1),
+    length=st.integers(0, 200),
+    inserted=st.text('0123456789.,;\t\n-eEbxyz#"|', max_size=8),
+)
+def test_damaged_tables_are_refused_or_read(
+    name: str, start: float, length: int, inserted: str, tmp_path: Path
+) -> None:
+    text, units = DIALECTS[name]
+    at = round(start * len(text))
+    path = tmp_path / "log.csv"
+    path.write_text(text[:at] + inserted + text[at + length :], encoding="utf-8", newline="")
+    with contextlib.suppress(LocatkError):
+        table = read_any_table(path)
+        guess = guess_columns(table, {}, units)
+        imported, _ = read_magnetometers(table, guess, spacing_m=0.02, units=units)
+        assert (np.diff(imported.samples.time_ns) > 0).all()
+        assert not np.isinf(imported.samples.field_t).any()

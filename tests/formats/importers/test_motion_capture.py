@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from locatk.core.errors import LocatkError
@@ -151,6 +154,30 @@ def test_broken_exports_are_one_line(text: str, problem: str, tmp_path: Path) ->
     with pytest.raises(LocatkError) as raised:
         trajectories.open_file(path, role="truth")
     assert problem in raised.value.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FILES)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    start=st.floats(0, 1),
+    length=st.integers(0, 400),
+    inserted=st.text('0123456789.,\t\n-eE RXTFrame;"[]', max_size=8),
+)
+def test_damaged_exports_are_refused_or_read(
+    name: str, start: float, length: int, inserted: str, tmp_path: Path
+) -> None:
+    text = FILES[name][1]
+    at = round(start * len(text))
+    path = tmp_path / "take.csv"
+    path.write_text(text[:at] + inserted + text[at + length :], newline="")
+    tracks = []
+    with contextlib.suppress(LocatkError):
+        tracks = trajectories.open_file(path, role="truth").trajectories
+    for track in tracks:
+        assert (np.diff(track.time_ns) > 0).all()
+        assert np.isfinite(track.position).all()
+        np.testing.assert_allclose(np.linalg.norm(track.quaternion, axis=1), 1.0, atol=1e-9)
 
 
 @pytest.mark.slow
