@@ -22,6 +22,9 @@ from locatk.core.errors import InputError
 
 COMMANDS = {
     "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),
+    "array": ("locatk.cli.sensors.array", "Describe the magnetometers under a robot."),
+    "halls": ("locatk.cli.sensors.halls", "Describe the hall sensors under a robot."),
+    "receiver": ("locatk.cli.sensors.receiver", "Describe the photodiodes of a Lighthouse device."),
     "site": ("locatk.cli.site", "Place magnetic tags on a floor, check and survey them."),
     "map": ("locatk.cli.map", "Design floors of landmarks, check and exchange them."),
     "print": ("locatk.cli.print", "Draw dot sheets and templates at true size."),

@@ -1,0 +1,1 @@
+"""``locatk array``, ``locatk halls`` and ``locatk receiver``: layouts of a robot's sensors."""
