@@ -49,6 +49,8 @@ MAX_WAITING_NOTIFICATIONS = 8192
 
 MAX_LISTED_NAMES = 12
 
+MAX_REASON_CHARACTERS = 120
+
 OUT_OF_RANGE = "disconnected: out of range, switched off, or closed by the device"
 
 
@@ -234,29 +236,26 @@ class BluetoothLink:
 
         loop = asyncio.get_running_loop()
         end_s = loop.time() + SCAN_TIMEOUT_S
-        found_s: float | None = None
+        address = (self._known_address or self._wanted).upper()
+        is_named = False
         async with bleak.BleakScanner() as scanner:
             while True:
                 found = scanner.discovered_devices_and_advertisement_data
-                address = (self._known_address or self._wanted).upper()
-                for device, _ in found.values():
+                named = []
+                for device, advertisement in found.values():
                     if device.address.upper() == address:
                         return device
-                named = [
-                    device
-                    for device, advertisement in found.values()
-                    if self._wanted in (advertisement.local_name, device.name)
-                ]
-                if self._known_address is not None:
-                    named = []
-                if len(named) > 1:
-                    raise _ambiguous_error(named, self._port)
-                now_s = loop.time()
-                if named and found_s is None:
-                    found_s = now_s
-                if found_s is not None and now_s >= found_s + SAME_NAME_WAIT_S and named:
-                    return named[0]
-                if found_s is None and now_s >= end_s:
+                    if self._wanted in (advertisement.local_name, device.name):
+                        named.append(device)
+                if self._known_address is None and named:
+                    if len(named) > 1:
+                        raise _ambiguous_error(named, self._port)
+                    if not is_named:
+                        is_named = True
+                        end_s = loop.time() + SAME_NAME_WAIT_S
+                    elif loop.time() >= end_s:
+                        return named[0]
+                elif loop.time() >= end_s:
                     raise _missing_error(found, self._port)
                 await asyncio.sleep(POLL_INTERVAL_S)
 
@@ -301,7 +300,10 @@ def _adapter_error(error: Exception, port: str) -> SourceError:
         hint = "Switch it on: bluetoothctl power on (package bluez, service bluetooth)"
     elif sys.platform == "darwin":
         hint += ", and allow this terminal to use it"
-    return SourceError(f"Bluetooth is not available ({_reason(error)})", file=port, hint=hint)
+    reason = _reason(error)
+    if sys.platform == "linux" and isinstance(error, FileNotFoundError | ConnectionRefusedError):
+        reason = "the D-Bus system bus is not running"
+    return SourceError(f"Bluetooth is not available ({reason})", file=port, hint=hint)
 
 
 def _connection_error(error: Exception, port: str) -> SourceError:
@@ -314,6 +316,10 @@ def _connection_error(error: Exception, port: str) -> SourceError:
 
 
 def _reason(error: Exception) -> str:
-    # Some errors of bleak have a second argument, for programs.
-    text = str(error.args[0]) if error.args and isinstance(error.args[0], str) else str(error)
-    return escape_controls(" ".join(text.split())[:120]) or type(error).__name__
+    from bleak.exc import BleakBluetoothNotAvailableError
+
+    # Its second argument is a constant for programs.
+    text = error.args[0] if isinstance(error, BleakBluetoothNotAvailableError) else error
+    return escape_controls(" ".join(str(text).split())[:MAX_REASON_CHARACTERS]) or (
+        type(error).__name__
+    )

@@ -1,15 +1,15 @@
 """Ports: serial devices, and URLs of sources that behave like one.
 
-============================  ==============================================================
-``/dev/ttyACM0``, ``COM3``    a serial port, or a link to one (``/dev/serial/by-id/...``)
-``socket://HOST:PORT``        raw bytes over TCP
-``rfc2217://HOST:PORT``       a serial port of another computer
+=============================  ==============================================================
+``/dev/ttyACM0``, ``COM3``     a serial port, or a link to one (``/dev/serial/by-id/...``)
+``socket://HOST:PORT``         raw bytes over TCP
+``rfc2217://HOST:PORT``        a serial port of another computer
 ``ble:NAME``, ``ble:ADDRESS``  a Bluetooth device, see :mod:`.bluetooth`
-``replay:FILE.mcap``          the raw bytes of a session, see :mod:`.replay`
-``loop://``                   a port without a device, which is silent
-``spy://``, ``alt://``,       of pyserial, see its documentation
+``replay:FILE.mcap``           the raw bytes of a session, see :mod:`.replay`
+``loop://``                    a port without a device, which is silent
+``spy://``, ``alt://``,        of pyserial, see its documentation
 ``hwgrep://``, ``cp2110://``
-============================  ==============================================================
+=============================  ==============================================================
 
 A serial port is locked (``flock``) and, on Linux, closed to programs that take no lock
 (``TIOCEXCL``). DTR and RTS are set as pyserial does: many boards restart when their port is
