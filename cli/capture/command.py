@@ -158,6 +158,7 @@ def command(
       /dev/ttyACM0, COM3      a serial port (--list shows them)
       socket://HOST:PORT      raw bytes over TCP
       rfc2217://HOST:PORT     a serial port of another computer
+      ble:NAME, ble:ADDRESS   a Bluetooth device with the Nordic UART Service (locatk[ble])
       replay:FILE.mcap        the raw bytes of a session, with their timing
       camera:0, camera:URL, camera:FILE
                               a camera by number, a stream, a video file
@@ -175,6 +176,7 @@ def command(
       locatk capture COM3 --device polaris-array --artifact tag.toml -o run.mcap
       locatk capture /dev/ttyACM0 -o run.mcap --duration 5min --note "floor 2"
       locatk capture /dev/ttyACM0 -o day.mcap --rotate 10min --meta robot=7
+      locatk capture ble:robot7 -o run.mcap --duration 5min
       locatk capture camera:0 --artifact sheet.toml -o run.mcap
       locatk capture replay:run.mcap --device lines -o again.mcap
     """
@@ -226,7 +228,7 @@ def command(
 def _refuse_unused_options(port: str, device: str, given: dict[str, Any]) -> None:
     """Refuse options that do not apply to the port or device."""
     camera, replay = port.startswith("camera:"), port.startswith("replay:")
-    network = port.startswith(("socket:", "loop:"))
+    network = port.lower().startswith(("socket:", "loop:", "ble:"))
     for name, is_unused, what in (
         ("columns", camera, f"the port {port}"),
         ("columns", device in DEVICES_WITHOUT_COLUMNS, f"the device {device}"),

@@ -33,7 +33,7 @@ for the next millisecond of USB."""
 
 AUTO = "auto"
 
-UNPACED = ("replay:", "socket:", "rfc2217:", "loop:")
+UNPACED = ("replay:", "socket:", "rfc2217:", "loop:", "ble:")
 """Ports whose bytes are not spaced by a baud rate."""
 
 
@@ -142,7 +142,7 @@ class SerialIntake:
     def _set_device(self, device: Device) -> None:
         self.device = device
         self._decoder = device.create_decoder(self._options)
-        if not self._port.startswith(UNPACED):
+        if not self._port.lower().startswith(UNPACED):
             self._arrivals.byte_ns = 10e9 / (self._baud or device.baud)
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:

@@ -1,14 +1,15 @@
 """Ports: serial devices, and URLs of sources that behave like one.
 
-============================  ==============================================================
-``/dev/ttyACM0``, ``COM3``    a serial port, or a link to one (``/dev/serial/by-id/...``)
-``socket://HOST:PORT``        raw bytes over TCP
-``rfc2217://HOST:PORT``       a serial port of another computer
-``replay:FILE.mcap``          the raw bytes of a session, see :mod:`.replay`
-``loop://``                   a port without a device, which is silent
-``spy://``, ``alt://``,       of pyserial, see its documentation
+=============================  ==============================================================
+``/dev/ttyACM0``, ``COM3``     a serial port, or a link to one (``/dev/serial/by-id/...``)
+``socket://HOST:PORT``         raw bytes over TCP
+``rfc2217://HOST:PORT``        a serial port of another computer
+``ble:NAME``, ``ble:ADDRESS``  a Bluetooth device, see :mod:`.bluetooth`
+``replay:FILE.mcap``           the raw bytes of a session, see :mod:`.replay`
+``loop://``                    a port without a device, which is silent
+``spy://``, ``alt://``,        of pyserial, see its documentation
 ``hwgrep://``, ``cp2110://``
-============================  ==============================================================
+=============================  ==============================================================
 
 A serial port is locked (``flock``) and, on Linux, closed to programs that take no lock
 (``TIOCEXCL``). DTR and RTS are set as pyserial does: many boards restart when their port is
@@ -25,10 +26,12 @@ import os
 import socket
 import struct
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
+from locatk.formats.capture import bluetooth
 from locatk.formats.capture.links import (
     DescriptorLink,
     Link,
@@ -64,7 +67,9 @@ _KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
 """Options by which a peer that has vanished is noticed after 25 s of silence."""
 
 
-def port_of(name: str, *, baud: int, speed: float = 1.0) -> Port:
+def port_of(
+    name: str, *, baud: int, speed: float = 1.0, stop: threading.Event | None = None
+) -> Port:
     """Return the port of this name, not yet opened.
 
     Parameters
@@ -75,6 +80,8 @@ def port_of(name: str, *, baud: int, speed: float = 1.0) -> Port:
         Baud rate of a serial port, local or behind ``rfc2217://``.
     speed : float
         Factor on the speed of ``replay:``; 0 is as fast as possible.
+    stop : threading.Event, optional
+        Ends the search for a Bluetooth device.
 
     Raises
     ------
@@ -87,6 +94,8 @@ def port_of(name: str, *, baud: int, speed: float = 1.0) -> Port:
     kind = kind.lower()
     if kind == "replay" and colon:
         return ReplayPort(name, speed=speed)
+    if kind == "ble" and colon:
+        return bluetooth.BluetoothPort(name, stop=stop)
     if kind == "camera" and colon:
         raise SourceError("a camera, not a serial port", file=name)
     if not rest.startswith("//"):

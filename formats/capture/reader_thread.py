@@ -113,6 +113,9 @@ class PortReader:
         """
         if not self._stop.is_set():
             self._stop.set()
+            cancel = getattr(self._port, "cancel", None)
+            if cancel is not None:  # Opening it may take longer than the wait below.
+                cancel()
             if self._thread.ident is None:
                 self._thread.start()  # Only the thread reads and closes the port.
             self._thread.join(MAX_STOP_WAIT_S)

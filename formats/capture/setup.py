@@ -114,7 +114,7 @@ def record(
     _check_disk(request.output.parent, request.limits.reserve_bytes)
     clock = HostClock()
     intake = _intake(request, content)
-    port = _port(request, clock)
+    port = _port(request, clock, stop)
     link = _open_port(port, request.wait_s, stop, waiting)
     try:
         ready(port.name)
@@ -216,7 +216,7 @@ def _intake(request: CaptureRequest, content: Mapping[str, str]) -> Intake:
     )
 
 
-def _port(request: CaptureRequest, clock: HostClock) -> Port:
+def _port(request: CaptureRequest, clock: HostClock, stop: threading.Event) -> Port:
     if request.is_camera:
         # OpenCV is slow to import, and not needed for bytes.
         from locatk.formats.capture.camera import camera_port
@@ -229,7 +229,7 @@ def _port(request: CaptureRequest, clock: HostClock) -> Port:
         )
     known = None if request.device == AUTO else find_device(request.device)
     baud = request.baud or (known.baud if known else 115_200)
-    return ports.port_of(request.port, baud=baud, speed=request.speed)
+    return ports.port_of(request.port, baud=baud, speed=request.speed, stop=stop)
 
 
 def _facts(request: CaptureRequest, port: Port, clock: HostClock) -> dict[str, str]:
