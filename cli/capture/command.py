@@ -158,7 +158,7 @@ def command(
       /dev/ttyACM0, COM3      a serial port (--list shows them)
       socket://HOST:PORT      raw bytes over TCP
       rfc2217://HOST:PORT     a serial port of another computer
-      ble:NAME, ble:ADDRESS   a Bluetooth device with the Nordic UART Service (locatk[ble])
+      ble:NAME, ble:ADDRESS   a Bluetooth device with Nordic's UART service
       replay:FILE.mcap        the raw bytes of a session, with their timing
       camera:0, camera:URL, camera:FILE
                               a camera by number, a stream, a video file
