@@ -67,11 +67,24 @@ def data() -> Path:
 @pytest.fixture(scope="session")
 def crazyflie() -> ModuleType:
     """Module with simulated flights of a Crazyflie and a writer of its logs."""
-    spec = importlib.util.spec_from_file_location("crazyflie", ROOT / "tests" / "crazyflie.py")
+    return _load_module("crazyflie")
+
+
+@pytest.fixture
+def air(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Bluetooth devices in range, in the place of those of bleak: none at first."""
+    return _load_module("bluetooth_devices").install(monkeypatch)
+
+
+def _load_module(name: str) -> ModuleType:
+    """Return a module of this folder."""
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tests" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules["crazyflie"] = module  # dataclasses look up their module
+    sys.modules[name] = module  # dataclasses look up their module
     spec.loader.exec_module(module)
     return module
 

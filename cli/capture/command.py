@@ -222,7 +222,7 @@ def command(
             ready=live.ready,
             waiting=live.waiting,
         )
-    _report(recorded, device, as_json)
+    _report(recorded, port, device, as_json)
 
 
 def _refuse_unused_options(port: str, device: str, given: dict[str, Any]) -> None:
@@ -252,14 +252,15 @@ def _list(as_json: bool) -> None:
         console.say("No serial port found. `locatk emulate polaris` creates one for tests.")
 
 
-def _report(recorded: Any, device: str, as_json: bool) -> None:
+def _report(recorded: Any, port: str, device: str, as_json: bool) -> None:
     console.result(capture_text.summary(recorded))
     if as_json:
         console.emit_json(capture_text.as_json(recorded))
     known_device = "" if device == "auto" and recorded.device == "raw" else recorded.device
     doubts = recorded.totals.doubts(known_device)
     if doubts and recorded.totals.bytes:
-        doubts.append("check --device (or use auto) and --baud")
+        remedy = "check --device (or use auto)"
+        doubts.append(remedy if port.lower().startswith("ble:") else f"{remedy} and --baud")
     losses = recorded.totals.losses() + doubts
     if recorded.failed:
         losses.insert(0, recorded.ended)

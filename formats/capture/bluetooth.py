@@ -225,6 +225,8 @@ class BluetoothLink:
                 await asyncio.wait_for(client.disconnect(), CLOSE_TIMEOUT_S)
 
     def _receive(self, characteristic: Any, data: bytearray) -> None:
+        if not data:  # An empty read means silence.
+            return
         try:
             self._notifications.put_nowait(bytes(data))
         except queue.Full:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import bleak
 import pytest
 from bleak.exc import (
     BleakBluetoothNotAvailableError,
@@ -29,148 +26,18 @@ from locatk.formats.capture.ports import port_of
 from locatk.formats.schemas.serial_pb2 import Readings
 from locatk.formats.sessions.reader import Session
 
-WAIT_S = 20.0
-"""Longer than anything takes."""
-
-
-class Peripheral:
-    """Device that advertises, accepts a connection, and sends notifications."""
-
-    def __init__(self, name: str | None, address: str, *, has_uart: bool = True) -> None:
-        self.name, self.address, self.has_uart = name, address, has_uart
-        self.is_on = True
-        self.connect_error: Exception | None = None
-        self.greeting: tuple[bytes, ...] = ()
-        """Notifications sent at each subscription."""
-        self.client: FakeClient | None = None
-        self.connections = 0
-        self.subscribed = threading.Event()
-
-    def send(self, pieces: Iterable[bytes]) -> None:
-        """Send notifications, from any thread."""
-        assert self.subscribed.wait(WAIT_S)
-        client = self.client
-        assert client is not None
-        for piece in pieces:
-            client.loop.call_soon_threadsafe(client.notify, piece)
-
-    def drop(self) -> None:
-        """Break the connection after what was sent."""
-        client = self.client
-        assert client is not None
-        self.subscribed.clear()
-        client.loop.call_soon_threadsafe(client.lose)
-
-
-class Air:
-    """All devices in range, and the adapter of the computer."""
-
-    def __init__(self) -> None:
-        self.devices: list[Peripheral] = []
-        self.adapter_error: Exception | None = None
-        self.scans = 0
-
-    def add(self, name: str | None, address: str, **more: Any) -> Peripheral:
-        self.devices.append(Peripheral(name, address, **more))
-        return self.devices[-1]
-
-
-class FakeScanner:
-    """In the place of ``bleak.BleakScanner``."""
-
-    def __init__(self, air: Air) -> None:
-        self._air = air
-
-    async def __aenter__(self) -> FakeScanner:
-        self._air.scans += 1
-        if self._air.adapter_error is not None:
-            raise self._air.adapter_error
-        return self
-
-    async def __aexit__(self, *error: object) -> None:
-        await asyncio.sleep(0)
-
-    @property
-    def discovered_devices_and_advertisement_data(self) -> dict[str, tuple[Any, Any]]:
-        return {
-            each.address: (each, SimpleNamespace(local_name=each.name))
-            for each in self._air.devices
-            if each.is_on
-        }
-
-
-class FakeClient:
-    """In the place of ``bleak.BleakClient``."""
-
-    def __init__(
-        self, device: Peripheral, disconnected_callback: Callable[[Any], None], timeout: float
-    ) -> None:
-        self._device, self._disconnected = device, disconnected_callback
-        self._callback: Callable[[Any, bytearray], None] | None = None
-        self.is_connected = False
-
-    async def connect(self) -> None:
-        self.loop = asyncio.get_running_loop()
-        await asyncio.sleep(0)
-        if self._device.connect_error is not None:
-            raise self._device.connect_error
-        self.is_connected = True
-        self._device.client = self
-        self._device.connections += 1
-
-    @property
-    def services(self) -> Any:
-        known = {bluetooth.TX_UUID: object()} if self._device.has_uart else {}
-        return SimpleNamespace(get_characteristic=known.get)
-
-    async def start_notify(self, uuid: str, callback: Callable[[Any, bytearray], None]) -> None:
-        assert uuid == "6e400003-b5a3-f393-e0a9-e50e24dcca9e"
-        self._callback = callback
-        for piece in self._device.greeting:
-            self.notify(piece)
-        self._device.subscribed.set()
-
-    def notify(self, piece: bytes) -> None:
-        if self.is_connected and self._callback is not None:
-            self._callback(None, bytearray(piece))
-
-    def lose(self) -> None:
-        if self.is_connected:
-            self.is_connected = False
-            self._disconnected(self)
-
-    async def disconnect(self) -> None:
-        await asyncio.sleep(0)
-        self.lose()
-
-
-def install(monkeypatch: pytest.MonkeyPatch) -> Air:
-    """Replace the scanner and the client of bleak; return the devices in range: none yet."""
-    air = Air()
-    monkeypatch.setattr(bleak, "BleakScanner", lambda: FakeScanner(air))
-    monkeypatch.setattr(bleak, "BleakClient", FakeClient)
-    monkeypatch.setattr(bluetooth, "SCAN_TIMEOUT_S", 0.1)
-    monkeypatch.setattr(bluetooth, "SAME_NAME_WAIT_S", 0.02)
-    monkeypatch.setattr(bluetooth, "POLL_INTERVAL_S", 0.005)
-    return air
-
-
 ADDRESS, OTHER = "C0:11:22:33:44:55", "C0:11:22:33:44:66"
+WAIT_S = 20.0
 LINES = b"".join(b"t_ms:%d,x_mm:%d\n" % (10 * k, k * k) for k in range(200))
 
 
 @pytest.fixture
-def air(monkeypatch: pytest.MonkeyPatch) -> Air:
-    return install(monkeypatch)
-
-
-@pytest.fixture
-def robot(air: Air) -> Peripheral:
+def robot(air: Any) -> Any:
     return air.add("robot7", ADDRESS)
 
 
 @pytest.fixture
-def port(air: Air) -> BluetoothPort:
+def port(air: Any) -> BluetoothPort:
     """The port that ``start`` of the conftest records."""
     return BluetoothPort("ble:robot7")
 
@@ -226,7 +93,7 @@ def wait_until(condition: Callable[[], object]) -> None:
 
 
 @pytest.mark.parametrize("name", ["ble:robot7", f"ble:{ADDRESS}", f"BLE:{ADDRESS.lower()}"])
-def test_bytes_by_name_and_by_address(robot: Peripheral, opened: Any, name: str) -> None:
+def test_bytes_by_name_and_by_address(robot: Any, opened: Any, name: str) -> None:
     port = port_of(name, baud=115_200)
     assert port.describe() == {"port": name}
     link = opened(port)
@@ -238,27 +105,22 @@ def test_bytes_by_name_and_by_address(robot: Peripheral, opened: Any, name: str)
     assert port.describe() == {"port": name, "resolved": ADDRESS, "product": "robot7"}
 
 
-def test_notifications_before_the_first_read_are_kept(robot: Peripheral, opened: Any) -> None:
+def test_notifications_before_the_first_read_are_kept(robot: Any, opened: Any) -> None:
     robot.greeting = (b"first ", b"second")
     assert gathered(opened("ble:robot7"), 12) == b"first second"
 
 
-def test_bytes_before_a_disconnection_are_read(robot: Peripheral, opened: Any) -> None:
+def test_bytes_before_a_disconnection_are_read(robot: Any, opened: Any) -> None:
     link = opened("ble:robot7")
     robot.send(cut(LINES))
     robot.drop()
     assert gathered(link, len(LINES)) == LINES
-
-    def read_on() -> None:
-        for _ in range(1000):
-            link.read(0.01)
-
     with pytest.raises(LinkLost, match="disconnected"):
-        read_on()
+        all(link.read(0.01) == b"" for _ in range(1000))
 
 
 def test_bytes_beyond_the_queue_are_counted(
-    robot: Peripheral, opened: Any, monkeypatch: pytest.MonkeyPatch
+    robot: Any, opened: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bluetooth, "MAX_WAITING_NOTIFICATIONS", 3)
     link = opened("ble:robot7")
@@ -271,7 +133,7 @@ def test_bytes_beyond_the_queue_are_counted(
     max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(sizes=st.lists(st.integers(1, 244), min_size=1, max_size=30), data=st.binary(max_size=3000))
-def test_cuts_do_not_matter(robot: Peripheral, sizes: list[int], data: bytes) -> None:
+def test_cuts_do_not_matter(robot: Any, sizes: list[int], data: bytes) -> None:
     pieces, rest = [], data
     for size in sizes:
         pieces.append(rest[:size])
@@ -297,7 +159,7 @@ def values(path: Path) -> list[float]:
 
 
 def test_lines_are_whole_across_notifications(
-    robot: Peripheral, start: Any, tmp_path: Path, raw_bytes: Any
+    robot: Any, start: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
     running = start("lines")
     robot.send(cut(LINES, 7))
@@ -311,7 +173,7 @@ def test_lines_are_whole_across_notifications(
 
 
 def test_disconnection_and_reconnection(
-    robot: Peripheral, air: Air, start: Any, tmp_path: Path, raw_bytes: Any, log_lines: Any
+    robot: Any, air: Any, start: Any, tmp_path: Path, raw_bytes: Any, log_lines: Any
 ) -> None:
     running = start("lines")
     robot.send([b"x:1\nx:2\nx:"])
@@ -329,13 +191,13 @@ def test_disconnection_and_reconnection(
     assert air.devices[1].connections == 0
     assert result.totals.gaps == 1
     assert raw_bytes(tmp_path / "run.mcap") == b"x:1\nx:2\nx:x:4\nx:5\n"
-    # The first line after each connection may be the end of a longer one: it is not decoded.
+    # The first line after each opening may be the rest of one, as with a serial port.
     assert values(tmp_path / "run.mcap") == [2, 5]
     assert any("disconnected" in line for line in log_lines(tmp_path / "run.mcap"))
 
 
 def test_end_while_the_device_is_away(
-    robot: Peripheral, start: Any, monkeypatch: pytest.MonkeyPatch
+    robot: Any, start: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = start("lines")
     robot.send([b"x:1\n"])
@@ -349,7 +211,7 @@ def test_end_while_the_device_is_away(
     assert time.monotonic() - began < 1.5
 
 
-def test_stop_ends_the_search(air: Air, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_ends_the_search(air: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bluetooth, "SCAN_TIMEOUT_S", 60.0)
     stop = threading.Event()
     port = port_of("ble:robot7", baud=115_200, stop=stop)
@@ -363,24 +225,24 @@ def test_stop_ends_the_search(air: Air, monkeypatch: pytest.MonkeyPatch) -> None
 # Refusals
 
 
-def test_unknown_name(robot: Peripheral, air: Air) -> None:
+def test_unknown_name(robot: Any, air: Any) -> None:
     air.add("evil\x1b[2J\nname", OTHER)
     air.add(None, "C0:11:22:33:44:77")
     error = refused("ble:robot8")
     assert error.message == "not found in 0.1 s; found: evil\\x1b[2J\\x0aname, robot7"
 
 
-def test_nothing_in_range(air: Air) -> None:
+def test_nothing_in_range(air: Any) -> None:
     assert "found: no device with a name" in str(refused("ble:robot7"))
 
 
-def test_many_names_are_cut(air: Air) -> None:
+def test_many_names_are_cut(air: Any) -> None:
     for number in range(20):
         air.add(f"n{number:02d}", f"C0:00:00:00:00:{number:02d}")
     assert str(refused("ble:robot7")).endswith("n11 and 8 more")
 
 
-def test_two_devices_of_one_name(robot: Peripheral, air: Air, opened: Any) -> None:
+def test_two_devices_of_one_name(robot: Any, air: Any, opened: Any) -> None:
     twin = air.add("robot7", OTHER)
     error = refused("ble:robot7")
     assert error.message == f"2 devices have this name: {ADDRESS}, {OTHER}"
@@ -391,7 +253,7 @@ def test_two_devices_of_one_name(robot: Peripheral, air: Air, opened: Any) -> No
 
 
 def test_second_device_that_advertises_later(
-    robot: Peripheral, air: Air, monkeypatch: pytest.MonkeyPatch
+    robot: Any, air: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bluetooth, "SAME_NAME_WAIT_S", 5.0)
     threading.Timer(0.05, air.add, ("robot7", OTHER)).start()
@@ -399,7 +261,7 @@ def test_second_device_that_advertises_later(
 
 
 @pytest.mark.parametrize("name", ["ble:", "ble: "])
-def test_no_name(air: Air, name: str) -> None:
+def test_no_name(air: Any, name: str) -> None:
     assert "no name or address" in str(refused(name))
     assert air.scans == 0
 
@@ -427,7 +289,7 @@ def test_bleak_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
         (OSError(), "(OSError)"),
     ],
 )
-def test_adapter_is_off(air: Air, raised: Exception, reason: str) -> None:
+def test_adapter_is_off(air: Any, raised: Exception, reason: str) -> None:
     air.adapter_error = raised
     assert str(refused("ble:robot7")) == f"ble:robot7: Bluetooth is not available {reason}"
 
@@ -436,11 +298,11 @@ def test_adapter_is_off(air: Air, raised: Exception, reason: str) -> None:
     ("raised", "problem"),
     [(TimeoutError(), "no answer in 10 s"), (BleakError("busy"), "cannot be connected (busy)")],
 )
-def test_no_connection(robot: Peripheral, raised: Exception, problem: str) -> None:
+def test_no_connection(robot: Any, raised: Exception, problem: str) -> None:
     robot.connect_error = raised
     assert refused("ble:robot7").message == problem
 
 
-def test_device_without_the_service(air: Air) -> None:
+def test_device_without_the_service(air: Any) -> None:
     air.add("watch", OTHER, has_uart=False)
     assert "no Nordic UART Service" in str(refused("ble:watch"))
