@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +61,13 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
         "--name",
         metavar="NAME",
         help="Name of the device in the session.  [default: robot; camera for cameras]",
+    ),
+    click.option(
+        "--test",
+        "is_test",
+        is_flag=True,
+        help="Check the sensors instead: dead ones, exchanged or inverted axes, wrong gains, "
+        "order. It takes 30 s, or --duration; -o keeps the recording.",
     ),
 )
 @section(
@@ -137,6 +147,7 @@ def _pairs(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -
 def command(
     port: str | None,
     listing: bool,
+    is_test: bool,
     device: str,
     output: Path | None,
     artifact: tuple[Path, ...],
@@ -167,12 +178,14 @@ def command(
     session directly. If a port is unplugged, it is opened again when it is back. If the program is
     killed, at most half a second is lost: `locatk recover` completes the file.
 
-    The exit status is 3 if data were lost; the file is complete nevertheless.
+    The exit status is 3 if data were lost; the file is complete nevertheless. With --test it is 3
+    if a sensor has a fault, too.
 
     \b
     Examples:
       locatk capture --list
       locatk capture /dev/ttyACM0 --device locatk -o run.mcap
+      locatk capture /dev/ttyACM0 --device polaris-array --test
       locatk capture COM3 --device polaris-array --artifact tag.toml -o run.mcap
       locatk capture /dev/ttyACM0 -o run.mcap --duration 5min --note "floor 2"
       locatk capture /dev/ttyACM0 -o day.mcap --rotate 10min --meta robot=7
@@ -183,15 +196,20 @@ def command(
     if listing:
         _list(as_json)
         return
-    if port is None or output is None:
+    if port is None or (output is None and not is_test):
         raise click.UsageError("Missing PORT." if port is None else "Missing option '-o'.")
-    from locatk.formats.capture import setup
+    from locatk.formats.capture import sensor_test, setup
     from locatk.formats.capture.recorder import Limits
     from locatk.formats.devices import find_device
 
     if device != "auto":
         find_device(device)
     _refuse_unused_options(port, device, rest)
+    if is_test:
+        if rotate is not None or port.startswith("camera:"):
+            what = "cameras" if rotate is None else "--rotate"
+            raise click.UsageError(f"--test does not apply to {what}.")
+        duration = sensor_test.DURATION_S if duration is None else duration
     kind, amount = rotate or ("", 0.0)
     limits = Limits(
         duration_s=duration,
@@ -201,28 +219,38 @@ def command(
         silence_s=silence,
         reserve_bytes=int(reserve),
     )
-    request = setup.CaptureRequest(
-        port=port,
-        device=device,
-        output=output,
-        artifacts=artifact,
-        note=note,
-        meta=meta,
-        limits=limits,
-        overwrite=overwrite,
-        **{name: value for name, value in rest.items() if value is not None},
-    )
     stop = threading.Event()
-    with capture_text.live() as live, asked_to_stop(stop.set):
-        recorded = setup.record(
-            request,
-            stop,
-            tell=live.tell,
-            show=live.show,
-            ready=live.ready,
-            waiting=live.waiting,
+    with contextlib.ExitStack() as stack:
+        is_temporary = output is None
+        if output is None:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="locatk-"))
+            output = Path(folder, "test.mcap")
+        request = setup.CaptureRequest(
+            port=port,
+            device=device,
+            output=output,
+            artifacts=artifact,
+            note=note,
+            meta=meta,
+            limits=limits,
+            overwrite=overwrite,
+            **{name: value for name, value in rest.items() if value is not None},
         )
-    _report(recorded, port, device, as_json)
+        live = stack.enter_context(capture_text.live())
+        stack.enter_context(asked_to_stop(stop.set))
+
+        def ready(name: str) -> None:
+            live.ready(name)
+            for text in sensor_test.instructions(device) if is_test else ():
+                console.say(text)
+
+        recorded = setup.record(
+            request, stop, tell=live.tell, show=live.show, ready=ready, waiting=live.waiting
+        )
+        tests = sensor_test.check_recording(recorded.paths[0]) if is_test else None
+        if is_temporary:
+            recorded.paths.clear()
+    _report(recorded, port, device, tests, as_json)
 
 
 def _refuse_unused_options(port: str, device: str, given: dict[str, Any]) -> None:
@@ -252,10 +280,17 @@ def _list(as_json: bool) -> None:
         console.say("No serial port found. `locatk emulate polaris` creates one for tests.")
 
 
-def _report(recorded: Any, port: str, device: str, as_json: bool) -> None:
-    console.result(capture_text.summary(recorded))
+def _report(
+    recorded: Any, port: str, device: str, tests: Sequence[Any] | None, as_json: bool
+) -> None:
+    """Print the result of a recording; ``tests`` are those of its sensors, with --test."""
+    if tests is None:
+        console.result(capture_text.summary(recorded))
+    for test in tests or ():
+        console.result(capture_text.sensor_test(test))
     if as_json:
-        console.emit_json(capture_text.as_json(recorded))
+        fields = {} if tests is None else {"tests": [*map(capture_text.test_as_json, tests)]}
+        console.emit_json({**capture_text.as_json(recorded), **fields})
     known_device = "" if device == "auto" and recorded.device == "raw" else recorded.device
     doubts = recorded.totals.doubts(known_device)
     if doubts and recorded.totals.bytes:
@@ -264,5 +299,8 @@ def _report(recorded: Any, port: str, device: str, as_json: bool) -> None:
     losses = recorded.totals.losses() + doubts
     if recorded.failed:
         losses.insert(0, recorded.ended)
+    faults = sum(len(test.check.faults) for test in tests or ())
+    if faults:
+        losses.append(f"{faults} fault{'s' * (faults > 1)} of the sensors")
     if losses:
         raise failures.Incomplete("; ".join(losses))

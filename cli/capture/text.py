@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -175,6 +176,80 @@ def as_json(recorded: Any) -> dict[str, Any]:
         "rates_hz": recorded.rates,
         "clocks": {key: float(text) for key, text in recorded.clocks.items()},
         "artifacts": recorded.artifacts,
+    }
+
+
+def sensor_test(test: Any) -> str:
+    """Return the result of a check of sensors: a table, the faults, and what was not tested."""
+    check = test.check
+    header, rows = _SENSOR_TABLES[test.system](check)
+    rows = [(name, *row) for name, row in zip(test.names, rows, strict=True)]
+    lines = [f"Test of {test.device}:", console.table(("sensor", *header), rows)]
+    for fault in check.faults:
+        name = "all sensors" if fault.sensor is None else test.names[fault.sensor]
+        lines.append(console.wrapped(f"FAULT  {name}: {fault.message}", indent=7))
+    if not check.faults:
+        lines.append("No fault was found.")
+    lines += [console.wrapped(f"not tested: {text}", indent=12) for text in check.untested]
+    return "\n".join(lines)
+
+
+def _array_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    rows = [
+        (
+            _figure(each.gain, 1, "{:.2f}"),
+            _figure(each.offset_t, 1e6, "{:.0f}"),
+            _figure(each.noise_t, 1e6, "{:.2f}"),
+            " ".join(("-" if axis < 0 else "") + "xyz"[abs(axis) - 1] for axis in each.axes) or "-",
+        )
+        for each in check.sensors
+    ]
+    return ("gain", "offset uT", "noise uT", "axes"), rows
+
+
+def _halls_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    rows = [
+        (
+            _figure(each.zero_t, 1e3, "{:.2f}"),
+            _figure(each.noise_t, 1e3, "{:.3f}"),
+            _figure(each.response_t, 1e3, "{:.1f}"),
+            _figure(each.response_s, 1, "{:.1f}"),
+        )
+        for each in check.sensors
+    ]
+    return ("zero mT", "noise mT", "response mT", "at s"), rows
+
+
+def _receiver_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    rows = [(str(each.sweeps), " ".join(map(str, each.channels)) or "-") for each in check.sensors]
+    return ("sweeps", "channels"), rows
+
+
+_SENSOR_TABLES = {"polaris": _array_table, "landmarks": _halls_table, "lighthouse": _receiver_table}
+
+
+def _figure(value: float, factor: float, form: str) -> str:
+    return "-" if math.isnan(value) else form.format(factor * value)
+
+
+def test_as_json(test: Any) -> dict[str, Any]:
+    """Return the result of a check of sensors for ``--json``; unknown figures are null."""
+    sensors = [
+        {
+            "name": name,
+            **{
+                key: None if isinstance(value, float) and math.isnan(value) else value
+                for key, value in vars(figures).items()
+            },
+        }
+        for name, figures in zip(test.names, test.check.sensors, strict=True)
+    ]
+    return {
+        "device": test.device,
+        "system": test.system,
+        "sensors": sensors,
+        "faults": [vars(fault) for fault in test.check.faults],
+        "untested": test.check.untested,
     }
 
 

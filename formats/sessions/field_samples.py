@@ -222,8 +222,17 @@ def write_halls(
     _write(path, HALLS, recordings, artifact, **extras)
 
 
-def read_magnetometers(session: Session) -> list[Samples]:
+def read_magnetometers(
+    session: Session, *, fallback: Callable[[int], SensorArray] | None = None
+) -> list[Samples]:
     """Read the samples of all magnetometer arrays of a session, sorted by device.
+
+    Parameters
+    ----------
+    session : Session
+    fallback : callable, optional
+        Takes a number of sensors and returns the array of a device without geometry; by default,
+        such a device is an error.
 
     Raises
     ------
@@ -235,12 +244,19 @@ def read_magnetometers(session: Session) -> list[Samples]:
     """
     return [
         Samples(each.device, each.geometry, each.time_ns, each.field_t)
-        for each in _read(session, MAGNETOMETERS)
+        for each in _read(session, MAGNETOMETERS, fallback)
     ]
 
 
-def read_halls(session: Session) -> list[HallSamples]:
+def read_halls(
+    session: Session, *, fallback: Callable[[int], HallSensors] | None = None
+) -> list[HallSamples]:
     """Read the samples of the hall sensors of all robots of a session, sorted by device.
+
+    Parameters
+    ----------
+    session, fallback
+        As for :func:`read_magnetometers`.
 
     Raises
     ------
@@ -254,7 +270,7 @@ def read_halls(session: Session) -> list[HallSamples]:
             each.time_ns,
             _restore_saturation(each.field_t[:, :, 0], each.geometry.range_t),
         )
-        for each in _read(session, HALLS)
+        for each in _read(session, HALLS, fallback)
     ]
 
 
@@ -314,7 +330,9 @@ def _messages(
     return layout.batches(f"{kind.topic}{samples.device}", fields, columns, edges)
 
 
-def _read(session: Session, kind: SensorKind[Geometry]) -> list[DeviceSamples[Geometry]]:
+def _read(
+    session: Session, kind: SensorKind[Geometry], fallback: Callable[[int], Geometry] | None
+) -> list[DeviceSamples[Geometry]]:
     """Read the samples of all devices, sorted by device; fields are (n, N, axes)."""
     topics = kind.topics(session)
     if not topics:
@@ -325,11 +343,14 @@ def _read(session: Session, kind: SensorKind[Geometry]) -> list[DeviceSamples[Ge
             file=session.path,
             hint=f"Make one with {kind.makers}",
         )
-    return [_read_device(session, kind, topic) for topic in topics]
+    return [_read_device(session, kind, topic, fallback) for topic in topics]
 
 
 def _read_device(
-    session: Session, kind: SensorKind[Geometry], topic: str
+    session: Session,
+    kind: SensorKind[Geometry],
+    topic: str,
+    fallback: Callable[[int], Geometry] | None,
 ) -> DeviceSamples[Geometry]:
     device = topic.removeprefix(kind.topic)
     payloads = [payload for _, _, payload in session.messages([topic])]
@@ -353,7 +374,13 @@ def _read_device(
         _check(device, time_ns, field_t)
     except InputError as error:
         raise FormatError(error.message, file=session.path, where=topic) from None
-    return DeviceSamples(device, _read_geometry(session, kind, topic, sensors), time_ns, field_t)
+    try:
+        geometry = _read_geometry(session, kind, topic, sensors)
+    except MissingGeometryError:
+        if fallback is None:
+            raise
+        geometry = fallback(sensors)
+    return DeviceSamples(device, geometry, time_ns, field_t)
 
 
 def _read_geometry(

@@ -1,0 +1,124 @@
+"""Check of the sensors in a recording that a user made for it (``locatk capture --test``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.halls import HallSensors
+from locatk.core.landmarks.halls_check import HallsCheck, check_halls
+from locatk.core.lighthouse.receiver_check import ReceiverCheck, check_receiver
+from locatk.core.polaris.array import SensorArray
+from locatk.core.polaris.array_check import ArrayCheck, check_array
+from locatk.formats.sessions.field_samples import (
+    HALLS,
+    MAGNETOMETERS,
+    read_halls,
+    read_magnetometers,
+)
+from locatk.formats.sessions.observations import (
+    SWEEP_TOPIC_PREFIX,
+    read_receivers,
+    read_sweeps,
+)
+from locatk.formats.sessions.reader import Session
+
+INSTRUCTIONS = {
+    "polaris": "Magnetometers: turn them slowly about all axes for 20 s, away from iron; then hold "
+    "a magnet to sensor 1.",
+    "landmarks": "Hall sensors: wait 3 s, then move a magnet, north side up, closely below one "
+    "after the other: {halls}.",
+    "lighthouse": "Photodiodes: hold the device still in the light of a base station.",
+}
+"""What a user does with the sensors of each system."""
+
+DEVICE_SYSTEM = {
+    "polaris-array": "polaris",
+    "magx-array": "polaris",
+    "lighthouse-deck": "lighthouse",
+    "dotbot-gateway": "lighthouse",
+}
+"""Systems of the devices that have sensors of one system only."""
+
+DURATION_S = 30.0
+"""Default duration of the recording [s]."""
+
+
+@dataclass(frozen=True)
+class DeviceTest:
+    """Result for the sensors of one device.
+
+    Attributes
+    ----------
+    device, system : str
+    names : tuple of str
+        Of the sensors.
+    check : ArrayCheck, HallsCheck or ReceiverCheck
+    """
+
+    device: str
+    system: str
+    names: tuple[str, ...]
+    check: ArrayCheck | HallsCheck | ReceiverCheck
+
+
+def instructions(device: str) -> list[str]:
+    """Return what the user does while the sensors of a device are recorded."""
+    system = DEVICE_SYSTEM.get(device)
+    halls = ", ".join(HallSensors().names)
+    return [
+        text.format(halls=halls) for name, text in INSTRUCTIONS.items() if system in (None, name)
+    ]
+
+
+def check_recording(path: str | Path) -> list[DeviceTest]:
+    """Check the sensors of all devices of a session.
+
+    Raises
+    ------
+    LocatkError
+        The session cannot be read, or has too few samples for a check.
+    InputError
+        It has no magnetometers, hall sensors or photodiodes.
+    """
+    session = Session.open(path)
+    tests: list[DeviceTest] = []
+    if MAGNETOMETERS.topics(session):
+        for samples in read_magnetometers(session, fallback=_unknown_array):
+            names = _numbered(len(samples.array))
+            tests.append(DeviceTest(samples.device, "polaris", names, check_array(samples)))
+    if HALLS.topics(session):
+        for readings in read_halls(session, fallback=_unknown_halls):
+            names = readings.sensors.names
+            tests.append(DeviceTest(readings.device, "landmarks", names, check_halls(readings)))
+    if session.topics(SWEEP_TOPIC_PREFIX):
+        sweeps, receivers = read_sweeps(session), read_receivers(session)
+        for number, device in enumerate(sweeps.devices):
+            check = check_receiver(sweeps, number, receivers.get(device))
+            names = tuple(f"photodiode {sensor}" for sensor in range(len(check.sensors)))
+            tests.append(DeviceTest(device, "lighthouse", names, check))
+    if not tests:
+        raise InputError(
+            "no magnetometers, hall sensors or photodiodes were decoded",
+            file=session.path,
+            hint="Check --device, and --columns for lines",
+        )
+    return tests
+
+
+def _unknown_array(sensors: int) -> SensorArray:
+    return SensorArray(np.full((sensors, 3), np.nan))
+
+
+def _unknown_halls(sensors: int) -> HallSensors:
+    usual = HallSensors()
+    if sensors == len(usual):
+        return usual
+    return HallSensors(_numbered(sensors), np.full((sensors, 2), np.nan))
+
+
+def _numbered(sensors: int) -> tuple[str, ...]:
+    return tuple(f"sensor {number + 1}" for number in range(sensors))
