@@ -17,8 +17,11 @@ import itertools
 import json
 import math
 import os
+import shutil
 import sys
 import textwrap
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -37,6 +40,9 @@ TEXT_COLUMNS = 80
 
 MIN_TEXT_COLUMNS = 16
 """Narrowest column of wrapped text in characters."""
+
+PROGRESS_INTERVAL_S = 0.5
+"""Interval at which the progress of a long call is shown [s]."""
 
 
 @dataclass
@@ -345,16 +351,35 @@ def steps(count: int, label: str) -> Iterator[Callable[[], None]]:
 
 
 @contextlib.contextmanager
-def working(label: str) -> Iterator[None]:
-    """Show a label on a terminal while one long call runs."""
-    shown = _shows_progress()
-    if shown:
-        control(f"{label} ...")
+def working(label: str) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a label and the elapsed time on a terminal while one long call runs.
+
+    Yields a function that adds progress: the name of the items, the number of those that are done,
+    and their total.
+    """
+    if not _shows_progress():
+        yield lambda items, done, total: None
+        return
+    started, end, note = time.monotonic(), threading.Event(), ""
+
+    def add(items: str, done: int, total: int) -> None:
+        nonlocal note
+        note = f", {100 * done // max(total, 1)} % of {total} {items}" if done < total else ""
+
+    def show() -> None:
+        while not end.wait(PROGRESS_INTERVAL_S):
+            line = f"{label} ... {time.monotonic() - started:.0f} s{note}"
+            control(f"\r\x1b[K{line[: shutil.get_terminal_size().columns - 1]}")
+
+    control(f"{label} ...")
+    ticker = threading.Thread(target=show, daemon=True)
+    ticker.start()
     try:
-        yield
+        yield add
     finally:
-        if shown:
-            erase_line()
+        end.set()
+        ticker.join()
+        erase_line()
 
 
 def erase_line() -> None:

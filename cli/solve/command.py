@@ -301,9 +301,10 @@ def _check_scene(sessions: Sequence[str]) -> None:
 
 def _solve_one(jobs: Sequence[SolveJob], as_json: bool, **workers: Any) -> None:
     """Solve one session; its error or its first loss is the result of the command."""
+    from locatk.core import progress
     from locatk.formats import pipeline
 
-    with console.working("Solving"):
+    with console.working("Solving") as advance, progress.observed(advance):
         [outcome] = [
             outcome for _, ready in pipeline.solve_batch(jobs, **workers) for outcome in ready
         ]

@@ -42,6 +42,7 @@ from locatk.core.polaris.published import pipeline as published
 from locatk.core.polaris.published.templates import TemplateGrid
 from locatk.core.polaris.results import PolarisFacts, TagDetection
 from locatk.core.polaris.tag import Tags
+from locatk.core.progress import track
 from locatk.core.solution import Solution, SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
 
@@ -275,7 +276,7 @@ def _identify_passes(
         least_magnet_field(samples, tags.magnet.moment, tags.clearance_m) for tags in designs
     ]
     magnet_field_t = min(fields_t, default=None)
-    for part in find_passes(samples, noise_t):
+    for part in track(find_passes(samples, noise_t), "passes"):
         current = identify(part)
         if (current is None or not current.is_identified) and (
             (current is not None and _is_at_rest(current))

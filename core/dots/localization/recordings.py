@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core import progress
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import CODEC_NAMES, Codec, codec
 from locatk.core.dots.frames import Frames
@@ -67,6 +68,7 @@ def localize_recording(
     :func:`~locatk.core.dots.localization.frames.localize_frames`.
     """
     result = unlocalized_frames(len(frames), TOO_FEW_DOTS)
+    done = 0
     for indices, images in batches(frames, np.arange(len(frames)), result.rejected, camera):
         if localize is not None:
             part = localize(images, code, camera)
@@ -78,6 +80,8 @@ def localize_recording(
             uncertain = localize_frames(images[off_sheet], code, camera)
             part.confidence[off_sheet] = uncertain.confidence
         result.update(indices, part)
+        done += len(indices)
+        progress.report("frames", done, len(frames))
     _recognize_altered(frames, result.rejected, code, camera)
     return result
 

@@ -34,6 +34,7 @@ from locatk.core.lighthouse.motion.solver import (
     estimate_paths,
     follow_path,
 )
+from locatk.core.progress import track
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
 
@@ -342,7 +343,7 @@ class PathRecording:
         pose_ns = 2 * self.knot_ns
         length_ns = -(-round(PART_S * 1e9) // pose_ns) * pose_ns
         overlap_ns, none = round(PART_OVERLAP_S * 1e9), np.zeros(0, np.int64)
-        for number in np.unique(own.time_ns // length_ns).tolist():
+        for number in track(np.unique(own.time_ns // length_ns).tolist(), "parts of the path"):
             start_ns, end_ns = number * length_ns, (number + 1) * length_ns
             rows = np.flatnonzero(_within(own.time_ns, start_ns - overlap_ns, end_ns + overlap_ns))
             near = rough.select(_within(rough.time_ns, start_ns - overlap_ns, end_ns + overlap_ns))
