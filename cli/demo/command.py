@@ -167,21 +167,20 @@ def _quoted(path: Path) -> str:
 
 
 def run_system(
-    folder: Path, system: str, seed: int, is_plotted: bool, overwrite: bool
+    folder: Path, system: str, seed: int, is_kept: bool, overwrite: bool
 ) -> tuple[dict[str, Any], Any]:
     """Simulate, solve and evaluate one system; return its row of the table, and its report."""
-    from locatk.cli.demo.sessions import MAKERS, SPEED_MPS
+    from locatk.cli.demo.sessions import MAKERS, PRINTED, SPEED_MPS
     from locatk.core.evaluation import evaluate, pair_devices
     from locatk.formats.pipeline import SolveRequest, solve_session
     from locatk.formats.pipeline.provenance import command_line, source_facts
-    from locatk.formats.plots.picture import write_picture
     from locatk.formats.plots.series import origin_ns
     from locatk.formats.report.subject import load_subject
     from locatk.formats.sessions import solutions
 
     session, solution = folder / f"{system}.mcap", folder / f"{system}-solved.mcap"
     with console.working(f"Simulating {system}"):
-        truths = MAKERS[system](folder, seed, overwrite)
+        truths, draw_sheet = MAKERS[system](folder, seed, overwrite)
     with console.working(f"Solving {system}"):
         solved = solve_session(session, SolveRequest())
         speed = SPEED_MPS if system == "polaris" else None
@@ -191,8 +190,14 @@ def run_system(
             solution, solved.solution, source=session, facts=facts, overwrite=overwrite
         )
     subject = load_subject(solution, session=session)
-    if is_plotted:
+    if is_kept:
+        from locatk.formats.output import atomic_write
+        from locatk.formats.plots.picture import write_picture
+
         with console.working(f"Drawing {system}"):
+            if draw_sheet is not None:
+                with atomic_write(folder / PRINTED[system], overwrite=overwrite) as stream:
+                    stream.write(draw_sheet())
             write_picture(
                 folder / f"{system}.png",
                 solved.solution,

@@ -1,4 +1,4 @@
-"""Sessions of ``locatk demo``: one per system, with truth, and the sheets to print."""
+"""Sessions of ``locatk demo``: one per system, with truth, and the sheet to print."""
 
 from __future__ import annotations
 
@@ -19,11 +19,16 @@ PRINTED = {
 }
 """Name of the file to print, if the system has one."""
 
-Maker = Callable[[Path, int, bool], "tuple[Trajectory, ...]"]
-"""Function of folder, seed and overwrite that writes `<system>.mcap` and returns the truth."""
+Sheet = Callable[[], bytes]
+"""Draws what is printed for a session, as PDF."""
+
+Maker = Callable[[Path, int, bool], "tuple[tuple[Trajectory, ...], Sheet | None]"]
+"""Function of folder, seed and overwrite that writes `<system>.mcap`; returns truth and sheet."""
 
 
-def lighthouse(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
+def lighthouse(
+    folder: Path, seed: int, overwrite: bool
+) -> tuple[tuple[Trajectory, ...], Sheet | None]:
     """Simulate two robots under two stations."""
     from locatk.core.lighthouse.simulation import SimulationOptions, simulate
     from locatk.formats.sessions import observations
@@ -39,20 +44,18 @@ def lighthouse(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ..
         truth=simulated.truth,
         overwrite=overwrite,
     )
-    return simulated.truth
+    return simulated.truth, None
 
 
-def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    """Simulate a camera over a sheet, and draw the sheet."""
+def dots(folder: Path, seed: int, overwrite: bool) -> tuple[tuple[Trajectory, ...], Sheet | None]:
+    """Simulate a camera over a sheet."""
     from math import radians
 
     from locatk.core.dots.simulation import session as simulate
-    from locatk.formats.output import atomic_write
-    from locatk.formats.printing import pattern
     from locatk.formats.sessions import frames
 
     options = simulate.SimulationOptions(
-        frames=200,
+        frames=100,
         rate_hz=25.0,
         speed_mps=0.25,
         tilt_rad=radians(3),
@@ -72,21 +75,23 @@ def dots(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
         truth=(simulated.truth,),
         overwrite=overwrite,
     )
-    with atomic_write(folder / PRINTED["dots"], overwrite=overwrite) as stream:
-        stream.write(pattern.render(simulated.manifest))
-    return (simulated.truth,)
+
+    def draw() -> bytes:
+        from locatk.formats.printing import pattern
+
+        return pattern.render(simulated.manifest)
+
+    return (simulated.truth,), draw
 
 
-def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    """Simulate a magnetometer array over three tags, and draw the tags."""
+def polaris(
+    folder: Path, seed: int, overwrite: bool
+) -> tuple[tuple[Trajectory, ...], Sheet | None]:
+    """Simulate a magnetometer array over three tags."""
     from math import radians
 
-    from locatk.core.polaris.codec import layout_of
-    from locatk.core.polaris.drawing.cards import draw_tag_cards
     from locatk.core.polaris.simulation import session as simulate
     from locatk.core.polaris.tag import PlanarPose, Tags
-    from locatk.formats.output import atomic_write
-    from locatk.formats.printing.drawings import render_pages
     from locatk.formats.sessions import field_samples
 
     ids = (262_143, 77, 123_456)
@@ -118,20 +123,25 @@ def polaris(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
         odometry=() if simulated.odometry is None else (simulated.odometry,),
         overwrite=overwrite,
     )
-    layouts = [(number, layout_of(tags, number)) for number in ids]
-    drawn = draw_tag_cards(tags, layouts, (210.0, 297.0))
-    with atomic_write(folder / PRINTED["polaris"], overwrite=overwrite) as stream:
-        stream.write(render_pages(drawn.pages, "locatk demo"))
-    return (simulated.truth,)
+
+    def draw() -> bytes:
+        from locatk.core.polaris.codec import layout_of
+        from locatk.core.polaris.drawing.cards import draw_tag_cards
+        from locatk.formats.printing.drawings import render_pages
+
+        layouts = [(number, layout_of(tags, number)) for number in ids]
+        drawn = draw_tag_cards(tags, layouts, (210.0, 297.0))
+        return render_pages(drawn.pages, "locatk demo")
+
+    return (simulated.truth,), draw
 
 
-def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...]:
-    """Simulate a robot over a floor, and draw the installation pack."""
+def landmarks(
+    folder: Path, seed: int, overwrite: bool
+) -> tuple[tuple[Trajectory, ...], Sheet | None]:
+    """Simulate a robot over a floor."""
     from locatk.core.landmarks.design.generation import DesignOptions, design_map
-    from locatk.core.landmarks.drawing.pack import draw_installation_pack
     from locatk.core.landmarks.simulation import session as simulate
-    from locatk.formats.output import atomic_write
-    from locatk.formats.printing.drawings import render_pages
     from locatk.formats.sessions import field_samples
 
     floor = design_map(DesignOptions(rows=6, columns=8, seed=seed))
@@ -151,10 +161,15 @@ def landmarks(folder: Path, seed: int, overwrite: bool) -> tuple[Trajectory, ...
         odometry=simulated.odometry,
         overwrite=overwrite,
     )
-    pack = draw_installation_pack(floor, (210.0, 297.0), paper_name="A4")
-    with atomic_write(folder / PRINTED["landmarks"], overwrite=overwrite) as stream:
-        stream.write(render_pages(pack.pages, "locatk demo"))
-    return simulated.truth
+
+    def draw() -> bytes:
+        from locatk.core.landmarks.drawing.pack import draw_installation_pack
+        from locatk.formats.printing.drawings import render_pages
+
+        pack = draw_installation_pack(floor, (210.0, 297.0), paper_name="A4")
+        return render_pages(pack.pages, "locatk demo")
+
+    return simulated.truth, draw
 
 
 MAKERS: dict[str, Maker] = {
