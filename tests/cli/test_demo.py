@@ -35,7 +35,7 @@ def test_every_system_is_better_than_its_published_algorithm(demo) -> None:
     assert tuple(rows) == SYSTEMS
     for system, mae_m in limits.items():
         row = rows[system]
-        assert row["poses"] > 100
+        assert row["poses"] >= 100  # of the dots, all frames
         assert row["mae_m"] < mae_m
         # Where tags or landmarks were not read, the published algorithm has no poses.
         assert row["paper_mae_m"] is not None or system in ("polaris", "landmarks")
