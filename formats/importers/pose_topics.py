@@ -156,6 +156,7 @@ SAMPLES_OF: dict[str, Callable[[Any], Iterator[PoseSample]]] = {
     "nav_msgs/msg/Odometry": _pose_with_covariance,
     "nav_msgs/msg/Path": _path,
     "tf2_msgs/msg/TFMessage": _tf_message,
+    "tf/msg/tfMessage": _tf_message,
     "foxglove.PoseInFrame": _pose_in_frame,
     "foxglove.PosesInFrame": _poses_in_frame,
     "foxglove.FrameTransform": _frame_transform,
@@ -163,7 +164,7 @@ SAMPLES_OF: dict[str, Callable[[Any], Iterator[PoseSample]]] = {
 }
 """Types of messages with poses, and the function that yields the poses of one."""
 
-TREE_TYPES = ("tf2_msgs/msg/TFMessage", "foxglove.FrameTransforms")
+TREE_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransforms")
 """Types of messages with transforms of several frames."""
 
 PATH_TYPE = "nav_msgs/msg/Path"

@@ -20,6 +20,9 @@ METADATA_FILE = "metadata.yaml"
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 
+TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
+"""Definition of tf2_msgs/TFMessage and of tf/tfMessage, its predecessor in ROS 1."""
+
 ROS1_MAGIC = b"#ROSBAG V"
 
 
@@ -54,10 +57,12 @@ def ros_decoder(topic: Topic) -> Callable[[bytes], Any]:
         rosbags is not installed.
     """
     import_rosbags()
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     is_ros1 = topic.encoding == "ros1"
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    if is_ros1 and topic.type not in store.types:  # It lacks the packages of tf.
+        store.register(get_types_from_msg(TF_DEFINITION, topic.type))
     deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
 
     def decode(data: bytes) -> Any:
