@@ -60,6 +60,7 @@ def assert_same(actual: Trajectory, expected: Trajectory) -> None:
     np.testing.assert_allclose(actual.quaternion, expected.quaternion, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("storage", STORAGES)
 def test_all_types_have_the_same_poses(tmp_path: Path, ros_bags: ModuleType, storage: str) -> None:
     make, robot = ros_bags.Messages(storage), track()
@@ -307,6 +308,7 @@ def test_a_bag_without_poses_lists_its_topics(tmp_path: Path, ros_bags: ModuleTy
     assert caught.value.hint == "It has no topics"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("storage", STORAGES)
 def test_damaged_bags_are_refused(tmp_path: Path, ros_bags: ModuleType, storage: str) -> None:
     """Cut anywhere and with any byte changed, a bag has poses or is refused in one line."""
