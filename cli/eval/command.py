@@ -74,8 +74,8 @@ offset_option = click.option(
     required=True,
     metavar="FILE[#NAME]|FOLDER",
     callback=options.existing_poses,
-    help="Session with truth, another solution, TUM, KITTI, CSV, EuRoC, a bag of ROS, MCAP with "
-    "poses, a log of a Crazyflie, or an export of Motive, Vicon or Qualisys; #NAME reads one "
+    help="Session with truth, another solution, TUM, KITTI, CSV, EuRoC, a bag of ROS, MCAP of "
+    "Foxglove, a log of a Crazyflie, or an export of Motive, Vicon or Qualisys; #NAME reads one "
     "device or topic only. In a folder, the file with the name of the session.",
 )
 @click.option(
@@ -168,8 +168,8 @@ def command(
 ) -> None:
     """Compare the poses of ESTIMATE with a reference, for each device.
 
-    ESTIMATE is a solution (.mcap), a session with truth, or any file of --truth. Of a bag of ROS,
-    the folder or a file in it is given; it needs `pip install "locatk[ros]"`. Several, also
+    ESTIMATE is a solution (.mcap), a session with truth, or any file of --truth. A bag of ROS is a
+    folder or a file (.db3, .mcap, .bag) and needs the extra locatk[ros]. Several, also
     folders of solutions and patterns, are each compared with the truth of their session, and
     solutions of the same sessions by several methods or settings with each other. The absolute pose
     error (APE) is the difference between a pose and the truth, the relative pose error (RPE) the
