@@ -93,7 +93,7 @@ def _pose_stamped(message: Any) -> Iterator[PoseSample]:
 def _pose_with_covariance(message: Any) -> Iterator[PoseSample]:
     header, pose = message.header, message.pose.pose
     numbers = _numbers(pose.position, pose.orientation)
-    covariance = message.pose.covariance
+    covariance = message.pose.covariance.tolist()
     yield PoseSample(_ros_time_ns(header), header.frame_id, numbers, "", covariance)
 
 
@@ -219,7 +219,8 @@ def read_topics(
     if not wanted:
         names = ", ".join(topic.name for topic in candidates[:MAX_LISTED_TOPICS])
         raise InputError(f"no topic {selected!r} with poses", file=path, hint=f"It has {names}")
-    trajectories, notes = [], []
+    trajectories: list[tuple[_Series, Trajectory]] = []
+    notes: list[str] = []
     for series in _collect(path, wanted, source, decoder):
         trajectory = series.trajectory(notes)
         if trajectory is not None:
@@ -364,7 +365,10 @@ def _collect(
                     series[key].append(sample, log_ns)
         except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
             raise FormatError(
-                f"a message is no valid {topic.type}", file=path, where=topic.name
+                f"a message is no valid {topic.type}",
+                file=path,
+                where=topic.name,
+                hint="Read another topic by FILE#NAME, or record it again",
             ) from None
 
     for topic, log_ns, data in source(topics):

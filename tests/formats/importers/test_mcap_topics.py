@@ -25,6 +25,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 from locatk.core.errors import FormatError, InputError, LocatkError
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers import trajectories as files
+from locatk.formats.sessions.writer import SessionWriter
 
 START_NS = 1_700_000_000_123_456_789
 TIME_NS = START_NS + 10_000_000 * np.arange(5)
@@ -240,6 +241,15 @@ def test_files_without_poses_list_their_topics(tmp_path: Path) -> None:
         files.read(path, role="truth")
     with pytest.raises(FormatError, match="no on-board poses"):
         files.read(path, role="onboard")
+
+
+def test_sessions_of_locatk_without_truth_have_their_own_error(tmp_path: Path) -> None:
+    with SessionWriter(tmp_path / "run.mcap", system="lighthouse"):
+        pass
+    with pytest.raises(FormatError, match="no reference poses"):
+        files.read(tmp_path / "run.mcap", role="truth")
+    with pytest.raises(FormatError, match="no reference poses"):
+        files.read(tmp_path / "run.mcap")
 
 
 def test_cut_files_can_be_recovered(tmp_path: Path, locatk: Any) -> None:
