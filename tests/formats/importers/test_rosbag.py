@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -209,6 +210,30 @@ def test_a_path_without_stamps_has_no_times(tmp_path: Path, ros_bags: ModuleType
     assert caught.value.hint == "/plan: 3 of 3 poses left out (without a stamp)"
 
 
+def test_poses_of_a_path_without_frame_have_that_of_the_path(
+    tmp_path: Path, ros_bags: ModuleType
+) -> None:
+    make = ros_bags.Messages()
+    points = [make.pose_stamped(START_NS + k, "", (k, 0, 0), (0, 0, 0, 1)) for k in range(3)]
+    messages = [("/path", START_NS, make.path(START_NS, "map", points))]
+    [path] = files.read(ros_bags.write_bag(tmp_path / "a", "mcap", messages))
+    assert (path.frame, len(path)) == ("map", 3)
+
+
+def test_transforms_of_several_bodies_on_one_topic(tmp_path: Path, ros_bags: ModuleType) -> None:
+    make = ros_bags.Messages()
+    messages = [
+        ("/vicon", START_NS + k, make.transform(START_NS + k, "map", body, (x, 0, 0), (0, 0, 0, 1)))
+        for k in range(3)
+        for x, body in enumerate(("red", "blue"))
+    ]
+    path = ros_bags.write_bag(tmp_path / "a", "mcap", messages)
+    blue, red = files.read(path)
+    assert (blue.device, red.device) == ("/vicon:map.blue", "/vicon:map.red")
+    assert (blue.position[:, 0].tolist(), red.position[:, 0].tolist()) == ([1] * 3, [0] * 3)
+    assert names(path, "/vicon:map.red") == ["/vicon:map.red"]
+
+
 # ---- selection
 
 
@@ -221,6 +246,8 @@ def tree(tmp_path: Path, ros_bags: ModuleType) -> Path:
         *transforms(make, track(frame="map", seed=1), "odom"),
         *transforms(make, track(frame="odom", seed=1), "base.link"),
         *transforms(make, fixed, "camera", "/tf_static"),
+        # Each node that starts late gets it again.
+        *transforms(make, replace(fixed, time_ns=fixed.time_ns + 10**9), "camera", "/tf_static"),
         *poses(make, track(), "/pose/kiwi"),
         *poses(make, track(seed=5), "/amcl"),
     ]
