@@ -126,7 +126,7 @@ def test_bags_without_definitions_of_messages(tmp_path: Path, ros_bags: ModuleTy
     assert_same(files.read(folder)[0], track())
 
 
-def test_our_export_is_read_back(tmp_path: Path) -> None:
+def test_our_export_is_read_back(tmp_path: Path, ros_bags: ModuleType) -> None:
     robot = track("kiwi", "floor")
     robot.covariance[3:, 2, :] = robot.covariance[3:, :, 2] = np.nan  # an unobserved height
     write_ros2(tmp_path / "a.mcap", [robot], covariance=True)
