@@ -64,6 +64,15 @@ def _existing(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
     return value
 
 
+def existing_poses(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
+    """Check that the file of a path, which can be `FILE#NAME`, exists."""
+    from locatk.formats.files import split_selection
+
+    if value is not None:
+        must_exist([split_selection(value)[0]])
+    return value
+
+
 def must_exist(paths: Sequence[Path | None]) -> None:
     """Raise MissingDataError if a path does not exist."""
     for path in paths:
@@ -83,7 +92,8 @@ def input_argument(name: str, *, many: bool = False) -> Callable[[F], F]:
 def input_option(*names: str, help: str, many: bool = False, **more: Any) -> Callable[[F], F]:
     """Return an option that names an existing file; repeatable with ``many``."""
     more.setdefault("metavar", "FILE")
-    return click.option(*names, type=PATH, multiple=many, callback=_existing, help=help, **more)
+    more.setdefault("callback", _existing)
+    return click.option(*names, type=PATH, multiple=many, help=help, **more)
 
 
 sessions = input_argument("sessions", many=True)

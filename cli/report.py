@@ -33,7 +33,8 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
     ),
     options.input_option(
         "--truth",
-        metavar="FILE|FOLDER",
+        metavar="FILE[#NAME]|FOLDER",
+        callback=options.existing_poses,
         help="Reference poses: a session, a solution, or a file that `locatk eval` reads. In a "
         "folder, the file with the name of the session.  "
         "[default: those of the session]",
@@ -82,12 +83,13 @@ def command(
       locatk report solved.mcap -o figure.svg
     """
     from locatk.formats.evaluation import find_estimates, find_truth
+    from locatk.formats.files import split_selection
 
     solutions = tuple(find_estimates(names)[0])
     options.must_exist(solutions)
     flags = zip(PICTURE_SUFFIXES, (png, pdf, svg), strict=True)
     page, pictures = plan_outputs(solutions, output, [suffix for suffix, on in flags if on])
-    inputs = [*solutions, *sessions, *([] if truth is None else [truth])]
+    inputs = [*solutions, *sessions, *([] if truth is None else [split_selection(truth)[0]])]
     for path in [*([] if page is None else [page]), *(p for row in pictures for p in row)]:
         options.guard_output(path, overwrite=overwrite, inputs=inputs)
     session_of = _match_sessions(solutions, sessions)

@@ -16,9 +16,11 @@ import numpy as np
 from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.natural_order import natural_key
+from locatk.formats.files import split_selection
 from locatk.formats.importers import trajectories as files
+from locatk.formats.importers.rosbag import is_bag_folder
 
-TRUTH_ENDINGS = (".mcap", ".tum", ".csv", ".txt", ".kitti", ".tsv")
+TRUTH_ENDINGS = (".mcap", ".tum", ".csv", ".txt", ".kitti", ".tsv", ".db3", ".bag")
 """Endings of files with truth in a folder, in the order in which they are looked for."""
 
 SOLVED_ENDING = "-solved"
@@ -168,7 +170,7 @@ def evaluate_file(
     files.check_kinds(estimated, true)
     notes, warnings = [*estimated.notes, *true.notes], []
     if not estimated.solved:
-        if estimate.samefile(truth):
+        if estimated.path.samefile(true.path):
             raise InputError(
                 "no solved poses", file=estimate, hint="Solve it first: `locatk solve`"
             )
@@ -183,7 +185,7 @@ def evaluate_file(
             f"none of its devices is in {truth}",
             file=estimate,
             hint=f"Name the pairs by --pair NAME=NAME: one of {estimated_devices}, and one of "
-            f"{true_devices}",
+            f"{true_devices}. FILE#NAME reads one of them only",
         )
     # TUM and KITTI files do not name their device.
     has_names = not {estimated.kind, true.kind} & set(files.EVO_KINDS)
@@ -211,14 +213,14 @@ def evaluate_file(
         )
     if evaluation.time_offset.alternatives:
         warnings.append("the motion is periodic and fits several time offsets: give --offset")
-    facts = _read_facts(estimate) if estimated.kind in ("solution", "session") else {}
+    facts = _read_facts(estimated.path) if estimated.kind in ("solution", "session") else {}
     return EvaluatedFile(estimate, truth, evaluation, facts, tuple(notes), tuple(warnings))
 
 
 def find_estimates(names: Sequence[Path]) -> tuple[list[Path], bool]:
     """Return the files of paths, folders and patterns, and whether one name can mean several.
 
-    A folder stands for its solutions, and for damaged files.
+    A folder stands for its solutions, and for damaged files, unless it is a bag of ROS.
 
     Raises
     ------
@@ -228,8 +230,10 @@ def find_estimates(names: Sequence[Path]) -> tuple[list[Path], bool]:
     found: dict[Path, None] = {}
     is_several = len(names) > 1
     for name in names:
+        file = split_selection(name)[0]
         # A plain file needs no search, whose imports take long.
-        expanded = None if name.is_file() else _expand(str(name))
+        is_one = file != name or file.is_file() or is_bag_folder(file)
+        expanded = None if is_one else _expand(str(name))
         if expanded is None:
             found[name] = None
             continue
@@ -249,23 +253,29 @@ def find_truth(estimate: Path, truth: Path) -> Path:
     """Return the file with the truth of an estimate: ``truth``, or that of its name in a folder.
 
     In a folder, it has the name of the session of a solution, or that of the estimate, with or
-    without ``-solved``.
+    without ``-solved``. It can be the folder of a bag of ROS.
 
     Raises
     ------
     MissingDataError
         There is no such file.
     """
-    if not truth.is_dir():
+    if not truth.is_dir() or is_bag_folder(truth):
         return truth
     stems = dict.fromkeys(
-        (session_name(estimate, _read_facts(estimate)), base_name(estimate), estimate.stem)
+        (
+            session_name(estimate, _read_facts(estimate)),
+            base_name(estimate),
+            split_selection(estimate)[0].stem,
+        )
     )
     for stem in stems:
         for ending in TRUTH_ENDINGS:
             candidate = truth / f"{stem}{ending}"
-            if candidate.is_file() and not candidate.samefile(estimate):
+            if candidate.is_file() and not candidate.samefile(split_selection(estimate)[0]):
                 return candidate
+        if is_bag_folder(truth / stem):
+            return truth / stem
     raise MissingDataError(
         f"no truth of this name in {truth}",
         file=estimate,
@@ -306,7 +316,7 @@ def _read_facts(path: Path) -> dict[str, str]:
 
 def base_name(estimate: Path) -> str:
     """Return the name of a file without ending and without ``-solved``."""
-    return estimate.stem.removesuffix(SOLVED_ENDING)
+    return split_selection(estimate)[0].stem.removesuffix(SOLVED_ENDING)
 
 
 def label_runs(evaluated: Sequence[EvaluatedFile]) -> list[str]:

@@ -12,6 +12,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import BinaryIO
 
 from locatk.core.errors import FormatError, InputError, LocatkError, MissingDataError
@@ -61,6 +62,19 @@ def check_regular(path: str | os.PathLike[str]) -> int:
             hint=f"This is {_kind_of(status.st_mode)}: copy its data into a file first",
         )
     return status.st_size
+
+
+def split_selection(path: Path) -> tuple[Path, str]:
+    """Split ``FILE#NAME`` into a file and the name of a trajectory in it.
+
+    The name is empty if ``path`` has none, exists itself, or no such file exists.
+    """
+    text = path.as_posix()
+    if "#" in text and not os.path.exists(path):
+        for k, letter in enumerate(text):
+            if letter == "#" and text[:k] and os.path.exists(text[:k]):
+                return Path(text[:k]), text[k + 1 :]
+    return path, ""
 
 
 def _kind_of(mode: int) -> str:

@@ -76,6 +76,13 @@ def air(monkeypatch: pytest.MonkeyPatch) -> Any:
     return _load_module("bluetooth_devices").install(monkeypatch)
 
 
+@pytest.fixture(scope="session")
+def ros_bags() -> ModuleType:
+    """Module that writes bags of ROS with rosbags; the test is skipped where it is absent."""
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    return _load_module("ros_bags")
+
+
 def _load_module(name: str) -> ModuleType:
     """Return a module of this folder."""
     if name in sys.modules:

@@ -72,9 +72,11 @@ offset_option = click.option(
 @options.input_option(
     "--truth",
     required=True,
-    metavar="FILE|FOLDER",
-    help="Session with truth, another solution, TUM, KITTI, CSV, EuRoC, a log of a Crazyflie, or "
-    "an export of Motive, Vicon or Qualisys. In a folder, the file with the name of the session.",
+    metavar="FILE[#NAME]|FOLDER",
+    callback=options.existing_poses,
+    help="Session with truth, another solution, TUM, KITTI, CSV, EuRoC, a bag of ROS, MCAP of "
+    "Foxglove, a log of a Crazyflie, or an export of Motive, Vicon or Qualisys; #NAME reads one "
+    "device or topic only. In a folder, the file with the name of the session.",
 )
 @click.option(
     "--pair",
@@ -166,7 +168,8 @@ def command(
 ) -> None:
     """Compare the poses of ESTIMATE with a reference, for each device.
 
-    ESTIMATE is a solution (.mcap), a session with truth, or any file of --truth. Several, also
+    ESTIMATE is a solution (.mcap), a session with truth, or any file of --truth. A bag of ROS is a
+    folder or a file (.db3, .mcap, .bag) and needs the extra locatk[ros]. Several, also
     folders of solutions and patterns, are each compared with the truth of their session, and
     solutions of the same sessions by several methods or settings with each other. The absolute pose
     error (APE) is the difference between a pose and the truth, the relative pose error (RPE) the
@@ -186,10 +189,12 @@ def command(
       locatk eval flight.mcap --onboard --truth solved.mcap --align se3
       locatk eval slam.tum --truth mocap.tum --align se3 --delta 1m
       locatk eval solved.mcap --truth mocap.csv --pair 785b=red --pair dffa=blue
+      locatk eval drive.db3#/odom --truth drive.db3#/tf:map.base_link
     """
     from locatk.cli.eval import text as eval_text
     from locatk.core.evaluation import Delta, EvaluationOptions
     from locatk.formats.evaluation import evaluate_file, find_estimates, find_truth
+    from locatk.formats.files import split_selection
 
     chosen = EvaluationOptions(
         align=align,
@@ -207,7 +212,7 @@ def command(
         )
 
     found, is_several = find_estimates(estimates)
-    options.must_exist(found)
+    options.must_exist([split_selection(file)[0] for file in found])
     if is_several or table is not None:
         evaluate_several(found, evaluated, table, overwrite=overwrite, as_json=as_json)
         return
@@ -240,11 +245,14 @@ def evaluate_several(
     """
     from locatk.cli.eval import text as eval_text
     from locatk.formats.evaluation import COLUMNS, label_runs, summarize_runs
+    from locatk.formats.files import split_selection
     from locatk.formats.tables.writing import ENDINGS, write_table
 
     if table is not None:
         options.check_ending(table, ENDINGS)
-        options.guard_output(table, overwrite=overwrite, inputs=list(found))
+        options.guard_output(
+            table, overwrite=overwrite, inputs=[split_selection(file)[0] for file in found]
+        )
     results, failures = [], []
     with console.progress(found, "Evaluating") as items:
         for file in items:

@@ -1,26 +1,30 @@
 """Trajectories from any file that contains some.
 
-Sessions and solutions, TUM, KITTI, CSV, and the formats of :data:`FORMATS`: motion capture systems,
-EuRoC, and logs of a Crazyflie.
+Sessions and solutions, TUM, KITTI, CSV, the formats of :data:`FORMATS` (motion capture systems,
+EuRoC, and logs of a Crazyflie), bags of ROS, and MCAP files with messages of ROS or Foxglove.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.trajectory import Trajectory
-from locatk.formats.files import read_head
+from locatk.formats.files import read_head, split_selection
 from locatk.formats.importers.kitti import KITTI_COLUMNS, read_kitti
+from locatk.formats.importers.rosbag import ROS1_MAGIC, SQLITE_MAGIC, is_bag_folder, read_bag
 from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.importers.tum import TUM_COLUMNS, read_tum
 
+if TYPE_CHECKING:
+    from locatk.formats.sessions.reader import Session
+
 ToolKind = Literal["motive", "vicon", "qualisys", "euroc", "crazyflie"]
-Kind = Literal["solution", "session", "tum", "kitti", "csv"] | ToolKind
+Kind = Literal["solution", "session", "tum", "kitti", "csv", "bag", "mcap"] | ToolKind
 Role = Literal["estimate", "truth", "onboard"]
 
 EVO_KINDS = ("tum", "kitti")
@@ -28,14 +32,15 @@ EVO_KINDS = ("tum", "kitti")
 
 MCAP_MAGIC = b"\x89MCAP"
 
-GZIP_MAGIC = b"\x1f\x8b"
+COMPRESSED_MAGICS = {b"\x1f\x8b": "gunzip", b"\x28\xb5\x2f\xfd": "unzstd"}
+"""Beginnings of compressed files (gzip, zstd), and the program that unpacks them."""
 
 HEAD_BYTES = 1 << 16
 """Beginning of a text file that has to contain the first row."""
 
 KIND_HINT = (
-    "Give a session or solution (.mcap), TUM, KITTI, CSV with time_s, EuRoC, a log of a Crazyflie, "
-    "or an export of Motive, Vicon or Qualisys"
+    "Give a session or solution (.mcap), TUM, KITTI, CSV with time_s, EuRoC, a bag of ROS, a log "
+    "of a Crazyflie, or an export of Motive, Vicon or Qualisys"
 )
 
 Content = tuple[list[Trajectory], tuple[str, ...]]
@@ -110,9 +115,10 @@ class TrajectoryFile:
     ----------
     path : Path
     kind : str
-        ``"solution"``, ``"session"``, ``"tum"``, ``"kitti"``, ``"csv"``, or one of :data:`FORMATS`.
+        ``"solution"``, ``"session"``, ``"tum"``, ``"kitti"``, ``"csv"``, one of :data:`FORMATS`,
+        ``"bag"`` (ROS), or ``"mcap"`` (of another program).
     trajectories : list of Trajectory
-        One a device.
+        One for each device or topic.
     solved : bool
         False if they are the truth of a session.
     notes : tuple of str
@@ -139,7 +145,10 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
     path : path
         A session (its truth), a solution (its poses), or text: CSV with a header
         (:func:`~locatk.formats.importers.trajectory_csv.read_csv`), TUM (eight numbers a line),
-        KITTI (twelve), or one of :data:`FORMATS`.
+        KITTI (twelve), or one of :data:`FORMATS`; a bag of ROS
+        (:func:`~locatk.formats.importers.rosbag.read_bag`), or an MCAP file with messages of ROS
+        or Foxglove (:func:`~locatk.formats.importers.mcap_topics.read_mcap_topics`).
+        ``FILE#NAME`` selects the trajectory of this name.
     role : str
         For a file with solved poses and truth: ``"estimate"`` reads the poses, ``"truth"`` the
         truth. ``"onboard"`` reads the poses of a session that its devices estimated themselves.
@@ -149,20 +158,50 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
     MissingDataError
         The file is missing.
     FormatError, InputError
-        The file is of another kind, has no poses, or is damaged.
+        The file is of another kind, has no poses or none of this name, or is damaged.
+    LocatkError
+        A bag needs rosbags, which is not installed.
     """
-    path = Path(path)
+    path, name = split_selection(Path(path))
+    if is_bag_folder(path):
+        return _read_bag(path, role, name)
     if path.is_dir():
         raise InputError("a folder instead of a file", file=path, hint=KIND_HINT)
     head = read_head(path, HEAD_BYTES)
+    if head.startswith((SQLITE_MAGIC, ROS1_MAGIC)):
+        return _read_bag(path, role, name)
     if head.startswith(MCAP_MAGIC):
-        return _read_mcap(path, role)
+        return _read_mcap(path, role, name)
+    return _select(_read_text(path, head, role), name)
+
+
+def _select(file: TrajectoryFile, name: str) -> TrajectoryFile:
+    """Return the file with the trajectory of one device only, with all for an empty name."""
+    chosen = [each for each in file.trajectories if name in ("", each.device)]
+    if not chosen:
+        names = ", ".join(each.device for each in file.trajectories)
+        raise InputError(f"no poses of {name!r}", file=file.path, hint=f"It has {names}")
+    return replace(file, trajectories=chosen)
+
+
+def _read_bag(path: Path, role: Role, name: str) -> TrajectoryFile:
+    _refuse_onboard(path, role)
+    trajectories, notes = read_bag(path, name)
+    return TrajectoryFile(path, "bag", trajectories, True, notes)
+
+
+def _refuse_onboard(path: Path, role: Role) -> None:
+    """Raise InputError if on-board poses are required: the file is no session."""
     if role == "onboard":
         raise InputError(
             "not a session: only sessions have on-board poses",
             file=path,
             hint="Give a session of `locatk import crazyflie-usd`, or omit --onboard",
         )
+
+
+def _read_text(path: Path, head: bytes, role: Role) -> TrajectoryFile:
+    _refuse_onboard(path, role)
     lines = _lines_of(path, head)
     for each in FORMATS:
         if each.is_format(lines):
@@ -187,8 +226,9 @@ def _lines_of(path: Path, head: bytes) -> list[str]:
     """
     if not head.strip():
         raise FormatError("an empty file", file=path, hint=KIND_HINT)
-    if head.startswith(GZIP_MAGIC):
-        raise FormatError("a compressed file", file=path, hint="Unpack it: `gunzip`")
+    for magic, program in COMPRESSED_MAGICS.items():
+        if head.startswith(magic):
+            raise FormatError("a compressed file", file=path, hint=f"Unpack it: `{program}`")
     return head.decode("utf-8-sig", "replace").lstrip("\r\n").splitlines() or [""]
 
 
@@ -222,7 +262,7 @@ def _kind_of_text(path: Path, lines: Sequence[str]) -> Literal["tum", "kitti", "
     )
 
 
-def _read_mcap(path: Path, role: Role) -> TrajectoryFile:
+def _read_mcap(path: Path, role: Role, name: str) -> TrajectoryFile:
     # The MCAP reader is slow to import, and text files do not need it.
     from locatk.formats.sessions.reader import Session
     from locatk.formats.sessions.solutions import read_trajectories
@@ -234,10 +274,31 @@ def _read_mcap(path: Path, role: Role) -> TrajectoryFile:
         "/pose/", "foxglove.PoseInFrame"
     )
     if role == "onboard":
-        return TrajectoryFile(path, kind, read_trajectories(path, "onboard"), True)
+        return _select(TrajectoryFile(path, kind, read_trajectories(path, "onboard"), True), name)
+    if _is_foreign(session) and (name or not _has_topics_as_locatk(session, role)):
+        from locatk.formats.importers.mcap_topics import read_mcap_topics
+
+        trajectories, notes = read_mcap_topics(session, name)
+        return TrajectoryFile(path, "mcap", trajectories, True, notes)
     solved = kind == "solution" or (role == "estimate" and bool(has_poses))
     trajectories = read_trajectories(path, "solution" if solved else "truth")
-    return TrajectoryFile(path, kind, trajectories, solved)
+    return _select(TrajectoryFile(path, kind, trajectories, solved), name)
+
+
+def _is_foreign(session: Session) -> bool:
+    """Return whether another program wrote a file, without messages of locatk."""
+    has_own_schema = any(channel.schema.startswith("locatk.") for channel in session.channels)
+    return not session.facts and not has_own_schema
+
+
+def _has_topics_as_locatk(session: Session, role: Role) -> bool:
+    """Return whether a file of another program has poses in topics with the names of locatk."""
+    prefixes = ("/truth/",) if role == "truth" else ("/pose/", "/truth/")
+    return any(
+        channel.topic.startswith(prefixes)
+        and (channel.schema, channel.encoding) == ("foxglove.PoseInFrame", "protobuf")
+        for channel in session.channels
+    )
 
 
 def check_kinds(estimate: TrajectoryFile, truth: TrajectoryFile) -> None:
