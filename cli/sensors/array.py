@@ -26,7 +26,17 @@ from locatk.cli.sensors.layout import (
 if TYPE_CHECKING:
     from locatk.core.polaris.array import SensorArray
 
-BOARDS = ("polaris-9", "polaris-3")
+BOARDS = (
+    "polaris-9",
+    "polaris-3",
+    "magx-large",
+    "magx-medium",
+    "magx-small",
+    "magx-stacked",
+    "magx-flat",
+    "magx-cube",
+    "magx-flat-cube",
+)
 
 
 @click.group(short_help="Describe the magnetometers under a robot.")
@@ -67,7 +77,10 @@ class Registers(click.ParamType):
     click.option(
         "--board",
         type=click.Choice(BOARDS),
-        help="Bars of the authors of Polaris: 9 sensors every 20 mm, or 3 every 8 mm.",
+        metavar="NAME",
+        help="A published board. Bars of Polaris: polaris-9 (9 sensors every 20 mm), polaris-3 (3 "
+        "every 8 mm). Arrays of MagX, 8 sensors: magx-large, magx-medium, magx-small (two boards "
+        "of 98, 80, 60 mm), magx-stacked, magx-flat, magx-cube, magx-flat-cube.",
     ),
     grid_option,
     pitch_option,
@@ -161,8 +174,11 @@ def design(
 
 
 def _board(name: str) -> SensorArray:
+    from locatk.core.polaris.magx import published_array
     from locatk.core.polaris.mlx90393 import Settings, published_bar
 
+    if name.startswith("magx-"):
+        return published_array(name)
     return {"polaris-9": published_bar(), "polaris-3": published_bar(3, 0.008, Settings(filt=5))}[
         name
     ]
