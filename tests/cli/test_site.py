@@ -238,3 +238,66 @@ def test_sessions_that_cannot_be_used_are_named(
     unknown = locatk("site", "survey", recordings[0], "-o", out, "--overwrite", "--fix", 9)
     assert unknown.exit_code == 1
     assert "tag 9 was not passed" in unknown.stderr
+
+
+# ---- export
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    path = tmp_path / "site.toml"
+    poses = {0: PlanarPose(0.0, 0.0, 0.0), 77354: PlanarPose(1.2, -0.3, math.pi / 2)}
+    write_tags(path, Tags(ids=FAMILY, min_distance=3, site=poses, meanings={0: "dock"}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("file", "format_name", "head"),
+    [
+        ("s.csv", "csv", b"id,x_mm,y_mm,heading_deg,meaning\n0,0,0,0,dock\n"),
+        ("s.json", "lif", b'{\n "metaInformation"'),
+        ("s.svg", "svg", b"<?xml"),
+        ("s.dxf", "dxf", b"  0\nSECTION"),
+    ],
+)
+def test_every_format_of_an_export(
+    locatk, site: Path, tmp_path: Path, file: str, format_name: str, head: bytes
+) -> None:
+    out = tmp_path / file
+    result = locatk("site", "export", site, "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    entry = json.loads(result.stdout)
+    assert (entry["format"], entry["outputs"]) == (format_name, [str(out)])
+    assert [each["id"] for each in entry["site"]] == [0, 77354]
+    assert out.read_bytes().startswith(head)
+    plain = tmp_path / "plain"
+    asked = locatk("site", "export", site, "-o", plain, "--format", format_name)
+    assert asked.stdout == f"Wrote {plain}: 2 tags\n"
+    assert plain.read_bytes() == out.read_bytes()
+    again = locatk("site", "export", site, "-o", out)
+    assert again.exit_code == 1
+    assert "--overwrite" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("file", "more"), [("s.csv", []), ("s.json", []), ("s.json", ["--lif-version", "2.0.0"])]
+)
+def test_export_and_import_give_the_same_site(
+    locatk, site: Path, tag: Path, tmp_path: Path, file: str, more: list[str]
+) -> None:
+    there, back = tmp_path / file, tmp_path / "back.toml"
+    assert locatk("site", "export", site, "-o", there, *more).exit_code == 0
+    assert locatk("site", "import", there, "--tag", tag, "-o", back).exit_code == 0
+    assert back.read_bytes() == site.read_bytes()
+
+
+def test_exports_that_are_refused(locatk, site: Path, tag: Path, tmp_path: Path) -> None:
+    for args, status, words in (
+        ((site, "-o", tmp_path / "a.txt"), 2, "not a known format"),
+        ((site, "-o", tmp_path / "a.csv", "--lif-version", "2.0.0"), 2, "is of --format lif"),
+        ((tag, "-o", tmp_path / "a.csv"), 1, "no tag has a position"),
+    ):
+        result = locatk("site", "export", *args)
+        assert result.exit_code == status
+        assert words in result.stderr
+    assert not list(tmp_path.glob("a.*"))
