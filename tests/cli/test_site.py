@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import ezdxf
 import pytest
 
 from locatk.core.polaris.simulation.options import SimulationOptions
@@ -301,3 +302,52 @@ def test_exports_that_are_refused(locatk, site: Path, tag: Path, tmp_path: Path)
         assert result.exit_code == status
         assert words in result.stderr
     assert not list(tmp_path.glob("a.*"))
+
+
+# ---- drawings
+
+
+def test_import_of_a_drawing(locatk, site: Path, tag: Path, tmp_path: Path) -> None:
+    plan, back = tmp_path / "plan.dxf", tmp_path / "back.toml"
+    assert locatk("site", "export", site, "-o", plan).exit_code == 0
+    result = locatk("site", "import", plan, "--tag", tag, "-o", back)
+    assert result.exit_code == 0, result.stderr
+    assert f"Lengths in {plan} are in mm." in result.stderr
+    assert back.read_bytes() == site.read_bytes()
+    args = ("--layer", "centres", "--layer", "LABELS", "--heading", 30, "--units", "m", "--json")
+    result = locatk("site", "import", plan, *args, "--tag", tag, "-o", back, "--overwrite")
+    assert result.exit_code == 0, result.stderr
+    first, second = json.loads(result.stdout)["site"]
+    assert (first["id"], first["meaning"], first["x_m"]) == (0, "dock", 0.0)
+    assert (second["id"], second["x_m"], second["y_m"]) == (77354, 1200.0, -300.0)
+    assert second["heading_rad"] == pytest.approx(math.radians(30))
+
+
+def test_drawings_and_options_that_are_refused(
+    locatk, site: Path, tag: Path, tmp_path: Path
+) -> None:
+    plan, survey = tmp_path / "plan.dxf", tmp_path / "survey.csv"
+    document = ezdxf.new("R12")
+    for _ in range(2):
+        document.modelspace().add_point((0, 0), {"layer": "TAGS"})
+    for name in ("TAG_0", "TAG_000"):
+        document.blocks.new(name)
+        document.modelspace().add_blockref(name, (1, 1), {"layer": "TWICE"})
+    document.saveas(plan)
+    survey.write_text("x_mm,y_mm\n0,0\n")
+    for args, status, words in (
+        (
+            (plan,),
+            1,
+            "plan.dxf: the drawing has no unit ($INSUNITS). Hint: Give it as in --units",
+        ),
+        ((plan, "--units", "yd"), 2, "--units of a drawing is one of mm, cm, dm, m, in, ft"),
+        ((plan, "--units", "m,deg"), 2, "--units of a drawing is one of"),
+        ((plan, "--columns", "x=a"), 2, "--columns and --units are of --format csv"),
+        ((plan, "--units", "m", "--layer", "TWICE"), 1, ": id 0 is also at handle"),
+        ((survey, "--layer", "A"), 2, "--layer is of --format dxf, not of csv"),
+    ):
+        result = locatk("site", "import", *args, "--tag", tag, "-o", tmp_path / "x.toml")
+        assert result.exit_code == status, args
+        assert words in result.stderr
+    assert not (tmp_path / "x.toml").exists()
