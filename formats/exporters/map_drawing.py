@@ -62,12 +62,7 @@ def draw_map(floor: FloorMap) -> FloorDrawing:
 def _landmark_shape(geometry: Geometry, code: int) -> Shape:
     bars = bar_outlines(geometry, code)
     outlines = tuple(Polygon(tuple((x, y) for x, y in bar.corners.tolist())) for bar in bars)
-    arrows = tuple(
-        mark
-        for bar in bars
-        for mark in pole_arrow(geometry, bar)
-        if isinstance(mark, Line | Polygon)
-    )
+    arrows = tuple(mark for bar in bars for mark in pole_arrow(geometry, bar))
     letters = tuple(Letter(*letter) for bar in bars for letter in pole_letters(bar))
     return Shape(
         f"LANDMARK_{name(code)}",

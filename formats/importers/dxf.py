@@ -356,14 +356,16 @@ def _assign_texts(
 
     if not texts:
         return DxfLayers(tuple(objects), (), unit, ignored)
-    tree = cKDTree([(item.x_m, item.y_m) for item in objects])
+    position_m = np.array([(item.x_m, item.y_m) for item in objects])
+    tree = cKDTree(position_m)
     limit_m = np.full(len(objects), math.inf)
     if len(objects) > 1:
-        limit_m = np.asarray(tree.query(tree.data, 2)[0])[:, 1] / 2
-    distance_m, nearest = tree.query([position for _, position in texts])
+        limit_m = np.asarray(tree.query(position_m, 2)[0])[:, 1] / 2
+    found = tree.query(np.array([position for _, position in texts]))
+    distance_m, nearest = (np.asarray(each) for each in found)
     nearby: list[list[DxfText]] = [[] for _ in objects]
-    distant = []
-    for (text, _), distance, index in zip(texts, distance_m, nearest, strict=True):
+    distant: list[DxfText] = []
+    for (text, _), distance, index in zip(texts, distance_m, nearest.tolist(), strict=True):
         (nearby[index] if distance < limit_m[index] else distant).append(text)
     assigned = (
         replace(item, nearby_texts=tuple(texts_of))
