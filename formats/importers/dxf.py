@@ -317,7 +317,7 @@ def _outline_centre(entity: Any) -> tuple[float, float] | None:
     corners = np.array([(point.x, point.y) for point in flattened])
     if not np.allclose(corners[0], corners[-1], rtol=0, atol=1e-6 * size):
         return None
-    return _centroid(corners[:-1])
+    return _centroid(corners)
 
 
 def _centroid(corners: Array) -> tuple[float, float] | None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from locatk.core.drawing import Circle, Group, Mark, Page, Polygon, Text, text_width
+from locatk.core.drawing import Circle, Group, Line, Mark, Page, Polygon, Text, text_width
 from locatk.core.errors import InputError
 from locatk.core.polaris.drawing.plan import (
     MIN_SYMBOL_MM,
@@ -161,6 +161,14 @@ def test_labels_of_sixty_tags_can_be_read(paper: tuple[float, float], seed: int)
         own = [mark for mark in marks(page) if isinstance(mark, Text)]
         for one, other in itertools.combinations(map(box_of, own), 2):
             assert not overlaps(one, other)
+        dashed = [mark for mark in marks(page) if isinstance(mark, Line) and mark.dash_mm]
+        for line in dashed:
+            # From the left or the lower edge to a tag, around the labels.
+            along = np.subtract(line.end, line.start)
+            assert sum(along) > 0
+            end = np.add(line.end, np.where(along == 0, 0.1, 0.0))
+            covered = (*line.start, *end)
+            assert not any(overlaps(covered, box_of(text)) for text in labels)
         half = MIN_SYMBOL_MM / 2
         for x, y in squares(page):
             symbol = (x - half, y - half, x + half, y + half)

@@ -211,7 +211,7 @@ def marker(document: Any, space: Any, place: tuple[float, float], **more: Any) -
             lambda d, s: (
                 s.add_point((0, 0), TAGS),
                 s.add_point((1, 0), TAGS),
-                s.add_text("5", dxfattribs=TAGS).set_placement((0.6, 3)),
+                s.add_text("5", dxfattribs=TAGS).set_placement((0.6, 0.4)),
             ),
             "the text '5' is next to no tag",
         ),
