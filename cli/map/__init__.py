@@ -13,7 +13,7 @@ COMMANDS = {
     "design": ("locatk.cli.map.design", "Design a map on which every window is unique."),
     "check": ("locatk.cli.map.check", "Prove that a map is unique, or list duplicates."),
     "export": ("locatk.cli.map.export", "Write a map for other tools."),
-    "import": ("locatk.cli.map.import_", "Read a map from a table or a LIF layout."),
+    "import": ("locatk.cli.map.import_", "Read a map from a table, a LIF layout or a drawing."),
 }
 """Name of a command to its module and short help. The module holds it as ``command``."""
 

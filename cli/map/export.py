@@ -12,8 +12,6 @@ from locatk.cli import console, options
 from locatk.cli.command import Command
 
 if TYPE_CHECKING:
-    from datetime import datetime
-
     from locatk.core.landmarks.map.floor import FloorMap
 
 ENDINGS = {
@@ -104,10 +102,11 @@ def command(
 
             contents = [dumps_csv(floor, unique_codes).encode()]
         elif format_name == "lif":
+            from locatk.formats.exporters.layout_lif import stamp_of
             from locatk.formats.exporters.map_lif import dumps_lif
 
             version = lif_version or LIF_VERSIONS[0]
-            contents = [dumps_lif(floor, _stamp(map_file), version).encode()]
+            contents = [dumps_lif(floor, stamp_of(map_file), version).encode()]
         else:
             contents = _draw(floor, format_name, files, resolution_mm)
     with contextlib.ExitStack() as stack:
@@ -135,28 +134,17 @@ def _draw(
 ) -> list[bytes]:
     """Return the content of each file of a drawing."""
     if format_name == "svg":
-        from locatk.formats.exporters import map_svg
+        from locatk.formats.exporters.drawing_svg import dumps_svg
+        from locatk.formats.exporters.map_drawing import draw_map
 
-        return [map_svg.dumps_svg(floor)]
+        return [dumps_svg(draw_map(floor))]
     if format_name == "dxf":
-        from locatk.formats.exporters.map_dxf import dumps_dxf
+        from locatk.formats.exporters.drawing_dxf import dumps_dxf
+        from locatk.formats.exporters.map_drawing import draw_map
 
-        return [dumps_dxf(floor).encode()]
+        return [dumps_dxf(draw_map(floor)).encode()]
     from locatk.formats.exporters import map_ros
 
     pixel = resolution_mm / 1e3
     picture = map_ros.dumps_pgm(map_ros.draw_grid(floor, pixel))
     return [map_ros.dumps_yaml(floor, files[1].name, pixel).encode(), picture]
-
-
-def _stamp(path: Path) -> datetime:
-    """Return the time at which the map was written, so that the same file gives the same layout.
-
-    SOURCE_DATE_EPOCH takes precedence (reproducible-builds.org).
-    """
-    import os
-    from datetime import UTC, datetime
-
-    given = os.environ.get("SOURCE_DATE_EPOCH", "")
-    seconds = int(given or path.stat().st_mtime)
-    return datetime.fromtimestamp(seconds, UTC)

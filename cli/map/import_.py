@@ -7,11 +7,12 @@ from pathlib import Path
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, drawing_options, options
 from locatk.cli.command import Command, section
 from locatk.cli.map.export import ENDINGS
 
-FORMATS = ("csv", "lif")
+FORMATS = ("csv", "lif", "dxf")
+DEFAULT_LAYER = "BARS"
 ALPHABETS = ("6", "16", "compass")
 WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
 
@@ -22,7 +23,7 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
     "--format",
     "format_name",
     type=click.Choice(FORMATS),
-    help="Format of SOURCE.  [default: by the ending of SOURCE: .csv, .json (LIF)]",
+    help="Format of SOURCE.  [default: by the ending of SOURCE: .csv, .json (LIF), .dxf]",
 )
 @options.output("Map to write (.toml).", endings=(".toml",))
 @section(
@@ -42,6 +43,16 @@ WINDOWS = ("L", "I2", "I3", "2x2", "3x3")
         show_default=True,
         metavar="MM",
         help="Maximum deviation of a landmark from its cell along x or y.",
+    ),
+)
+@section(
+    "Drawings",
+    drawing_options.layer(DEFAULT_LAYER, "landmarks"),
+    click.option(
+        "--units",
+        "unit",
+        type=click.Choice(drawing_options.UNITS),
+        help="--format dxf: unit of the drawing.  [default: that of the file, $INSUNITS]",
     ),
 )
 @section(
@@ -67,24 +78,31 @@ def command(
     output: Path,
     pitch_mm: float | None,
     tolerance_mm: float,
+    layers: tuple[str, ...],
+    unit: str | None,
     like: Path | None,
     alphabet: str | None,
     window: str | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write a map of the landmarks in SOURCE, a table of `locatk map export` or a LIF layout.
+    """Write a map of the landmarks in SOURCE: a table of `locatk map export`, LIF, or DXF.
 
     Pitch, rows and columns are estimated from the positions. If a landmark deviates from its cell,
     its position is imported as built; a deviation beyond the tolerance is an error. Such files do
     not contain alphabet, window and bars: give them as options. Check the map afterwards with
     `locatk map check`.
 
+    In a drawing (DXF), each block insert, closed outline or point on --layer is a landmark. The
+    letters of its bars are the attribute LANDMARK, a text next to it, or the end of the name of its
+    block (LANDMARK_NNSN). Walls are not read.
+
     \b
     Examples:
       locatk map import map.csv -o map.toml
       locatk map import survey.csv -o map.toml --pitch 200 --like design.toml
       locatk map import layout.json --format lif -o map.toml --alphabet 6
+      locatk map import plan.dxf -o map.toml --like design.toml
     """
     from locatk.core.units import metres
     from locatk.formats.artifacts.maps import dumps_map, loads_map, read_map, write_map
@@ -93,21 +111,31 @@ def command(
     if format_name is None:
         known = {name: ENDINGS[name] for name in FORMATS}
         format_name = options.choose_format(source, None, known)
+    drawing_options.check_layers(layers, format_name)
+    if unit is not None and format_name != "dxf":
+        raise click.UsageError(f"--units is of --format dxf, not of {format_name}.")
     inputs = [source] if like is None else [source, like]
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
-    text = read_text(source)
     pitch = None if pitch_mm is None else metres(pitch_mm)
     tolerance, warnings = metres(tolerance_mm), list[str]()
     if format_name == "csv":
         from locatk.formats.importers.map_csv import loads_csv
 
+        text = read_text(source)
         floor = loads_csv(
             text, file=source, pitch_m=pitch, tolerance_m=tolerance, warnings=warnings
         )
+    elif format_name == "dxf":
+        from locatk.formats.importers.map_dxf import read_map_drawing
+
+        floor, content = read_map_drawing(
+            source, layers or (DEFAULT_LAYER,), unit, pitch_m=pitch, tolerance_m=tolerance
+        )
+        drawing_options.report(source, content.unit, content.ignored)
     else:
         from locatk.formats.importers.map_lif import loads_lif
 
-        floor = loads_lif(text, file=source, pitch_m=pitch, tolerance_m=tolerance)
+        floor = loads_lif(read_text(source), file=source, pitch_m=pitch, tolerance_m=tolerance)
     if like is not None:
         design = read_map(like)
         floor = replace(

@@ -1,8 +1,8 @@
 """Drawings at true size: marks, pages of a pack, cards and tiles, independent of the file format.
 
 ``marks`` holds what is drawn (lines, circles, polygons, text, rulers, cut marks), ``pages`` the
-frame of a page with flowing text and tables, ``cards`` the arrangement of equal cards on pages, and
-``tiles`` the division of a large drawing over several papers.
+frame of a page with flowing text and tables, ``cards`` the arrangement of equal cards on pages,
+``tiles`` the division of a large drawing over several papers, and ``scale`` the scales of plans.
 """
 
 from locatk.core.drawing.marks import (

@@ -159,7 +159,7 @@ def cut_marks(left: float, bottom: float, right: float, top: float) -> tuple[Lin
     return tuple(marks)
 
 
-def arrow(start: Point, tip: Point, head_mm: float, width_mm: float = 0.2) -> list[Mark]:
+def arrow(start: Point, tip: Point, head_mm: float, width_mm: float = 0.2) -> list[Line | Polygon]:
     """Draw a line with a filled arrow head of length ``head_mm``."""
     length = math.dist(start, tip)
     u, v = (tip[0] - start[0]) / length, (tip[1] - start[1]) / length

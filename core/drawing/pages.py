@@ -29,6 +29,7 @@ from locatk.core.drawing.marks import (
     wrap,
 )
 from locatk.core.errors import InputError
+from locatk.core.paper_sizes import PAPER_SIZES_MM
 
 TITLE_POINTS = 10.0
 """Font size of titles."""
@@ -51,6 +52,9 @@ PAGE_NUMBER_WIDTH_MM = 30.0
 MIN_CONTENT_MM = 20.0
 """Smallest side of a page that the margins may leave; rulers and their numbers need most of it."""
 
+MAX_TEXT_PAPER_MM2 = 1.001 * PAPER_SIZES_MM["A3"][0] * PAPER_SIZES_MM["A3"][1]
+"""Largest area of a paper on which text is still printed."""
+
 TICK_BOX_INDENT_MM = 8.0
 """Indentation of a paragraph with a box to tick."""
 
@@ -71,6 +75,8 @@ class PageFrame:
         Font size of the title.
     spacing_em : float
         Line height of title and notes, as a fraction of the font size.
+    has_rulers : bool
+        Whether the page has rulers, which pages at true size need.
     """
 
     size_mm: Point
@@ -79,11 +85,14 @@ class PageFrame:
     notes: tuple[str, ...] = ()
     title_points: float = TITLE_POINTS
     spacing_em: float = LINE_SPACING_EM
+    has_rulers: bool = True
 
     @property
     def content_box(self) -> Box:
         """Left, bottom, right and top of the area for the content."""
-        edge = self.margin_mm + RULER_DEPTH_MM + FRAME_CLEARANCE_MM
+        edge = self.margin_mm
+        if self.has_rulers:
+            edge += RULER_DEPTH_MM + FRAME_CLEARANCE_MM
         width, height = self.size_mm
         header = self._title_height + len(self._note_lines) * self._line(TEXT_POINTS)
         top = height - self.margin_mm - header - FRAME_CLEARANCE_MM
@@ -98,7 +107,7 @@ class PageFrame:
         return Group(
             "page",
             (
-                *page_rulers(self.size_mm, self.margin_mm),
+                *(page_rulers(self.size_mm, self.margin_mm) if self.has_rulers else ()),
                 *self._paragraph(self._title_lines, (left, top), self.title_points, bold=True),
                 Text(f"page {number} of {count}", (right, first_baseline), TEXT_POINTS, "end"),
                 *self._paragraph(self._note_lines, (left, notes_top), TEXT_POINTS),
@@ -157,6 +166,12 @@ def check_margin(paper_mm: Point, margin_mm: float, min_content_mm: float = MIN_
             f"a margin of {margin_mm:g} mm leaves too little of a paper of {size_text(paper_mm)}",
             hint="Use a smaller margin or a larger paper",
         )
+
+
+def text_paper(paper_mm: Point) -> Point:
+    """Return the paper for the pages of text of a pack: A4 if that of its drawings is above A3."""
+    is_large = paper_mm[0] * paper_mm[1] > MAX_TEXT_PAPER_MM2
+    return PAPER_SIZES_MM["A4"] if is_large else paper_mm
 
 
 def size_text(size_mm: Point, decimals: int | None = None) -> str:

@@ -1,6 +1,6 @@
 """Layouts in VDMA's Layout Interchange Format (LIF) 1.0.0 and 2.0.0: checked access to the JSON.
 
-The format is described in :mod:`locatk.formats.exporters.map_lif`. Landmark maps
+The format is described in :mod:`locatk.formats.exporters.layout_lif`. Landmark maps
 (:mod:`.map_lif`) and sites of tags (:mod:`.site_lif`) are read from its nodes.
 """
 

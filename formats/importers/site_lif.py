@@ -1,8 +1,10 @@
 """Points for tags from layouts in VDMA's Layout Interchange Format (LIF) 1.0.0 and 2.0.0.
 
-A node is a tag. Its name (in LIF 2, its descriptor) is the id of the tag if all names are whole
-numbers; otherwise it is the meaning of the tag, and the id is free. The heading is the ``theta`` of
-the first type of vehicle that has one (LIF 1), or 0. Edges are not used.
+A node is a tag. Nodes ``tag<id>`` (:mod:`locatk.formats.exporters.site_lif`) state their ids, and
+the name (in LIF 2, the descriptor) of a node is the meaning of its tag. In other layouts the name
+is the id of the tag if all names are whole numbers; otherwise it is the meaning of the tag, and the
+id is free. The heading is the ``theta`` of the first type of vehicle that has one, or 0. Edges are
+not used.
 """
 
 from __future__ import annotations
@@ -15,6 +17,9 @@ from locatk.core.polaris.design.site import SitePoint
 from locatk.core.polaris.tag import MAX_MEANING_CHARACTERS
 from locatk.formats.importers.lif import NAME_KEY, LayoutNode, LayoutReader
 from locatk.formats.importers.site_csv import MAX_ID_DIGITS
+
+NODE_PREFIX = "tag"
+"""Beginning of the identifiers of nodes that state the ids of their tags."""
 
 PROPERTIES_KEY = {"1": "vehicleTypeNodeProperties", "2": "mobileRobotTypeNodeProperties"}
 """Key of the properties of a node by type of vehicle, by the major version of LIF."""
@@ -40,29 +45,37 @@ def loads_site_points(text: str, *, file: str | os.PathLike[str]) -> tuple[list[
     nodes = list(reader.nodes(layout))
     if not nodes:
         raise reader.error("a layout without nodes", "nodes")
-    names = [_name(node, NAME_KEY[major]) for node in nodes]
-    has_ids = all(
-        name.isascii() and name.isdigit() and len(name) <= MAX_ID_DIGITS for name in names
-    )
+    key = NAME_KEY[major]
+    ids, meanings = [node.node_id.removeprefix(NODE_PREFIX) for node in nodes], [""] * len(nodes)
+    if all(node.node_id.startswith(NODE_PREFIX) for node in nodes) and _are_ids(ids):
+        meanings = [_name(node, key) for node in nodes]
+    else:
+        ids = [_name(node, key) or node.node_id for node in nodes]
+        if not _are_ids(ids):
+            ids, meanings = [""] * len(nodes), ids
     headings = [_heading(reader, node, PROPERTIES_KEY[major]) for node in nodes]
     points = [
         SitePoint(
             node.x_m,
             node.y_m,
             heading or 0.0,
-            int(name) if has_ids else None,
-            "" if has_ids else _meaning(name),
+            int(tag_id) if tag_id else None,
+            _meaning(meaning),
             f"node {node.node_id!r}",
         )
-        for node, name, heading in zip(nodes, names, headings, strict=True)
+        for node, tag_id, meaning, heading in zip(nodes, ids, meanings, headings, strict=True)
     ]
     return points, any(heading is not None for heading in headings)
 
 
 def _name(node: LayoutNode, key: str) -> str:
-    """Return the name of a node, or its id if it has none."""
+    """Return the name of a node, empty if it has none."""
     name = node.data.get(key)
-    return name.strip() if isinstance(name, str) and name.strip() else node.node_id
+    return name.strip() if isinstance(name, str) else ""
+
+
+def _are_ids(texts: list[str]) -> bool:
+    return all(text.isascii() and text.isdigit() and len(text) <= MAX_ID_DIGITS for text in texts)
 
 
 def _meaning(name: str) -> str:

@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import ezdxf
 import pytest
 
 from locatk.core.polaris.simulation.options import SimulationOptions
@@ -238,3 +239,115 @@ def test_sessions_that_cannot_be_used_are_named(
     unknown = locatk("site", "survey", recordings[0], "-o", out, "--overwrite", "--fix", 9)
     assert unknown.exit_code == 1
     assert "tag 9 was not passed" in unknown.stderr
+
+
+# ---- export
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    path = tmp_path / "site.toml"
+    poses = {0: PlanarPose(0.0, 0.0, 0.0), 77354: PlanarPose(1.2, -0.3, math.pi / 2)}
+    write_tags(path, Tags(ids=FAMILY, min_distance=3, site=poses, meanings={0: "dock"}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("file", "format_name", "head"),
+    [
+        ("s.csv", "csv", b"id,x_mm,y_mm,heading_deg,meaning\n0,0,0,0,dock\n"),
+        ("s.json", "lif", b'{\n "metaInformation"'),
+        ("s.svg", "svg", b"<?xml"),
+        ("s.dxf", "dxf", b"  0\nSECTION"),
+    ],
+)
+def test_every_format_of_an_export(
+    locatk, site: Path, tmp_path: Path, file: str, format_name: str, head: bytes
+) -> None:
+    out = tmp_path / file
+    result = locatk("site", "export", site, "-o", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    entry = json.loads(result.stdout)
+    assert (entry["format"], entry["outputs"]) == (format_name, [str(out)])
+    assert [each["id"] for each in entry["site"]] == [0, 77354]
+    assert out.read_bytes().startswith(head)
+    plain = tmp_path / "plain"
+    asked = locatk("site", "export", site, "-o", plain, "--format", format_name)
+    assert asked.stdout == f"Wrote {plain}: 2 tags\n"
+    assert plain.read_bytes() == out.read_bytes()
+    again = locatk("site", "export", site, "-o", out)
+    assert again.exit_code == 1
+    assert "--overwrite" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("file", "more"), [("s.csv", []), ("s.json", []), ("s.json", ["--lif-version", "2.0.0"])]
+)
+def test_export_and_import_give_the_same_site(
+    locatk, site: Path, tag: Path, tmp_path: Path, file: str, more: list[str]
+) -> None:
+    there, back = tmp_path / file, tmp_path / "back.toml"
+    assert locatk("site", "export", site, "-o", there, *more).exit_code == 0
+    assert locatk("site", "import", there, "--tag", tag, "-o", back).exit_code == 0
+    assert back.read_bytes() == site.read_bytes()
+
+
+def test_exports_that_are_refused(locatk, site: Path, tag: Path, tmp_path: Path) -> None:
+    for args, status, words in (
+        ((site, "-o", tmp_path / "a.txt"), 2, "not a known format"),
+        ((site, "-o", tmp_path / "a.csv", "--lif-version", "2.0.0"), 2, "is of --format lif"),
+        ((tag, "-o", tmp_path / "a.csv"), 1, "no tag has a position"),
+    ):
+        result = locatk("site", "export", *args)
+        assert result.exit_code == status
+        assert words in result.stderr
+    assert not list(tmp_path.glob("a.*"))
+
+
+# ---- drawings
+
+
+def test_import_of_a_drawing(locatk, site: Path, tag: Path, tmp_path: Path) -> None:
+    plan, back = tmp_path / "plan.dxf", tmp_path / "back.toml"
+    assert locatk("site", "export", site, "-o", plan).exit_code == 0
+    result = locatk("site", "import", plan, "--tag", tag, "-o", back)
+    assert result.exit_code == 0, result.stderr
+    assert f"Lengths in {plan} are in mm." in result.stderr
+    assert back.read_bytes() == site.read_bytes()
+    args = ("--layer", "centres", "--layer", "LABELS", "--heading", 30, "--units", "m", "--json")
+    result = locatk("site", "import", plan, *args, "--tag", tag, "-o", back, "--overwrite")
+    assert result.exit_code == 0, result.stderr
+    first, second = json.loads(result.stdout)["site"]
+    assert (first["id"], first["meaning"], first["x_m"]) == (0, "dock", 0.0)
+    assert (second["id"], second["x_m"], second["y_m"]) == (77354, 1200.0, -300.0)
+    assert second["heading_rad"] == pytest.approx(math.radians(30))
+
+
+def test_drawings_and_options_that_are_refused(
+    locatk, site: Path, tag: Path, tmp_path: Path
+) -> None:
+    plan, survey = tmp_path / "plan.dxf", tmp_path / "survey.csv"
+    document = ezdxf.new("R12")
+    for _ in range(2):
+        document.modelspace().add_point((0, 0), {"layer": "TAGS"})
+    for name in ("TAG_0", "TAG_000"):
+        document.blocks.new(name)
+        document.modelspace().add_blockref(name, (1, 1), {"layer": "TWICE"})
+    document.saveas(plan)
+    survey.write_text("x_mm,y_mm\n0,0\n")
+    for args, status, words in (
+        (
+            (plan,),
+            1,
+            "plan.dxf: the drawing has no unit ($INSUNITS). Hint: Give it as in --units",
+        ),
+        ((plan, "--units", "yd"), 2, "--units of a drawing is one of mm, cm, dm, m, in, ft"),
+        ((plan, "--units", "m,deg"), 2, "--units of a drawing is one of"),
+        ((plan, "--columns", "x=a"), 2, "--columns and --units are of --format csv"),
+        ((plan, "--units", "m", "--layer", "TWICE"), 1, ": id 0 is also at handle"),
+        ((survey, "--layer", "A"), 2, "--layer is of --format dxf, not of csv"),
+    ):
+        result = locatk("site", "import", *args, "--tag", tag, "-o", tmp_path / "x.toml")
+        assert result.exit_code == status, args
+        assert words in result.stderr
+    assert not (tmp_path / "x.toml").exists()

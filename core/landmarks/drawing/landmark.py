@@ -223,7 +223,7 @@ def _draw_notes(notes: tuple[str, ...], centre: Point, inner_mm: float) -> list[
     ]
 
 
-def pole_arrow(geometry: Geometry, bar: BarOutline) -> list[Mark]:
+def pole_arrow(geometry: Geometry, bar: BarOutline) -> list[Line | Polygon]:
     """Draw a short arrow in the middle of a bar to its north pole, with space for the letters."""
     start, tip = (_along_bar(bar, fraction) for fraction in (0.28, 0.72))
     head = min(0.5e3 * geometry.bar_width_m, 0.2 * math.dist(bar.south, bar.north))

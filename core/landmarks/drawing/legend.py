@@ -18,10 +18,10 @@ from locatk.core.drawing import (
     line_height,
     paragraph,
     rectangle,
-    text_width,
     wrap,
 )
 from locatk.core.drawing.pages import TEXT_POINTS
+from locatk.core.drawing.scale import scale_bar
 from locatk.core.landmarks.drawing.landmark import draw_symbol, north_mark
 from locatk.core.landmarks.landmark import PATTERNS, code_of, name
 from locatk.core.landmarks.map.floor import FloorMap
@@ -41,9 +41,6 @@ EDGE_MM = 4.0
 
 LEGEND_POINTS = 6.0
 """Font size of the explanations."""
-
-MAX_SCALE_BAR_MM = 42.0
-"""Largest length of the scale bar."""
 
 LANDMARK_NOTE = (
     "Bars are numbered and read counter-clockwise, from bar 0 at +x. "
@@ -144,29 +141,4 @@ def _draw_window(window: str, corner: Point) -> list[Mark]:
 def _draw_scale(scale: float, width: float, corner: Point) -> list[Mark]:
     """Draw the north mark and a scale bar."""
     x, y = corner
-    marks: list[Mark] = [*north_mark((x + 2.0, y - 14.0), 11.0)]
-    length_m = _scale_bar_length(scale, width)
-    length, bar_y = 1e3 * length_m / scale, y - 20.0
-    return [
-        *marks,
-        Line((x, bar_y), (x + length, bar_y), 0.3),
-        Line((x, bar_y - 1), (x, bar_y + 1), 0.3),
-        Line((x + length, bar_y - 1), (x + length, bar_y + 1), 0.3),
-        Text(_bar_text(length_m), (x + length + 1.2, bar_y - 0.8), TEXT_POINTS),
-    ]
-
-
-def _bar_text(length_m: float) -> str:
-    return f"{length_m:g} m"
-
-
-def _scale_bar_length(scale: float, width: float) -> float:
-    """Return the longest of 1, 2 or 5 times a power of ten in metres that fits with its text."""
-    for power in itertools.count(math.ceil(math.log10(MAX_SCALE_BAR_MM * scale / 1e3)), -1):
-        for factor in (5, 2, 1):
-            length_m = factor * 10.0**power
-            length = 1e3 * length_m / scale
-            text = text_width(_bar_text(length_m), TEXT_POINTS)
-            if length <= MAX_SCALE_BAR_MM and length + 1.2 + text <= width:
-                return length_m
-    raise AssertionError("a bar of any length fits")
+    return [*north_mark((x + 2.0, y - 14.0), 11.0), *scale_bar((x, y - 20.0), scale, width)]

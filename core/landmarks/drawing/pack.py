@@ -6,7 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from locatk.core.drawing import Page, Point
-from locatk.core.drawing.pages import UnnumberedPage, check_margin, number_pages, printable
+from locatk.core.drawing.pages import (
+    UnnumberedPage,
+    check_margin,
+    number_pages,
+    printable,
+    text_paper,
+)
 from locatk.core.errors import InputError
 from locatk.core.landmarks.design.materials import SPARES_PERCENT, bill_of_materials
 from locatk.core.landmarks.drawing.landmark import check_buildable
@@ -14,19 +20,12 @@ from locatk.core.landmarks.drawing.plan import draw_plan
 from locatk.core.landmarks.drawing.templates import PlacedTemplate, draw_templates
 from locatk.core.landmarks.drawing.texts import bill_pages, checklist_pages, marking_list_pages
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.paper_sizes import PAPER_SIZES_MM
 
 PACK_PARTS = ("plan", "templates", "materials", "checklist", "list")
 """Parts of a pack, in the order of their pages."""
 
 MAX_PAGES = 500
 """Largest number of pages of a pack."""
-
-TEXT_PAPER_MM = PAPER_SIZES_MM["A4"]
-"""Paper for the pages of text of a pack on large paper."""
-
-MAX_TEXT_PAPER_MM2 = 1.001 * PAPER_SIZES_MM["A3"][0] * PAPER_SIZES_MM["A3"][1]
-"""Largest area of a paper on which text is still printed."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +79,7 @@ def draw_installation_pack(
     check_buildable(floor)
     check_margin(paper_mm, margin_mm)
     title = printable(floor.name) or "Landmarks"
-    is_large = paper_mm[0] * paper_mm[1] > MAX_TEXT_PAPER_MM2
-    text_paper_mm = TEXT_PAPER_MM if is_large else paper_mm
+    text_paper_mm = text_paper(paper_mm)
     pages: list[UnnumberedPage] = []
     page_ranges: dict[str, tuple[int, int]] = {}
     templates: list[PlacedTemplate] = []

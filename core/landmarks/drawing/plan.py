@@ -14,13 +14,13 @@ from locatk.core.drawing import (
     Mark,
     Point,
     Text,
-    arrow,
     capital_height,
     line_height,
     rectangle,
     text_width,
 )
 from locatk.core.drawing.pages import SMALL_TEXT_POINTS, TEXT_POINTS, PageFrame, UnnumberedPage
+from locatk.core.drawing.scale import axes, round_scale
 from locatk.core.drawing.tiles import tile_name
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.landmark import draw_hole, draw_symbol, north_mark
@@ -39,9 +39,6 @@ MIN_LABELLED_CELL_MM = 20.0
 
 AXIS_SPACE_MM = 7.0
 """Space for the arrows of the axes at the left of and below the numbers."""
-
-SCALE_STEPS = (1, 1.25, 1.5, 2, 2.5, 3, 3.5, 4, 4.5, 5, 6, 7, 7.5, 8, 9, 10)
-"""Leading digits of the denominators of scales."""
 
 _KEY = (
     "Bars point to their north poles. Filled bars are N (counter-clockwise), hollow bars are S. "
@@ -122,13 +119,6 @@ def draw_plan(
         plan = _BlockDrawing.in_box(floor, cell_mm, block, block_frame.content_box)
         pages.append(UnnumberedPage(block_frame, (Group("plan", tuple(plan.marks())),)))
     return pages
-
-
-def round_scale(min_scale: float) -> float:
-    """Return the smallest round n for a scale 1 : n that is at least ``min_scale``."""
-    power = 10.0 ** math.floor(math.log10(min_scale) + 1e-9)
-    scales = (step * power for step in SCALE_STEPS)
-    return round(next(scale for scale in scales if scale >= min_scale * (1 - 1e-9)), 6)
 
 
 def _lay_out_plan(
@@ -271,12 +261,7 @@ class _BlockDrawing:
         length = min(25.0, max(10.0, top - bottom))
         # On a low floor the long label would extend into the page's title.
         label = "+y, rows, mm" if top - y > length + 25.0 else "+y"
-        return [
-            *arrow((x, y), (x + length, y), 2.5, 0.3),
-            Text("+x, columns, mm", (x + length + 1.0, y - 0.8), TEXT_POINTS),
-            *arrow((x, y), (x, y + length), 2.5, 0.3),
-            Text(label, (x + 0.8, y + length + 1.0), TEXT_POINTS, angle_deg=90),
-        ]
+        return axes((x, y), length, "+x, columns, mm", label)
 
     def _cell(self, cell: Cell) -> list[Mark]:
         centre, half = self._centre(cell), 0.5 * self.cell_mm

@@ -261,7 +261,7 @@ def place_tags(tags: Tags, points: Sequence[SitePoint], min_distance: int = 1) -
         if tags.ids is not None and point.tag_id not in tags.ids:
             raise InputError(
                 f"{point.name}: id {point.tag_id} is not in the family",
-                hint="Leave the column out to get ids of the family, which has "
+                hint="Leave the ids out to get those of the family, which has "
                 + ", ".join(map(str, tags.ids[:MAX_NAMED_IDS]))
                 + (" and others" if len(tags.ids) > MAX_NAMED_IDS else ""),
             )

@@ -141,7 +141,9 @@ class _TagDrawing:
             Text("y", y_label, AXIS_LABEL_POINTS, "middle"),
         ]
 
-    def _arrow(self, start: Point, tip: Point, head_mm: float, width_mm: float) -> list[Mark]:
+    def _arrow(
+        self, start: Point, tip: Point, head_mm: float, width_mm: float
+    ) -> list[Line | Polygon]:
         return arrow(self._on_page(*start), self._on_page(*tip), head_mm, width_mm)
 
     def _magnet(self, cell: Cell, symbol: int) -> list[Mark]:

@@ -14,7 +14,14 @@ import pytest
 
 from locatk.cli.app import app
 from locatk.core.landmarks.landmark import Geometry, signs
-from locatk.core.landmarks.map.floor import ALPHABETS, HOLE_CODE, WINDOWS, AsBuiltLandmark, FloorMap
+from locatk.core.landmarks.map.floor import (
+    ALPHABETS,
+    HOLE_CODE,
+    WINDOWS,
+    AsBuiltLandmark,
+    FloorMap,
+    as_built_poses,
+)
 from locatk.formats.artifacts.maps import dumps_map, read_map, write_map
 
 FLOOR = FloorMap(
@@ -223,3 +230,52 @@ def test_a_large_floor(locatk, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_map(back).codes, codes)
     document = ezdxf.readfile(tmp_path / "m.dxf")
     assert len(document.modelspace().query("INSERT")) == 400
+
+
+def test_import_of_a_drawing(locatk, map_file: Path, tmp_path: Path) -> None:
+    plan, back = tmp_path / "plan.dxf", tmp_path / "back.toml"
+    assert locatk("map", "export", map_file, "-o", plan).exit_code == 0
+    result = locatk("map", "import", plan, "-o", back, "--like", map_file, "--pitch", 200)
+    assert result.exit_code == 0, result.stderr
+    assert f"Lengths in {plan} are in mm." in result.stderr
+    found = read_map(back)
+    np.testing.assert_array_equal(found.codes, FLOOR.codes)
+    np.testing.assert_allclose(as_built_poses(found), as_built_poses(FLOOR), atol=1e-6)
+    assert found.walls == frozenset()
+    # The labels of the export, at the centres.
+    layers = ("--layer", "CENTRES", "--layer", "LABELS")
+    args = ("-o", back, "--overwrite", "--pitch", 200)
+    assert locatk("map", "import", plan, *args, *layers).exit_code == 0
+    np.testing.assert_array_equal(read_map(back).codes, FLOOR.codes)
+    for more, status, words in (
+        (("--layer", "CENTRES"), 1, "a landmark without the letters of its bars"),
+        (("--layer", "NONE"), 1, "nothing is on layer 'NONE'"),
+        (("--units", "yd"), 2, "yd"),
+    ):
+        refused = locatk("map", "import", plan, *args, *more)
+        assert refused.exit_code == status
+        assert words in refused.stderr
+    table = tmp_path / "m.csv"
+    table.write_text("0;7;0;0\n1;1;200;0\n")
+    for option in ("--layer", "--units"):
+        refused = locatk("map", "import", table, *args, option, "m")
+        assert refused.exit_code == 2
+        assert "is of --format dxf, not of csv" in refused.stderr
+
+
+def test_import_of_a_drawing_by_another_program(locatk, tmp_path: Path) -> None:
+    """Blocks in inches, with an attribute, and one as built 2 mm off its cell."""
+    document = ezdxf.new("R2000")
+    document.header["$INSUNITS"] = 1
+    document.blocks.new("LM").add_attdef("LANDMARK", (0, 0))
+    for x, y, letters in ((0, 0, "NNNS"), (200, 0, "nsns"), (0, 200, "SSSS"), (202, 200, "NNNN")):
+        place = (x / 25.4, y / 25.4)
+        insert = document.modelspace().add_blockref("LM", place, {"layer": "Magnets"})
+        insert.add_auto_attribs({"LANDMARK": letters})
+    plan, back = tmp_path / "plan.dxf", tmp_path / "back.toml"
+    document.saveas(plan)
+    result = locatk("map", "import", plan, "-o", back, "--layer", "magnets", "--pitch", 200)
+    assert result.exit_code == 0, result.stderr
+    found = read_map(back)
+    np.testing.assert_array_equal(found.codes, [[0b0111, 0b0101], [0, 15]])
+    np.testing.assert_allclose(as_built_poses(found)[3], [0.202, 0.2, 0], atol=1e-6)

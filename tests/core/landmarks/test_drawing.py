@@ -10,6 +10,7 @@ import pytest
 from reportlab.pdfbase.pdfmetrics import stringWidth
 
 from locatk.core.drawing import Circle, Line, Mark, Polygon, Text
+from locatk.core.drawing.scale import round_scale
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.landmark import (
     bar_outlines,
@@ -20,7 +21,6 @@ from locatk.core.landmarks.drawing.landmark import (
     drawing_half_side,
 )
 from locatk.core.landmarks.drawing.legend import draw_legend, legend_height
-from locatk.core.landmarks.drawing.plan import round_scale
 from locatk.core.landmarks.drawing.templates import cells_by_code, cells_text
 from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, name, rotated

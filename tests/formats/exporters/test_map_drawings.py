@@ -21,8 +21,9 @@ from locatk.core.landmarks.field import landmark_field
 from locatk.core.landmarks.landmark import PATTERNS, signs
 from locatk.core.landmarks.map.floor import HOLE_CODE, AsBuiltLandmark, FloorMap
 from locatk.formats.artifacts.maps import write_map
-from locatk.formats.exporters import map_ros, map_svg
-from locatk.formats.exporters.map_dxf import dumps_dxf
+from locatk.formats.exporters import drawing_svg, map_ros
+from locatk.formats.exporters.drawing_dxf import dumps_dxf
+from locatk.formats.exporters.map_drawing import draw_map
 
 NONE = np.full(7, np.nan)
 
@@ -153,20 +154,20 @@ def groups(svg: bytes) -> dict[str, Xml.Element]:
     root = Xml.fromstring(svg)
     return {
         group.attrib["id"]: group
-        for group in root.iter(f"{{{map_svg.NAMESPACE}}}g")
+        for group in root.iter(f"{{{drawing_svg.NAMESPACE}}}g")
         if group.get("id")
     }
 
 
 def test_svg_has_true_size_and_layers() -> None:
-    svg = map_svg.dumps_svg(FLOOR)
-    assert svg == map_svg.dumps_svg(FLOOR)
+    svg = drawing_svg.dumps_svg(draw_map(FLOOR))
+    assert svg == drawing_svg.dumps_svg(draw_map(FLOOR))
     root = Xml.fromstring(svg)
     assert (root.get("width"), root.get("height")) == ("600mm", "400mm")
     assert root.get("viewBox") == "0 0 600 400"
     assert root.findtext("{*}title") == "Landmarks Hall <3>"
     found = groups(svg)
-    label = f"{{{map_svg.INKSCAPE}}}label"
+    label = f"{{{drawing_svg.INKSCAPE}}}label"
     assert {g.get(label) for g in found.values() if g.get(label)} == {
         *PATTERNS,
         "walls",
@@ -188,7 +189,7 @@ def test_svg_has_true_size_and_layers() -> None:
 
 def test_svg_bars_are_as_designed() -> None:
     """Bar 0 of NNNS is N: at the right, 25 mm from the centre, north upwards."""
-    group = groups(map_svg.dumps_svg(FLOOR))["r0c0"]
+    group = groups(drawing_svg.dumps_svg(draw_map(FLOOR)))["r0c0"]
     outlines, lines, _ = (path.get("d") for path in group.findall("{*}path"))
     centre = np.array([100.0, 300.0])  # half a pitch from the left, the lower row below
     bars = subpaths(outlines)
@@ -206,7 +207,7 @@ def test_svg_bars_are_as_designed() -> None:
 
 
 def test_svg_is_as_built() -> None:
-    group = groups(map_svg.dumps_svg(BUILT))["r0c1"]
+    group = groups(drawing_svg.dumps_svg(draw_map(BUILT)))["r0c1"]
     bar = subpaths(group.find("{*}path").get("d"))[0].mean(0)
     centre = np.array([300 + 4, 100 + 3])
     wanted = centre + 25 * np.array([math.cos(TURN), -math.sin(TURN)])
@@ -221,7 +222,7 @@ def read(text: str) -> ezdxf.document.Drawing:
 
 
 def test_dxf_is_valid_and_in_mm() -> None:
-    document = read(dumps_dxf(FLOOR))
+    document = read(dumps_dxf(draw_map(FLOOR)))
     assert not document.audit().has_errors
     assert document.units == ezdxf.units.MM
     assert {"BARS", "POLES", "CENTRES", "LABELS", "WALLS"} <= {
@@ -239,7 +240,7 @@ def test_dxf_is_valid_and_in_mm() -> None:
 
 
 def test_dxf_bars_are_as_built() -> None:
-    document = read(dumps_dxf(BUILT))
+    document = read(dumps_dxf(draw_map(BUILT)))
     (insert,) = document.modelspace().query("INSERT[name=='LANDMARK_NSSS']")
     bars = [e for e in insert.virtual_entities() if e.dxftype() == "LWPOLYLINE"]
     assert {bar.dxf.layer for bar in bars} == {"BARS"}
@@ -258,13 +259,14 @@ def test_dxf_bars_are_as_built() -> None:
 def test_dxf_is_the_same_in_every_process(tmp_path: Path) -> None:
     """Neither the time nor the order of hashes is in it, and ezdxf is left as it was."""
     assert ezdxf.options.write_fixed_meta_data_for_testing is False
-    text = dumps_dxf(FLOOR)
+    text = dumps_dxf(draw_map(FLOOR))
     assert ezdxf.options.write_fixed_meta_data_for_testing is False
     write_map(tmp_path / "map.toml", FLOOR)
     code = (
-        "import sys; from locatk.formats.exporters.map_dxf import dumps_dxf; "
+        "import sys; from locatk.formats.exporters.drawing_dxf import dumps_dxf; "
+        "from locatk.formats.exporters.map_drawing import draw_map; "
         "from locatk.formats.artifacts.maps import read_map; "
-        f"sys.stdout.write(dumps_dxf(read_map({str(tmp_path / 'map.toml')!r})))"
+        f"sys.stdout.write(dumps_dxf(draw_map(read_map({str(tmp_path / 'map.toml')!r}))))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],
