@@ -13,6 +13,7 @@ from typing import Literal
 
 from locatk.core.drawing.marks import (
     LINE_SPACING_EM,
+    MIN_TEXT_POINTS,
     RULER_DEPTH_MM,
     Box,
     Group,
@@ -33,11 +34,8 @@ from locatk.core.errors import InputError
 TITLE_POINTS = 10.0
 """Font size of titles."""
 
-TEXT_POINTS = 7.0
-"""Font size of notes and tables."""
-
-SMALL_TEXT_POINTS = 5.0
-"""Font size of labels within a drawing."""
+TEXT_POINTS = MIN_TEXT_POINTS
+"""Font size of notes, tables, and labels within a drawing."""
 
 FLOW_TEXT_POINTS = 9.0
 """Font size of flowing text, which is read at arm's length while working."""
