@@ -90,6 +90,12 @@ class Obstacles:
             _enters(self._strokes, box).any()
         )
 
+    def are_touched_by(self, mark: Mark) -> bool:
+        """Return True if a line is too near to a text of the drawing."""
+        strokes = np.array(_strokes(mark)).reshape(-1, 5)
+        strokes[:, 4] += TEXT_CLEARANCE_MM
+        return any(bool(_enters(strokes, box).any()) for box in self._boxes)
+
     def place(self, candidates: Iterable[Text]) -> list[Text]:
         """Add the first of the candidates that is free; return it in a list, or an empty list."""
         text = next(filter(self.is_free, candidates), None)

@@ -42,7 +42,7 @@ ARROW_HEAD_MM = 2.0
 
 CROSS_ARM_MM = 2.0
 
-LABEL_OFFSETS_MM = (0.8, 1.4, 2.4, 3.4)
+LABEL_OFFSETS_MM = (1.0, 1.6, 2.4, 3.4)
 """Distances of a label from the lines of its cross, in the order in which they are tried."""
 
 EDGE_MM = 8.0

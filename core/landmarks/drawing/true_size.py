@@ -24,6 +24,9 @@ from locatk.core.units import mm_text
 MAX_TILES = 500
 """Largest number of pages of a floor; more of them are hardly joined by hand."""
 
+EDGE_GAP_MM = 1.5
+"""Distance of labels from the border of a cell, on which a wall may be drawn."""
+
 MIN_MARGIN_MM = 7.0
 """Smallest margin that holds rulers, joining marks and texts."""
 
@@ -76,15 +79,12 @@ def draw_floor(
             f"{paper.name}; at most {MAX_TILES} are possible",
             hint="Use a larger paper, as in --paper roll:914mm, or the templates",
         )
-    return [
-        FloorPage(
-            grid.page_mm,
-            tile,
-            (*_draw_area(floor, tile.corner_mm, tile.box), *tile.seam_marks),
-            _margin_notes(floor, grid, tile),
-        )
-        for tile in grid.tiles()
-    ]
+    pages = []
+    for tile in grid.tiles():
+        area = _draw_area(floor, tile.corner_mm, tile.box)
+        notes = _margin_notes(floor, grid, tile)
+        pages.append(FloorPage(grid.page_mm, tile, (*area, *tile.seam_marks(area)), notes))
+    return pages
 
 
 def floor_extent(floor: FloorMap) -> Box:
@@ -147,7 +147,7 @@ def _draw_cell(floor: FloorMap, cell: Cell, centre: Point) -> list[Mark]:
         return [*draw_hole(centre, 10.0, 0.2), Text("no landmark", (x + 2, y + 12), TEXT_POINTS)]
     notes = (f"row {cell[0]}", f"column {cell[1]}", f"code {code_digit(code)}")
     return [
-        *draw_landmark(floor.geometry, code, centre, notes),
+        *draw_landmark(floor.geometry, code, centre, notes, 0.5e3 * floor.pitch_m - EDGE_GAP_MM),
         *north_mark((x + 3.0, y + 3.0), 5.0, "+y"),
     ]
 

@@ -46,10 +46,34 @@ def page_inks(data: bytes) -> Iterator[PageInk]:
     document = pypdfium2.PdfDocument(data)
     for page in document:
         text_page = page.get_textpage()
-        strokes: list[tuple[float, ...]] = []
+        strokes = [np.zeros((0, 5))]
         for item in page.get_objects(filter=(pdfium.FPDF_PAGEOBJ_PATH,)):
-            strokes += _strokes(item)
-        yield PageInk(tuple(_texts(text_page)), np.array(strokes).reshape(-1, 5) * MM_PER_POINT)
+            edges = np.array(list(_strokes(item))).reshape(-1, 5) * MM_PER_POINT
+            strokes.append(_clipped(edges, _clip(item.raw)))
+        yield PageInk(tuple(_texts(text_page)), np.concatenate(strokes))
+
+
+def _clip(item: object) -> Box:
+    """Return the box to which an object is clipped, in mm."""
+    box = (-math.inf, -math.inf, math.inf, math.inf)
+    clip = pdfium.FPDFPageObj_GetClipPath(item)
+    for path in range(max(0, pdfium.FPDFClipPath_CountPaths(clip))):
+        corners = []
+        for index in range(pdfium.FPDFClipPath_CountPathSegments(clip, path)):
+            x, y = ctypes.c_float(), ctypes.c_float()
+            segment = pdfium.FPDFClipPath_GetPathSegment(clip, path, index)
+            pdfium.FPDFPathSegment_GetPoint(segment, x, y)
+            corners.append((x.value * MM_PER_POINT, y.value * MM_PER_POINT))
+        (left, bottom), (right, top) = np.min(corners, axis=0), np.max(corners, axis=0)
+        box = _common((left, bottom, right, top), box)
+    return box
+
+
+def _common(first: Box, second: Box) -> Box:
+    """Return the common area of two boxes."""
+    low = [max(pair) for pair in zip(first[:2], second[:2], strict=True)]
+    high = [min(pair) for pair in zip(first[2:], second[2:], strict=True)]
+    return low[0], low[1], high[0], high[1]
 
 
 def _texts(text_page: pypdfium2.PdfTextPage) -> Iterator[PrintedText]:
@@ -72,7 +96,10 @@ def _texts(text_page: pypdfium2.PdfTextPage) -> Iterator[PrintedText]:
         assert pdfium.FPDFText_GetMatrix(text_page, inked[0], matrix)
         scale = math.sqrt(abs(matrix.a * matrix.d - matrix.b * matrix.c))
         points = pdfium.FPDFText_GetFontSize(text_page, inked[0]) * scale
-        yield PrintedText(text.strip(), points, (left, bottom, right, top))
+        item = pdfium.FPDFText_GetTextObject(text_page, inked[0])
+        box = _common((left, bottom, right, top), _clip(item))
+        if box[0] < box[2] and box[1] < box[3]:
+            yield PrintedText(text.strip(), points, box)
 
 
 def _strokes(item: pypdfium2.PdfObject) -> Iterator[tuple[float, ...]]:
@@ -118,16 +145,27 @@ def _chords(*corners: tuple[float, float]) -> list[tuple[float, float]]:
     return [(float(x), float(y)) for x, y in curve + t**3 * p[3]]
 
 
-def crossed_texts(ink: PageInk) -> list[str]:
-    """Return the texts whose box a stroke enters."""
-    return [text.text for text in ink.texts if _enters(ink.strokes, text.box).any()]
+def crossed_texts(ink: PageInk, clearance_mm: float = -TOUCH_MM) -> list[str]:
+    """Return the texts to which a stroke is nearer than this distance."""
+    return [
+        text.text
+        for text in ink.texts
+        if _entered(ink.strokes, text.box, ink.strokes[:, 4] + clearance_mm)[0].any()
+    ]
 
 
-def _enters(strokes: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
-    """Return which strokes enter a box (Liang and Barsky's clipping)."""
-    if not len(strokes):
-        return np.zeros(0, bool)
-    grow = strokes[:, 4] - TOUCH_MM
+def _clipped(strokes: NDArray[np.float64], box: Box) -> NDArray[np.float64]:
+    """Return the parts of strokes in a box."""
+    is_inside, low, high = _entered(strokes, box, np.zeros(len(strokes)))
+    start, step = strokes[:, :2], strokes[:, 2:4] - strokes[:, :2]
+    parts = [start + low[:, None] * step, start + high[:, None] * step, strokes[:, 4:]]
+    return np.concatenate(parts, axis=1)[is_inside]
+
+
+def _entered(
+    strokes: NDArray[np.float64], box: Box, grow: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Return which strokes enter a box that is grown, and between which fractions of them."""
     low, high = np.zeros(len(strokes)), np.ones(len(strokes))
     is_inside = np.ones(len(strokes), bool)
     for axis in (0, 1):
@@ -139,7 +177,7 @@ def _enters(strokes: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
         first, last = (lower - start) / safe, (upper - start) / safe
         low = np.maximum(low, np.where(is_parallel, 0.0, np.minimum(first, last)))
         high = np.minimum(high, np.where(is_parallel, 1.0, np.maximum(first, last)))
-    return is_inside & (low < high)
+    return is_inside & (low < high), low, high
 
 
 def overlapping_texts(ink: PageInk) -> list[tuple[str, str]]:
