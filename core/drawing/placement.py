@@ -96,6 +96,13 @@ class Obstacles:
         strokes[:, 4] += TEXT_CLEARANCE_MM
         return any(bool(_enters(strokes, box).any()) for box in self._boxes)
 
+    def interrupt(self, circle: Circle) -> list[Circle | Line]:
+        """Return a circle; if texts touch it, the chords of it that leave them free."""
+        if not self.are_touched_by(circle):
+            return [circle]
+        chords = [Line(stroke[:2], stroke[2:4], circle.width_mm) for stroke in _strokes(circle)]
+        return [chord for chord in chords if not self.are_touched_by(chord)]
+
     def place(self, candidates: Iterable[Text]) -> list[Text]:
         """Add the first of the candidates that is free; return it in a list, or an empty list."""
         text = next(filter(self.is_free, candidates), None)
@@ -134,7 +141,7 @@ def boxes_overlap(first: Box, second: Box) -> bool:
     )
 
 
-def _strokes(mark: Mark) -> list[tuple[float, ...]]:
+def _strokes(mark: Mark) -> list[tuple[float, float, float, float, float]]:
     """Return the straight strokes of a mark as (x0, y0, x1, y1, half width)."""
     if isinstance(mark, Text):
         return []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -250,13 +251,14 @@ class _BlockDrawing:
 
     def marks(self) -> list[Mark]:
         cells = [(row, column) for row in self.block.rows for column in self.block.columns]
+        content = [mark for cell in cells for mark in self._cell(cell)]
         return [
             *self._grid(),
             *self._numbers(),
             *self._axes(),
-            *(mark for cell in cells for mark in self._cell(cell)),
+            *content,
             *self._walls(),
-            *self._map_origin(),
+            *self._map_origin(content),
         ]
 
     def _point(self, row: float, column: float) -> Point:
@@ -366,8 +368,8 @@ class _BlockDrawing:
             marks.append(Line((x - v, y - u), (x + v, y + u), min(1.2, 0.1 * self.cell_mm)))
         return marks
 
-    def _map_origin(self) -> list[Mark]:
-        """Draw a circle at the origin of the map if it is on this page."""
+    def _map_origin(self, content: Sequence[Mark]) -> list[Mark]:
+        """Draw a circle at the origin of the map if it is on this page; texts interrupt it."""
         column, row = (-value / self.floor.pitch_m for value in self.floor.origin_m)
         block = self.block
         is_on_page = (
@@ -378,7 +380,8 @@ class _BlockDrawing:
             return []
         relative_radius = 0.33 if self.has_cell_texts else 0.42
         centre = self._point(row + 0.5, column + 0.5)
-        return [Circle(centre, relative_radius * self.cell_mm, 0.2)]
+        circle = Circle(centre, relative_radius * self.cell_mm, 0.2)
+        return [*Obstacles(mark for mark in content if isinstance(mark, Text)).interrupt(circle)]
 
 
 def _draw_overview(floor: FloorMap, layout: _PlanLayout, box: Box) -> list[Mark]:

@@ -1,17 +1,50 @@
-"""Texts and strokes of the pages of a PDF, as pdfium finds them, and their collisions."""
+"""Texts of printed packs: large enough, and touched by no line and no other text.
+
+Texts and strokes are those that pdfium finds in the PDF, not those of the drawing's model.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import io
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pypdfium2
 import pypdfium2.raw as pdfium
+import pytest
 from numpy.typing import NDArray
+from reportlab.pdfgen.canvas import Canvas
+
+from locatk.core.dots.drawing.layout import lay_out, manifest, snap
+from locatk.core.dots.drawing.test_sheet import printer_sheet
+from locatk.core.dots.drawing.tiles import tiling
+from locatk.core.drawing.sensor_layout import draw_sensor_layout
+from locatk.core.landmarks.drawing.pack import PACK_PARTS, draw_installation_pack
+from locatk.core.landmarks.drawing.true_size import draw_floor
+from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
+from locatk.core.paper_sizes import PAPER_SIZES_MM, paper_size, parse_paper
+from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.codec.families import generate_family
+from locatk.core.polaris.drawing.cards import draw_tag_cards
+from locatk.core.polaris.tag import Magnet, Tags
+from locatk.formats.printing import pattern
+from locatk.formats.printing.drawings import render_floor, render_pages
+
+MIN_POINTS = 7.0
+"""Smallest legible print; a newspaper's small advertisements have 6 to 7 points."""
+
+CLEARANCE_MM = 0.1
+"""Distance at which a line and a letter do not merge in toner: a pixel of 300 dpi is 0.085 mm."""
+
+PAPERS = ("A4", "Letter", "A3")
+
+SMALL_BARS = Geometry(bar_length_m=0.01, bar_width_m=0.003, radius_m=0.009)
+
 
 MM_PER_POINT = 25.4 / 72
 
@@ -193,3 +226,140 @@ def overlapping_texts(ink: PageInk) -> list[tuple[str, str]]:
         (ink.texts[a].text, ink.texts[b].text)
         for a, b in zip(first.tolist(), second.tolist(), strict=True)
     ]
+
+
+def check(data: bytes) -> list[str]:
+    """Assert that all pages are legible; return their texts."""
+    texts = []
+    for number, ink in enumerate(page_inks(data), 1):
+        small = [(text.text, text.points) for text in ink.texts if text.points < MIN_POINTS - 1e-3]
+        assert not small, f"page {number}"
+        assert not crossed_texts(ink, CLEARANCE_MM), f"page {number}"
+        assert not overlapping_texts(ink), f"page {number}"
+        texts += [text.text for text in ink.texts]
+    return texts
+
+
+def some_floor(rows: int, columns: int, pitch_m: float = 0.2, window: str = "L") -> FloorMap:
+    codes = np.random.default_rng(rows).integers(0, 16, (rows, columns))
+    codes[rows // 2, columns // 3] = HOLE_CODE
+    walls = frozenset({((0, 0), (0, 1)), ((0, 1), (1, 1))})
+    floor = FloorMap(codes, name="hall", pitch_m=pitch_m, window=window, walls=walls)
+    return replace(floor, origin_m=(-1.5, 0.25))
+
+
+@pytest.mark.parametrize("angle", [0, 90])
+def test_collisions_and_sizes_are_found(angle: int) -> None:
+    stream = io.BytesIO()
+    canvas = Canvas(stream, pagesize=(300, 300))
+    canvas.translate(150, 150)
+    canvas.rotate(angle)
+    canvas.scale(0.5, 0.5)
+    for y, text in ((0, "HALF"), (-100, "FREE"), (-200, "gone")):
+        canvas.setFont("Helvetica", 12)
+        canvas.drawString(0, y, text)
+    canvas.drawString(2, 3, "OVER")
+    canvas.line(-20, 4, 60, 4)
+    canvas.line(-20, -100 - 2, 60, -100 - 2)
+    canvas.circle(10, -195, 3)
+    canvas.save()
+    (ink,) = page_inks(stream.getvalue())
+    assert {text.text: text.points for text in ink.texts} == pytest.approx(
+        dict.fromkeys(("HALF", "FREE", "gone", "OVER"), 6.0)
+    )
+    assert sorted(crossed_texts(ink)) == ["HALF", "OVER", "gone"]
+    assert sorted(crossed_texts(ink, 0.5)) == ["FREE", "HALF", "OVER", "gone"]
+    assert [set(pair) for pair in overlapping_texts(ink)] == [{"HALF", "OVER"}]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", PAPERS)
+@pytest.mark.parametrize(
+    "floor",
+    [
+        some_floor(2, 2, pitch_m=0.07),
+        some_floor(7, 7),
+        some_floor(20, 24, pitch_m=0.25),
+        some_floor(30, 35, pitch_m=1.2, window="3x3"),
+        replace(some_floor(4, 5, pitch_m=0.05), geometry=SMALL_BARS),
+    ],
+    ids=lambda floor: "x".join(map(str, floor.shape)),
+)
+def test_installation_packs_are_legible(floor: FloorMap, paper: str) -> None:
+    # The templates and lists of all floors are alike; those of large ones take long to check.
+    parts = PACK_PARTS if floor.codes.size < 50 else ("plan", "materials")
+    pack = draw_installation_pack(floor, PAPER_SIZES_MM[paper], parts=parts)
+    texts = check(render_pages(pack.pages, "test"))
+    assert parts != PACK_PARTS or texts.count("[ ]") == len(floor.cells())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", ["A4", "Letter", "A3", "A0", "roll:914mm"])
+@pytest.mark.parametrize(
+    "floor",
+    [
+        some_floor(3, 4),
+        some_floor(3, 4, pitch_m=0.1),
+        some_floor(3, 3, pitch_m=0.061),
+        replace(some_floor(4, 5, pitch_m=0.05), geometry=SMALL_BARS),
+    ],
+    ids=("200mm", "100mm", "61mm", "small"),
+)
+def test_floors_are_legible(floor: FloorMap, paper: str) -> None:
+    texts = check(render_floor(draw_floor(floor, parse_paper(paper)), "test"))
+    if paper == "A4" and floor.pitch_m == 0.2:
+        assert "joins c2r1" in texts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", PAPERS)
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize(
+    ("tags", "counts"),
+    [
+        (Tags(), (1, 3, 50)),
+        (Tags(spacing_m=0.012, codec="polaris-released"), (3,)),
+        (Tags(order=2, magnets=3, spacing_m=0.016, magnet=Magnet(1e-3, 0.5e-3)), (3,)),
+        (Tags(order=5, magnets=13, orientations=20, spacing_m=0.008), (10,)),
+        (Tags(magnets=4, spacing_m=0.004, magnet=Magnet(1e-3, 0.5e-3)), (3,)),
+    ],
+    ids=("40mm", "12mm", "mini", "dense", "tiny"),
+)
+def test_tags_are_legible(tags: Tags, counts: tuple[int, ...], mirror: bool, paper: str) -> None:
+    for count in counts:
+        ids = generate_family(tags, count, 1)
+        requested = [(tag_id, layout_of(tags, tag_id)) for tag_id in ids]
+        drawn = draw_tag_cards(tags, requested, PAPER_SIZES_MM[paper], mirror=mirror)
+        texts = check(render_pages(drawn.pages, "test"))
+        assert sum(text.startswith("id ") for text in texts) == count
+        angles = " ".join(texts).count("\u00b0")
+        assert angles >= count * tags.magnets
+
+
+@pytest.mark.parametrize("paper", ["A4", "Letter"])
+@pytest.mark.parametrize(("rows", "columns", "pitch_mm"), [(1, 9, 20), (1, 16, 5), (6, 8, 3)])
+def test_sensor_layouts_are_legible(rows: int, columns: int, pitch_mm: int, paper: str) -> None:
+    x, y = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+    position_m = 1e-3 * pitch_mm * np.column_stack([x.ravel(), y.ravel()])
+    labels = [str(number) for number in range(rows * columns)]
+    pages = draw_sensor_layout(labels, position_m, PAPER_SIZES_MM[paper], title="Array")
+    assert set(labels) <= set(check(render_pages(pages, "test")))
+
+
+@pytest.mark.parametrize("paper", ["A4", "Letter"])
+@pytest.mark.parametrize("dpi", [300, 600, 1200])
+def test_test_sheets_are_legible(paper: str, dpi: int) -> None:
+    sheet = printer_sheet(paper, dpi)
+    texts = check(pattern.render_test_sheet(sheet))
+    assert {field.name for field in sheet.fields} <= set(texts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", PAPERS)
+@pytest.mark.parametrize("overlap_mm", [0.0, 12.0])
+def test_margins_of_patterns_are_legible(overlap_mm: float, paper: str) -> None:
+    layout = lay_out(paper_size(paper)[1], 7.0, snap(0.508, None, 300))
+    tiled = tiling(layout, (2, 2), overlap_mm)
+    sheets = tiled.sheets("sheet-1", (0, 0))
+    texts = check(pattern.render(manifest(layout.raster, sheets, "anoto"), crop=True))
+    assert {"x", "y"} <= set(texts)
