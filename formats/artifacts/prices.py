@@ -10,7 +10,7 @@ from locatk.core.materials import Price
 from locatk.core.polaris.design.materials import PARTS as TAG_PARTS
 from locatk.core.polaris.design.materials import PUBLISHED_PRICES
 from locatk.formats.artifacts.kinds import InvalidValueError, Number, Text, nearest_key_hint
-from locatk.formats.artifacts.schema import Artifact, Key, Table, Tables, Values, refuse_repeated
+from locatk.formats.artifacts.schema import Artifact, Key, Table, Tables, Values
 
 PARTS = (*TAG_PARTS, *LANDMARK_PARTS)
 """Parts that can have a price."""
@@ -32,7 +32,12 @@ def _item_of(values: Values) -> Values:
 
 def _prices_of(values: Values) -> Prices:
     items = values["parts"]
-    refuse_repeated((item["part"] for item in items), "parts", "part")
+    names = [item["part"] for item in items]
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            raise InvalidValueError(
+                f"{name!r} occurs twice", f"parts[{number}]", "Keep one of the two"
+            )
     prices = {
         item["part"]: Price(item["price"], item["currency"], item["date"], item["source"])
         for item in items

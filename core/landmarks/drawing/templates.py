@@ -148,7 +148,7 @@ def _available_mm(frame: PageFrame) -> Point:
 
 
 def _too_small(frame: PageFrame, min_half: float, paper_name: str) -> InputError:
-    side = 2 * min_half
+    side = float(math.ceil(2 * min_half))
     paper = larger_paper_text(frame.size_mm, (side, side), _available_mm(frame))
     return InputError(
         f"a template needs {side:.0f} x {side:.0f} mm and space for its texts, which paper "

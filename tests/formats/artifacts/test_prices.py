@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from locatk.core.errors import ArtifactError, InputError
@@ -28,7 +28,7 @@ def part(name: str, price: float, currency: str = "EUR", date: str = "2026-11-02
 
 
 def test_the_template_has_every_part_and_the_published_prices(tmp_path: Path) -> None:
-    floor = FloorMap([[1, 2], [3, 4]])  # type: ignore[arg-type]
+    floor = FloorMap(np.array([[1, 2], [3, 4]]))
     items = (*tag_bill(Tags(), 9, "MLX90393"), *floor_bill(floor))
     assert {priced_part(item) for item in items} == set(PARTS)
     text = prices_template()
@@ -83,9 +83,7 @@ def test_a_file_of_prices_replaces_all_published_ones(tmp_path: Path) -> None:
         (part("glue", float("nan")), "finite"),
     ],
 )
-def test_wrong_prices_are_one_line_with_a_hint(
-    locatk: Callable[..., object], tmp_path: Path, text: str, problem: str
-) -> None:
+def test_wrong_prices_are_one_line_with_a_hint(tmp_path: Path, text: str, problem: str) -> None:
     path = tmp_path / "prices.toml"
     path.write_text(HEAD + text)
     with pytest.raises(ArtifactError, match=problem) as caught:
