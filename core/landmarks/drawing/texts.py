@@ -44,10 +44,10 @@ def bill_pages(
         if item.price is not None:
             prices = (f"{item.price.amount:g}", f"{item.amount:.2f}")
             origin = f" (price: {item.price.source}, {item.price.date})"
-        row = (item.part, str(item.count), *prices, printable(item.detail + origin))
-        flow.add_row(row, BILL_COLUMNS_MM)
+        cells = (item.part, str(item.count), *prices, printable(item.detail + origin))
+        flow.add_row(cells, BILL_COLUMNS_MM)
     flow.add_space(2.0)
-    flow.add_paragraph(f"{total.text[0].upper()}{total.text[1:]}.", bold=True)
+    flow.add_paragraph(printable(f"{total.text[0].upper()}{total.text[1:]}."), bold=True)
     flow.add_space(8.0)
     flow.add_paragraph("Landmarks by pattern", points=TITLE_POINTS, bold=True)
     flow.add_space(2.0)
