@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from locatk.core.errors import InputError
 
@@ -31,6 +32,26 @@ MAX_REMANENCE_T = 2.0
 
 
 @dataclass(frozen=True)
+class Price:
+    """Price of one piece of a part.
+
+    Attributes
+    ----------
+    amount : float
+    currency : str
+        Code of ISO 4217, as in ``"USD"``.
+    date : str
+        Day, month or year of the price, as in ``"2024-11"``.
+    source : str
+    """
+
+    amount: float
+    currency: str
+    date: str
+    source: str
+
+
+@dataclass(frozen=True)
 class BillItem:
     """Item of a bill of materials.
 
@@ -40,17 +61,71 @@ class BillItem:
     count : int
     detail : str
         Description for buying it.
-    price_usd : float or None
-        Upper limit of the price of one piece, if the paper gives one.
-    source : str
-        Source of the price.
+    price : Price or None
+        Price of one piece, if it is known.
     """
 
     part: str
     count: int
     detail: str
-    price_usd: float | None = None
-    source: str = ""
+    price: Price | None = None
+
+    @property
+    def amount(self) -> float | None:
+        """Price of all pieces."""
+        return None if self.price is None else round(self.count * self.price.amount, 4)
+
+
+@dataclass(frozen=True)
+class BillTotal:
+    """Sum of the items of a bill that have a price, and the parts without one."""
+
+    amount: float
+    currency: str
+    parts_without_price: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """The total in words, as in ``"total 3.75 USD, incomplete: no price of glue"``."""
+        if not self.currency:
+            return "no total, no part has a price"
+        total = f"total {self.amount:.2f} {self.currency}"
+        if not self.parts_without_price:
+            return total
+        return f"{total}, incomplete: no price of {', '.join(self.parts_without_price)}"
+
+
+def total_of(items: Sequence[BillItem]) -> BillTotal:
+    """Add the prices of a bill.
+
+    Raises
+    ------
+    InputError
+        The prices are in several currencies.
+    """
+    prices = [item.price for item in items if item.price is not None]
+    currencies = sorted({price.currency for price in prices})
+    if len(currencies) > 1:
+        raise InputError(
+            f"prices in {' and '.join(currencies)}", hint="Convert all prices to one currency"
+        )
+    amount = sum(item.amount or 0.0 for item in items)
+    missing = dict.fromkeys(priced_part(item) for item in items if item.price is None)
+    return BillTotal(round(amount, 4), "".join(currencies), tuple(missing))
+
+
+def priced_part(item: BillItem) -> str:
+    """Return the part whose price an item has: that of ``"bar magnet, spare"`` is a bar magnet."""
+    return item.part.split(",")[0]
+
+
+def with_prices(
+    items: Sequence[BillItem], prices: Mapping[str, Price] | None
+) -> tuple[BillItem, ...]:
+    """Return items with the prices of their parts; None keeps the published prices."""
+    if prices is None:
+        return tuple(items)
+    return tuple(replace(item, price=prices.get(priced_part(item))) for item in items)
 
 
 def remanence_of_grade(grade: str) -> float:

@@ -10,6 +10,7 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
+from locatk.cli.price_options import price_options
 
 DEFAULT_OVERLAP_MM = 10.0
 
@@ -49,6 +50,7 @@ DEFAULT_OVERLAP_MM = 10.0
         endings=(".csv",),
         help="Also write the bill of materials (.csv).",
     ),
+    price_options,
 )
 @section(
     "Paper",
@@ -91,6 +93,7 @@ def landmarks(
     overlap_mm: float | None,
     spares_percent: float,
     bom: Path | None,
+    prices: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -108,12 +111,16 @@ def landmarks(
       locatk print landmarks map.toml -o floor.pdf --floor --paper A0
       locatk print landmarks map.toml -o floor.pdf --floor --paper roll:914mm
       locatk print landmarks map.toml -o pack.pdf --spares 10 --bom parts.csv
+      locatk print landmarks --print-prices > prices.toml
+      locatk print landmarks map.toml -o pack.pdf --prices prices.toml
     """
     from locatk.core.errors import OutputExistsError, error_context
     from locatk.core.landmarks.design.materials import bill_of_materials
+    from locatk.core.materials import with_prices
     from locatk.core.paper_sizes import parse_paper
     from locatk.formats.artifacts.maps import read_map
-    from locatk.formats.exporters.bill_of_materials import write_bill
+    from locatk.formats.artifacts.prices import read_prices
+    from locatk.formats.exporters.bill_of_materials import bill_rows, total_entry, write_bill
     from locatk.formats.output import atomic_write
 
     if templates_only and whole_floor:
@@ -129,13 +136,13 @@ def landmarks(
         if os.path.realpath(bom) == os.path.realpath(output):
             raise OutputExistsError("drawing and materials would be one file", file=bom)
     floor = read_map(map_file)
-    items = bill_of_materials(floor, spares_percent)
+    items = with_prices(bill_of_materials(floor, spares_percent), read_prices(prices))
     with error_context(map_file):
         if whole_floor:
             overlap_mm = DEFAULT_OVERLAP_MM if overlap_mm is None else overlap_mm
             data, entry = _draw_floor(floor, paper, margin_mm, overlap_mm)
         else:
-            data, entry = _draw_pack(floor, paper, margin_mm, spares_percent, templates_only)
+            data, entry = _draw_pack(floor, paper, margin_mm, items, templates_only)
     with atomic_write(output, overwrite=overwrite) as stream:
         stream.write(data)
     if bom is not None:
@@ -149,17 +156,15 @@ def landmarks(
                 "output": output,
                 "bom": bom,
                 "landmarks": len(floor.cells()),
-                "materials": [
-                    {"part": item.part, "count": item.count, "detail": item.detail}
-                    for item in items
-                ],
+                "materials": bill_rows(items),
+                "materials_total": total_entry(items),
                 **entry,
             }
         )
 
 
 def _draw_pack(
-    floor: Any, paper: Any, margin_mm: float, spares_percent: float, templates_only: bool
+    floor: Any, paper: Any, margin_mm: float, items: Any, templates_only: bool
 ) -> tuple[bytes, dict[str, Any]]:
     """Return the PDF of the pack, and its entries for ``--json`` (docs/formats.md)."""
     from locatk.core.landmarks.drawing.landmark import code_digit
@@ -173,7 +178,7 @@ def _draw_pack(
         parts=("templates",) if templates_only else PACK_PARTS,
         paper_name=paper.name,
         margin_mm=margin_mm,
-        spares_percent=spares_percent,
+        items=items,
     )
     with console.steps(len(pack.pages), "Drawing") as done:
         data = render_pages(pack.pages, _title(floor), done=done)
@@ -233,6 +238,8 @@ def _text(
     entry: dict[str, Any],
 ) -> str:
     """Format the summary of the drawing."""
+    from locatk.core.materials import total_of
+
     width, height = entry["page_mm"]
     pages = entry["pages"]
     files = f"{output} and {bom}" if bom is not None else str(output)
@@ -240,6 +247,7 @@ def _text(
     lines = [
         f"Wrote {files}: {pages} page{'s' * (pages != 1)} of {width:g} x {height:g} mm",
         f"{len(floor.cells())} landmarks, {bars} bars with spares",
+        f"Materials: {total_of(items).text}",
     ]
     for part, (first, last) in entry.get("parts", {}).items():
         where = f"page {first}" if first == last else f"pages {first} to {last}"

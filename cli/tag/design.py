@@ -11,6 +11,7 @@ import click
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
 from locatk.cli.options import number
+from locatk.cli.price_options import price_options
 from locatk.cli.tag.design_text import report_evaluation
 from locatk.cli.tag.options import LENGTH_MM, code_options, reading_conditions, reading_options
 from locatk.core.errors import OutputExistsError
@@ -27,6 +28,7 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
 @options.output_option(
     "--bom", endings=(".csv",), metavar="FILE", help="Also write the bill of materials (.csv)."
 )
+@price_options
 @code_options
 @section(
     "Family",
@@ -112,6 +114,7 @@ def command(
     count: int | None,
     min_distance: int,
     bom: Path | None,
+    prices: Path | None,
     overwrite: bool,
     as_json: bool,
     **conditions: Any,
@@ -126,12 +129,15 @@ def command(
     Examples:
       locatk tag design -o tag.toml
       locatk tag design -o tag.toml --count 50 --min-distance 3 --bom parts.csv
+      locatk tag design --print-prices > prices.toml
       locatk tag design -o mini.toml --order 2 --magnets 3 --clearance 4
       locatk tag design -o tag.toml --spacing 16 --osr 2 --rate 100 --speed 0.3
     """
+    from locatk.core.materials import with_prices
     from locatk.core.polaris.codec import families
     from locatk.core.polaris.design.planning import compact_spacing, evaluate_design
     from locatk.core.polaris.tag import Tags
+    from locatk.formats.artifacts.prices import read_prices
     from locatk.formats.artifacts.tags import write_tags
     from locatk.formats.exporters.bill_of_materials import write_bill
 
@@ -145,6 +151,7 @@ def command(
         if bom.resolve() == output.resolve():
             raise OutputExistsError("tags and bill of materials would be one file", file=bom)
 
+    part_prices = read_prices(prices)
     magnet = _magnet(diameter, height, grade, remanence)
     tags = Tags(
         order=order,
@@ -171,6 +178,7 @@ def command(
         report = evaluate_design(
             tags, reading_conditions(**conditions), count=len(tags.ids or (0,))
         )
+    report = replace(report, materials=with_prices(report.materials, part_prices))
     write_tags(output, tags, overwrite=overwrite)
     if bom is not None:
         write_bill(bom, report.materials, overwrite=overwrite)

@@ -20,7 +20,7 @@ MAX_ID_LIST_CHARACTERS = 36
 """Longest list of the ids of a family."""
 
 
-MAX_DETAIL_CHARACTERS = 44
+MAX_DETAIL_CHARACTERS = 36
 """Longest line of the detail of a material."""
 
 
@@ -54,10 +54,9 @@ def text(report: DesignReport) -> str:
                     _accuracy("tag, each step free", report.free_speed, True),
                 ),
             ),
-            console.table(("material", "count", "", "USD each"), list(_materials(report))),
+            _materials_text(report),
             "Accuracies are bounds by noise alone: errors of the published recordings are at\n"
-            "most 2 times as large in angle, and 10 times in position. Prices: Polaris,\n"
-            "sections 7.1 and 7.2.",
+            "most 2 times as large in angle, and 10 times in position.",
         )
     )
 
@@ -68,12 +67,15 @@ def entry(report: DesignReport) -> dict[str, Any]:
     tags = result.pop("tags")
     del tags["built"], tags["site"], tags["notes"]
     use = result.pop("use")
-    warnings, notes, materials = (result.pop(key) for key in ("warnings", "notes", "materials"))
+    warnings, notes, _ = (result.pop(key) for key in ("warnings", "notes", "materials"))
+    from locatk.formats.exporters.bill_of_materials import bill_rows, total_entry
+
     return {
         "tag": tags,
         "use": use,
         "plan": result,
-        "materials": materials,
+        "materials": bill_rows(report.materials),
+        "materials_total": total_entry(report.materials),
         "warnings": warnings,
         "notes": notes,
     }
@@ -182,13 +184,36 @@ def _limits(report: DesignReport) -> list[tuple[str, str, str, str]]:
     ]
 
 
+def _materials_text(report: DesignReport) -> str:
+    """Format the bill of materials, its total, and the sources of its prices."""
+    from locatk.core.materials import total_of
+
+    total = total_of(report.materials)
+    head = ("material", "count", "", "each", f"sum {total.currency}".strip())
+    sources = {
+        f"{item.part}: {item.price.source}, {item.price.date}"
+        for item in report.materials
+        if item.price is not None
+    }
+    lines = [f"{total.text[0].upper()}{total.text[1:]}.", *sorted(sources)]
+    return "\n".join([console.table(head, list(_materials(report))), "", *_wrapped(lines)])
+
+
+def _wrapped(lines: list[str]) -> Iterator[str]:
+    for line in lines:
+        yield from textwrap.wrap(line, console.TEXT_COLUMNS)
+
+
 def _materials(report: DesignReport) -> Iterator[tuple[object, ...]]:
     """Yield the rows of the bill of materials; long details take several rows."""
     for item in report.materials:
         first, *more = textwrap.wrap(item.detail, MAX_DETAIL_CHARACTERS) or [""]
-        yield item.part, item.count, first, item.price_usd and f"< {item.price_usd:g}"
+        prices = ("", "")
+        if item.price is not None:
+            prices = (f"{item.price.amount:g}", f"{item.amount:.2f}")
+        yield item.part, item.count, first, *prices
         for line in more:
-            yield "", "", line, ""
+            yield "", "", line, "", ""
 
 
 def _accuracy(name: str, bound: AccuracyBound, pose: bool) -> tuple[str, ...]:

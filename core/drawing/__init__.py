@@ -1,8 +1,9 @@
 """Drawings at true size: marks, pages of a pack, cards and tiles, independent of the file format.
 
 ``marks`` holds what is drawn (lines, circles, polygons, text, rulers, cut marks), ``pages`` the
-frame of a page with flowing text and tables, ``cards`` the arrangement of equal cards on pages,
-``tiles`` the division of a large drawing over several papers, and ``scale`` the scales of plans.
+frame of a page with flowing text and tables, ``placement`` the search for free space of a text,
+``cards`` the arrangement of equal cards on pages, ``tiles`` the division of a large drawing over
+several papers, and ``scale`` the scales of plans.
 """
 
 from locatk.core.drawing.marks import (
@@ -10,6 +11,7 @@ from locatk.core.drawing.marks import (
     CUT_MARK_MM,
     LINE_SPACING_EM,
     LINE_WIDTH_MM,
+    MIN_TEXT_POINTS,
     MM_PER_POINT,
     RULER_DEPTH_MM,
     TRUE_SIZE_INSTRUCTION,
@@ -31,6 +33,7 @@ from locatk.core.drawing.marks import (
     paragraph,
     rectangle,
     ruler,
+    shifted,
     text_width,
     wrap,
 )
@@ -40,6 +43,7 @@ __all__ = [
     "CUT_MARK_MM",
     "LINE_SPACING_EM",
     "LINE_WIDTH_MM",
+    "MIN_TEXT_POINTS",
     "MM_PER_POINT",
     "RULER_DEPTH_MM",
     "TRUE_SIZE_INSTRUCTION",
@@ -61,6 +65,7 @@ __all__ = [
     "paragraph",
     "rectangle",
     "ruler",
+    "shifted",
     "text_width",
     "wrap",
 ]

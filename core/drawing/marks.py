@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 Point: TypeAlias = tuple[float, float]
@@ -32,7 +32,10 @@ sans-serif font."""
 LINE_SPACING_EM = 1.3
 """Distance between the baselines of two lines of text, as a fraction of the font size."""
 
-RULER_FONT_POINTS = 5.0
+MIN_TEXT_POINTS = 7.0
+"""Smallest font size of printed texts, which is legible at arm's length."""
+
+RULER_FONT_POINTS = MIN_TEXT_POINTS
 """Font size of the numbers of a ruler."""
 
 RULER_BASELINE_MM = 2.6
@@ -177,6 +180,21 @@ def cross(centre: Point, arm_mm: float, width_mm: float = LINE_WIDTH_MM) -> list
         Line((x - arm_mm, y), (x + arm_mm, y), width_mm),
         Line((x, y - arm_mm), (x, y + arm_mm), width_mm),
     ]
+
+
+def shifted(mark: Mark, dx: float, dy: float) -> Mark:
+    """Return a mark at another position."""
+
+    def moved(point: Point) -> Point:
+        return point[0] + dx, point[1] + dy
+
+    if isinstance(mark, Line):
+        return replace(mark, start=moved(mark.start), end=moved(mark.end))
+    if isinstance(mark, Circle):
+        return replace(mark, centre=moved(mark.centre))
+    if isinstance(mark, Polygon):
+        return replace(mark, corners=tuple(map(moved, mark.corners)))
+    return replace(mark, position=moved(mark.position))
 
 
 def rectangle(box: Box, width_mm: float = LINE_WIDTH_MM) -> Polygon:

@@ -13,6 +13,7 @@ from typing import Literal
 
 from locatk.core.drawing.marks import (
     LINE_SPACING_EM,
+    MIN_TEXT_POINTS,
     RULER_DEPTH_MM,
     Box,
     Group,
@@ -34,11 +35,8 @@ from locatk.core.paper_sizes import PAPER_SIZES_MM
 TITLE_POINTS = 10.0
 """Font size of titles."""
 
-TEXT_POINTS = 7.0
-"""Font size of notes and tables."""
-
-SMALL_TEXT_POINTS = 5.0
-"""Font size of labels within a drawing."""
+TEXT_POINTS = MIN_TEXT_POINTS
+"""Font size of notes, tables, and labels within a drawing."""
 
 FLOW_TEXT_POINTS = 9.0
 """Font size of flowing text, which is read at arm's length while working."""
@@ -54,6 +52,15 @@ MIN_CONTENT_MM = 20.0
 
 MAX_TEXT_PAPER_MM2 = 1.001 * PAPER_SIZES_MM["A3"][0] * PAPER_SIZES_MM["A3"][1]
 """Largest area of a paper on which text is still printed."""
+
+GROUP_ROWS = 5
+"""Number of rows of a table between two thin lines."""
+
+GROUP_GAP_LINES = 0.4
+"""Additional space between two groups of rows, which contains the thin line, in lines."""
+
+DESCENDER_LINES = 0.25
+"""Space for descenders below a row of a table, in lines."""
 
 TICK_BOX_INDENT_MM = 8.0
 """Indentation of a paragraph with a box to tick."""
@@ -291,7 +298,10 @@ def table_pages(
     left, bottom, right, top = frame.content_box
     width = sum(column.width_mm for column in columns)
     blocks_per_page = max(1, int((right - left + gap_mm) // (width + gap_mm)))
-    rows_per_block = max(1, int((top - bottom) / line_height(points) - 1.5))
+    # The head takes 1.5 lines.
+    lines = (top - bottom) / line_height(points) - 1.5
+    groups, rest = divmod(lines, GROUP_ROWS + GROUP_GAP_LINES)
+    rows_per_block = max(1, int(groups) * GROUP_ROWS + min(GROUP_ROWS, int(rest)))
     rows_per_page = blocks_per_page * rows_per_block
     pages = []
     for page_start in range(0, max(1, len(rows)), rows_per_page):
@@ -314,7 +324,8 @@ def _draw_table_block(
     head_line = corner[1] - 1.15 * step
     marks: list[Mark] = [Line((left, head_line), (right, head_line), 0.2)]
     for number, row in enumerate([[column.head for column in columns], *rows]):
-        baseline = head_line + 0.35 * step if number == 0 else head_line - (number - 0.1) * step
+        gap = (number - 1) // GROUP_ROWS * GROUP_GAP_LINES
+        baseline = head_line - (number + gap - 0.1) * step if number else head_line + 0.35 * step
         x = left
         for text, column in zip(row, columns, strict=True):
             position = (x + column.width_mm - 1.0, baseline)
@@ -323,8 +334,8 @@ def _draw_table_block(
                 position, anchor = (x, baseline), "start"
             marks.append(Text(text, position, points, anchor, bold=number == 0))
             x += column.width_mm
-        # A thin line after every fifth row guides the eye.
-        if number and number % 5 == 0 and number < len(rows):
-            y = baseline - 0.3 * step
+        # A thin line in the gap after each group guides the eye.
+        if number and number % GROUP_ROWS == 0 and number < len(rows):
+            y = baseline - (DESCENDER_LINES + GROUP_GAP_LINES / 2) * step
             marks.append(Line((left, y), (right, y), 0.05))
     return marks

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,7 @@ from locatk.core.drawing.marks import (
     Point,
     Text,
     arrow,
+    capital_height,
     cross,
 )
 from locatk.core.drawing.pages import (
@@ -30,6 +32,7 @@ from locatk.core.drawing.pages import (
     size_text,
     table_pages,
 )
+from locatk.core.drawing.placement import Obstacles
 from locatk.core.errors import InputError
 
 AXIS_MM = 10.0
@@ -39,8 +42,8 @@ ARROW_HEAD_MM = 2.0
 
 CROSS_ARM_MM = 2.0
 
-LABEL_OFFSET_MM = 0.8
-"""Distance of a label from the lines of its cross."""
+LABEL_OFFSETS_MM = (1.0, 1.6, 2.4, 3.4)
+"""Distances of a label from the lines of its cross, in the order in which they are tried."""
 
 EDGE_MM = 8.0
 """Free space around the outermost sensors, for their labels."""
@@ -112,24 +115,36 @@ def _place(
 def _draw_plan(
     labels: Sequence[str], on_page: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> list[Mark]:
-    """Draw the axes at ``origin``, and a cross with a label for each sensor."""
+    """Draw the axes at ``origin``, and a cross with a label for each sensor.
+
+    Labels without space between the crosses are left out; the table has them.
+    """
     x0, y0 = float(origin[0]), float(origin[1])
+    shared: dict[tuple[float, float], list[str]] = {}
+    for label, (x, y) in zip(labels, np.round(on_page + origin, 6).tolist(), strict=True):
+        shared.setdefault((x, y), []).append(label)
     marks: list[Mark] = [
         Circle((x0, y0), 0.6),
         *arrow((x0, y0), (x0, y0 + AXIS_MM), ARROW_HEAD_MM),
         *arrow((x0, y0), (x0 - AXIS_MM, y0), ARROW_HEAD_MM),
-        Text("x", (x0 + 1.0, y0 + AXIS_MM - 1.5), TEXT_POINTS, bold=True),
-        Text("y", (x0 - AXIS_MM, y0 + 1.0), TEXT_POINTS, bold=True),
+        *(mark for point in shared for mark in cross(point, CROSS_ARM_MM)),
     ]
-    shared: dict[tuple[float, float], list[str]] = {}
-    for label, (x, y) in zip(labels, np.round(on_page + origin, 6).tolist(), strict=True):
-        shared.setdefault((x, y), []).append(label)
-    for (x, y), names in shared.items():
-        marks += cross((x, y), CROSS_ARM_MM)
-        text = printable(", ".join(names))
-        corner = (x + LABEL_OFFSET_MM, y + LABEL_OFFSET_MM)
-        marks.append(Text(text, corner, TEXT_POINTS))
-    return marks
+    obstacles = Obstacles(marks)
+    texts: list[Text] = []
+    for point, names in shared.items():
+        texts += obstacles.place(_labels_near(printable(", ".join(names)), point))
+    for name, tip in (("x", (x0, y0 + AXIS_MM)), ("y", (x0 - AXIS_MM, y0))):
+        texts += obstacles.place(_labels_near(name, tip, bold=True))
+    return [*marks, *texts]
+
+
+def _labels_near(text: str, point: Point, *, bold: bool = False) -> Iterator[Text]:
+    """Yield a text at the right and left of a point, above and below it, nearest first."""
+    height = capital_height(TEXT_POINTS)
+    for dx, dy in itertools.product(LABEL_OFFSETS_MM, repeat=2):
+        for rise in (dy, -dy - height):
+            yield Text(text, (point[0] + dx, point[1] + rise), TEXT_POINTS, bold=bold)
+            yield Text(text, (point[0] - dx, point[1] + rise), TEXT_POINTS, "end", bold=bold)
 
 
 def _table(

@@ -6,12 +6,20 @@ Neighbouring tiles overlap and are cut along a seam in the middle of the overlap
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from locatk.core.drawing.marks import Box, Line, Mark, Point, Text
 from locatk.core.drawing.pages import TEXT_POINTS
+from locatk.core.drawing.placement import Obstacles, interrupt
 from locatk.core.errors import InputError
 from locatk.core.paper_sizes import Paper
+
+SEAM_DASH_MM = 5.0
+"""Length of the dashes of a cut."""
+
+SEAM_LABEL_STEP_MM = 2.0
+"""Step of the positions along a cut at which its label is tried."""
 
 MAX_PAGE_MM = 5000.0
 """Largest side of a page cut from a roll; a PDF page may be 200 inches (ISO 32000-1, annex C)."""
@@ -31,15 +39,46 @@ class Tile:
         Lower left corner of the box, in the frame of the drawing.
     seams : (x, y)
         Coordinates of the cuts to neighbouring tiles, in mm from the lower left corner of the page.
-    seam_marks : tuple of Mark
-        Dashed lines along the cuts, with the names of the tiles beyond them.
+    neighbours : (x, y)
+        Names of the tiles beyond these cuts.
     """
 
     name: str
     box: Box
     corner_mm: Point
     seams: tuple[tuple[float, ...], tuple[float, ...]]
-    seam_marks: tuple[Mark, ...]
+    neighbours: tuple[tuple[str, ...], tuple[str, ...]]
+
+    def seam_marks(self, drawing: Sequence[Mark] = ()) -> list[Mark]:
+        """Draw dashed lines along the cuts, with the names of the tiles beyond them.
+
+        The lines leave the texts of the ``drawing`` free, and the names avoid its lines and texts.
+        """
+        texts = [mark for mark in drawing if isinstance(mark, Text)]
+        left, bottom, right, top = self.box
+        lines = [Line((x, bottom), (x, top), 0.1, SEAM_DASH_MM) for x in self.seams[0]]
+        lines += [Line((left, y), (right, y), 0.1, SEAM_DASH_MM) for y in self.seams[1]]
+        obstacles = Obstacles([*drawing, *lines], self.box)
+        labels: list[Text] = []
+        for axis, (seams, names) in enumerate(zip(self.seams, self.neighbours, strict=True)):
+            for seam, name in zip(seams, names, strict=True):
+                labels += obstacles.place(self._seam_labels(f"joins {name}", axis, seam))
+        return [*(part for line in lines for part in interrupt(line, texts)), *labels]
+
+    def _seam_labels(self, text: str, axis: int, seam: float) -> Iterator[Text]:
+        """Yield a text along a cut, inside of it, from its middle to its ends."""
+        low, high = self.box[1 - axis], self.box[3 - axis]
+        is_first = seam < (self.box[axis] + self.box[axis + 2]) / 2
+        steps = int((high - low) / 2 / SEAM_LABEL_STEP_MM)
+        for step in sorted(range(-steps, steps + 1), key=abs):
+            along = (low + high) / 2 + step * SEAM_LABEL_STEP_MM
+            if axis == 0:
+                # Upright text extends to the left of its baseline.
+                position = (seam + (3.0 if is_first else -1.0), along)
+                yield Text(text, position, TEXT_POINTS, "middle", angle_deg=90)
+            else:
+                position = (along, seam + (1.0 if is_first else -3.0))
+                yield Text(text, position, TEXT_POINTS, "middle")
 
 
 @dataclass(frozen=True)
@@ -100,39 +139,19 @@ class TileGrid:
             box,
             (corner[0], corner[1]),
             (seams[0], seams[1]),
-            tuple(self._seam_marks(index, box)),
+            self._neighbours(index),
         )
 
-    def _seam_marks(self, index: int, box: Box) -> list[Mark]:
-        """Draw dashed lines along the cuts, with the names of the tiles beyond them."""
+    def _neighbours(self, index: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the names of the tiles beyond the cuts of a tile, in their order."""
         columns, rows = self.count
         row, column = divmod(index, columns)
-        left, bottom, right, top = box
-        centre = ((left + right) / 2, (bottom + top) / 2)
-        inset = self.overlap_mm / 2
-        marks: list[Mark] = []
-        for has_neighbour, neighbour, x in (
-            (column > 0, index - 1, left + inset),
-            (column < columns - 1, index + 1, right - inset),
-        ):
-            if has_neighbour:
-                # Upright text extends to the left of its baseline.
-                shift = -1.0 if x > centre[0] else 3.0
-                label = f"joins {tile_name(neighbour, columns)}"
-                marks.append(Line((x, bottom), (x, top), 0.1, dash_mm=5.0))
-                marks.append(
-                    Text(label, (x + shift, centre[1]), TEXT_POINTS, "middle", angle_deg=90)
-                )
-        for has_neighbour, neighbour, y in (
-            (row < rows - 1, index + columns, bottom + inset),
-            (row > 0, index - columns, top - inset),
-        ):
-            if has_neighbour:
-                shift = 1.0 if y < centre[1] else -3.0
-                label = f"joins {tile_name(neighbour, columns)}"
-                marks.append(Line((left, y), (right, y), 0.1, dash_mm=5.0))
-                marks.append(Text(label, (centre[0], y + shift), TEXT_POINTS, "middle"))
-        return marks
+        across = [index + step for step in (-1, 1) if 0 <= column + step < columns]
+        upwards = [index - step * columns for step in (-1, 1) if 0 <= row - step < rows]
+        names = [
+            tuple(tile_name(other, columns) for other in others) for others in (across, upwards)
+        ]
+        return names[0], names[1]
 
 
 def divide_area(extent_mm: Box, paper: Paper, margin_mm: float, overlap_mm: float) -> TileGrid:

@@ -60,7 +60,7 @@ MARK_MM = 4.0
 """Size of a registration mark."""
 
 FONT, BOLD_FONT = "Helvetica", "Helvetica-Bold"
-AXIS_LABEL_POINTS, CAPTION_POINTS = 5.0, 7.0
+CAPTION_POINTS = drawing.MIN_TEXT_POINTS
 
 
 @dataclass(frozen=True)
@@ -254,8 +254,8 @@ def crop_marks(canvas: Canvas, box: Box) -> None:
     canvas.setTrimBox([edge * mm for edge in (box.left, box.bottom, box.right, box.top)])
 
 
-def axes(canvas: Canvas, x: float, y: float, length: float = 3.5) -> None:
-    """Draw labelled arrows along the sheet's x and y from a corner."""
+def axes(canvas: Canvas, x: float, y: float, length: float = 2.0) -> None:
+    """Draw arrows along the sheet's x and y from a corner, with their names beyond the tips."""
     head = 0.8
     _lines(
         canvas,
@@ -268,8 +268,8 @@ def axes(canvas: Canvas, x: float, y: float, length: float = 3.5) -> None:
             (x + head / 2, y + length - head, x, y + length),
         ],
     )
-    text(canvas, (x + length - 0.6, y - 1.9), "x", AXIS_LABEL_POINTS)
-    text(canvas, (x - 1.6, y + length - 0.9), "y", AXIS_LABEL_POINTS)
+    text(canvas, (x + length + 0.4, y - 0.65), "x", CAPTION_POINTS)
+    text(canvas, (x - 1.1, y + length + 0.9), "y", CAPTION_POINTS)
 
 
 def fits_margin(box: Box, size_mm: tuple[float, float]) -> bool:

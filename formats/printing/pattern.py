@@ -38,9 +38,8 @@ Without it, pdfium and MuPDF cover a pixel more and stretch the image over it; w
 ``cups`` device of Ghostscript moves dots. 0.1 px tolerates a page that is 0.08 px off.
 """
 
-CAPTION_POINTS = 6.0
 LINE_SPACING_MM = 3.4
-"""Captions of the test sheet."""
+"""Distance of the lines of text of the test sheet."""
 
 
 def render(
@@ -224,15 +223,17 @@ def _draw_marker(canvas: Canvas, sheet: PrinterSheet, corner: CornerMarker) -> N
 
 
 def _caption(canvas: Canvas, sheet: PrinterSheet, field: PrinterField) -> None:
-    """Write name, dot and pitch below a field."""
+    """Write name, dot and pitch below a field, in lines that are narrower than its column."""
     left, _, _, bottom = field.layout.box
     x, y = sheet.mm(left), sheet.mm(sheet.page[1] - bottom) - LINE_SPACING_MM
     raster = field.layout.raster
-    width = page.text(canvas, (x, y), field.name, CAPTION_POINTS, bold=True)
-    dot = f"dot {1000 * field.dot_mm:.0f} \u00b5m = {raster.dot} px"
-    page.text(canvas, (x + width + 1, y), dot, CAPTION_POINTS)
-    pitch = f"pitch {field.pitch_mm:.3f} mm = {raster.pitch} px"
-    page.text(canvas, (x, y - 0.75 * LINE_SPACING_MM), pitch, CAPTION_POINTS)
+    width = page.text(canvas, (x, y), field.name, page.CAPTION_POINTS, bold=True)
+    dot = f"dot {1000 * field.dot_mm:.0f} \u00b5m"
+    page.text(canvas, (x + width + 1, y), dot, page.CAPTION_POINTS)
+    pitch = f"pitch {1000 * field.pitch_mm:.0f} \u00b5m"
+    pixels = f"{raster.dot} px in {raster.pitch} px"
+    for number, line in enumerate((pitch, pixels), 1):
+        page.text(canvas, (x, y - number * 0.85 * LINE_SPACING_MM), line, page.CAPTION_POINTS)
 
 
 def _instructions(canvas: Canvas, sheet: PrinterSheet) -> None:

@@ -92,8 +92,11 @@ def test_a_family_and_its_bill(locatk, tmp_path: Path) -> None:
     with bom.open(newline="") as stream:
         rows = {row["part"]: row for row in csv.DictReader(stream)}
     assert rows["disc magnet"]["count"] == "100"
-    assert rows["disc magnet"]["price_usd"] == "0.015"
-    assert rows["glue"]["price_usd"] == ""
+    assert rows["disc magnet"]["unit_price"] == "0.015"
+    assert (rows["disc magnet"]["sum"], rows["disc magnet"]["currency"]) == ("1.5", "USD")
+    assert rows["glue"]["unit_price"] == ""
+    assert rows["total"]["sum"] == "19.5"
+    assert rows["total"]["detail"].endswith("no price of substrate, glue, microcontroller")
     # The same command gives the same file, byte for byte.
     again = tmp_path / "again.toml"
     design(locatk, again, "--count", 20, "--min-distance", 3)
@@ -140,6 +143,10 @@ def test_stdout_is_one_json_object(locatk, tmp_path: Path) -> None:
     assert told["plan"]["rate_hz"] == pytest.approx(61.2, abs=0.1)
     assert told["plan"]["known_speed"]["angle_rad"] < told["plan"]["free_speed"]["angle_rad"]
     assert told["materials"][0]["count"] == 15
+    assert told["materials_total"]["amount"] == pytest.approx(15 * 0.015 + 9 * 2)
+    assert told["materials_total"]["parts_without_price"] == [
+        "substrate", "glue", "microcontroller",
+    ]  # fmt: skip
     assert len(told["warnings"]) == 1
     checked = json.loads(locatk("tag", "check", tmp_path / "tag.toml", "--json").stdout)
     assert checked["tag"] == told["tag"]

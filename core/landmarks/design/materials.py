@@ -17,6 +17,9 @@ SPARES_PERCENT = 5.0
 MAX_SPARES_PERCENT = 1000.0
 """Largest percentage of spare bars; a larger one is probably a number of bars."""
 
+PARTS = ("bar magnet", "adhesive", "compass", "marker", "chalk line")
+"""Parts of :func:`bill_of_materials`; spares have the price of their part."""
+
 EPOXY_G_PER_CM2 = 0.03
 """Mass of a layer of epoxy 0.3 mm thick, at 1 g/cm3."""
 

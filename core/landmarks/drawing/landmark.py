@@ -7,6 +7,7 @@ designed, with their axes parallel to those of the map, not as built.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from locatk.core.drawing import (
     CAPITAL_HEIGHT_EM,
+    MIN_TEXT_POINTS,
     MM_PER_POINT,
     Circle,
     Line,
@@ -137,7 +139,11 @@ def check_buildable(floor: FloorMap) -> None:
 
 
 def draw_landmark(
-    geometry: Geometry, code: int, centre: Point, notes: tuple[str, ...] = ()
+    geometry: Geometry,
+    code: int,
+    centre: Point,
+    notes: tuple[str, ...] = (),
+    max_half_side_mm: float = math.inf,
 ) -> list[Mark]:
     """Draw a landmark at true size, for placing its bars.
 
@@ -153,12 +159,19 @@ def draw_landmark(
         Position on the page. The drawing ends :func:`drawing_half_side` from it on all sides.
     notes : tuple of str
         Lines of text in the upper left part of the square between the bars.
+    max_half_side_mm : float
+        Distance from the centre within which the labels of the bars must end; longer ones are
+        shortened or left out.
     """
     marks: list[Mark] = []
     label_distance = bars_half_side(geometry) + BAR_LABEL_GAP_MM
-    for number, bar in enumerate(bar_outlines(geometry, code)):
+    bars = bar_outlines(geometry, code)
+    label = _longest_bar_label(max_half_side_mm - label_distance)
+    for number, bar in enumerate(bars):
         marks += _draw_bar(geometry, bar, centre)
-        marks.append(_draw_bar_label(number, bar.letter, centre, label_distance))
+        if label is not None:
+            text = label(number, bar.letter)
+            marks.append(_draw_bar_label(number, text, centre, label_distance))
     inner = 1e3 * (geometry.radius_m - geometry.bar_width_m / 2)
     arm = min(6.0, 0.5 * inner)
     marks += [*cross(centre, arm, 0.2), Circle(centre, arm / 3, 0.2)]
@@ -186,6 +199,9 @@ def _draw_bar(geometry: Geometry, bar: BarOutline, centre: Point) -> list[Mark]:
     tail, tip = ((x + side * half_arrow * u, y + side * half_arrow * v) for side in (-1, 1))
     marks += arrow(tail, tip, min(0.45 * width, 0.6 * half_arrow), 0.06 * min(width, 10.0))
     points = letter_mm / (CAPITAL_HEIGHT_EM * MM_PER_POINT)
+    if points < MIN_TEXT_POINTS:
+        # The arrow shows the poles, too.
+        return marks
     for pole, side in (("S", -1), ("N", 1)):
         offset = side * (length / 2 - 0.9 * letter_mm)
         position = (x + offset * u, y + offset * v - letter_mm / 2)
@@ -197,7 +213,19 @@ def _bar_label(number: int, letter: str) -> str:
     return f"bar {number}: {letter} ({'ccw' if letter == 'N' else 'cw'})"
 
 
-def _draw_bar_label(number: int, letter: str, centre: Point, distance: float) -> Text:
+def _short_bar_label(number: int, letter: str) -> str:
+    return f"{number}: {letter}"
+
+
+def _longest_bar_label(width_mm: float) -> Callable[[int, str], str] | None:
+    """Return the format of the labels of bars that fits a width, or None if none does."""
+    for label in (_bar_label, _short_bar_label):
+        if text_width(label(0, "S"), BAR_LABEL_POINTS) <= width_mm:
+            return label
+    return None
+
+
+def _draw_bar_label(number: int, text: str, centre: Point, distance: float) -> Text:
     """Draw the label of a bar outside of it, next to the line to the neighbouring cell."""
     gap = 1.2
     x, y = (
@@ -208,13 +236,18 @@ def _draw_bar_label(number: int, letter: str, centre: Point, distance: float) ->
     )[number]
     anchor: Literal["start", "end"] = "end" if number == 2 else "start"
     position = (centre[0] + x, centre[1] + y)
-    return Text(_bar_label(number, letter), position, BAR_LABEL_POINTS, anchor)
+    return Text(text, position, BAR_LABEL_POINTS, anchor)
 
 
 def _draw_notes(notes: tuple[str, ...], centre: Point, inner_mm: float) -> list[Mark]:
-    """Draw right-aligned lines of text in the upper left part of the square between the bars."""
+    """Draw right-aligned lines of text in the upper left part of the square between the bars.
+
+    They are left out if the square is too small for legible text.
+    """
     longest = max((len(text) for text in notes), default=1)
     points = min(MAX_NOTE_POINTS, 0.85 * inner_mm / text_width("x" * longest, 1.0))
+    if points < MIN_TEXT_POINTS:
+        return []
     top = centre[1] + inner_mm - 2.6
     step = line_height(points, NOTE_SPACING_EM)
     return [
@@ -255,8 +288,9 @@ def draw_symbol(code: int, centre: Point, cell_mm: float) -> list[Mark]:
         corners = [_rotate((cell_mm * a, cell_mm * sign * b), bar) for a, b in outline]
         positions = tuple((x + a, y + b) for a, b in corners)
         marks.append(Polygon(positions, letter == "N", min(0.2, 0.012 * cell_mm)))
-    points = 0.2 * cell_mm / (CAPITAL_HEIGHT_EM * MM_PER_POINT)
-    marks.append(Text(code_digit(code), (x, y - 0.1 * cell_mm), points, "middle", bold=True))
+    points = max(MIN_TEXT_POINTS, 0.2 * cell_mm / (CAPITAL_HEIGHT_EM * MM_PER_POINT))
+    baseline = y - capital_height(points) / 2
+    marks.append(Text(code_digit(code), (x, baseline), points, "middle", bold=True))
     return marks
 
 
@@ -277,7 +311,7 @@ def code_digit(code: int) -> str:
 def north_mark(start: Point, height_mm: float, text: str = "map +y") -> list[Mark]:
     """Draw an arrow up the page from ``start``, with a text at its right."""
     x, y = start
-    points = min(9.0, 1.1 * height_mm)
+    points = min(9.0, max(MIN_TEXT_POINTS, 1.1 * height_mm))
     return [
         *arrow(start, (x, y + height_mm), 0.45 * height_mm, 0.06 * height_mm),
         Text(text, (x + 0.2 * height_mm + 0.5, y + 0.3 * height_mm), points, bold=True),

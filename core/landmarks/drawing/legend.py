@@ -39,9 +39,6 @@ COLUMN_GAP_MM = 3.0
 EDGE_MM = 4.0
 """Space above the columns, with a line that separates them from the plan."""
 
-LEGEND_POINTS = 6.0
-"""Font size of the explanations."""
-
 LANDMARK_NOTE = (
     "Bars are numbered and read counter-clockwise, from bar 0 at +x. "
     "N: magnetised counter-clockwise, too."
@@ -65,8 +62,8 @@ def legend_height(width: float) -> float:
     if column < MIN_COLUMN_MM:
         return math.inf
     notes = (LANDMARK_NOTE, WINDOW_NOTE, PATTERNS_NOTE)
-    lines = max(len(wrap(note, LEGEND_POINTS, column)) for note in notes)
-    texts = line_height(TEXT_POINTS) + (lines + 0.5) * line_height(LEGEND_POINTS)
+    lines = max(len(wrap(note, TEXT_POINTS, column)) for note in notes)
+    texts = line_height(TEXT_POINTS) + (lines + 0.5) * line_height(TEXT_POINTS)
     return EDGE_MM + DRAWING_HEIGHT_MM + texts
 
 
@@ -87,11 +84,11 @@ def draw_legend(floor: FloorMap, scale: float, corner: Point, width: float) -> l
     )
     for number, (title, draw, note) in enumerate(columns):
         x = left + number * (column + COLUMN_GAP_MM)
-        lines = [line.replace("\u00a0", " ") for line in wrap(note, LEGEND_POINTS, column)]
+        lines = [line.replace("\u00a0", " ") for line in wrap(note, TEXT_POINTS, column)]
         marks += [
             *paragraph([title], (x, top), TEXT_POINTS, bold=True),
             *draw((x, drawings_top)),
-            *paragraph(lines, (x, drawings_top - DRAWING_HEIGHT_MM), LEGEND_POINTS),
+            *paragraph(lines, (x, drawings_top - DRAWING_HEIGHT_MM), TEXT_POINTS),
         ]
     return marks
 
@@ -105,11 +102,11 @@ def _draw_landmark(corner: Point) -> list[Mark]:
     side = 20.0
     x, y = corner[0] + MIN_COLUMN_MM / 2, corner[1] - DRAWING_HEIGHT_MM / 2
     marks: list[Mark] = [*draw_symbol(SAMPLE_CODE, (x, y), side)]
-    distance, capital = 0.43 * side, capital_height(LEGEND_POINTS)
+    distance, capital = 0.43 * side, capital_height(TEXT_POINTS)
     for bar, letter in enumerate(name(SAMPLE_CODE)):
         u, v = (round(f(math.radians(90 * bar))) for f in (math.cos, math.sin))
         position = (x + distance * u, y + distance * v - capital / 2)
-        marks.append(Text(f"{bar}: {letter}", position, LEGEND_POINTS, "middle", bold=True))
+        marks.append(Text(f"{bar}: {letter}", position, TEXT_POINTS, "middle", bold=True))
     # The order of the bars: an arc with an arrow from bar 0 to bar 1.
     radius = 0.52 * side
     angles = [math.radians(25 + 10 * step) for step in range(5)]
@@ -131,7 +128,7 @@ def _draw_window(window: str, corner: Point) -> list[Mark]:
     for number, (x, y) in enumerate(centres, 1):
         marks.append(rectangle((x - half, y - half, x + half, y + half)))
         position = (x - half + 0.8, y + half - 0.8 - capital_height(TEXT_POINTS))
-        marks.append(Text(str(number), position, TEXT_POINTS - 1))
+        marks.append(Text(str(number), position, TEXT_POINTS))
     for start, end in itertools.pairwise(centres):
         marks += arrow(start, end, 1.8, 0.3)
     marks.append(Circle(centres[0], 0.7, 0.3))

@@ -14,12 +14,13 @@ from locatk.core.drawing.pages import (
     text_paper,
 )
 from locatk.core.errors import InputError
-from locatk.core.landmarks.design.materials import SPARES_PERCENT, bill_of_materials
+from locatk.core.landmarks.design.materials import bill_of_materials
 from locatk.core.landmarks.drawing.landmark import check_buildable
 from locatk.core.landmarks.drawing.plan import draw_plan
 from locatk.core.landmarks.drawing.templates import PlacedTemplate, draw_templates
 from locatk.core.landmarks.drawing.texts import bill_pages, checklist_pages, marking_list_pages
 from locatk.core.landmarks.map.floor import FloorMap
+from locatk.core.materials import BillItem
 
 PACK_PARTS = ("plan", "templates", "materials", "checklist", "list")
 """Parts of a pack, in the order of their pages."""
@@ -53,7 +54,7 @@ def draw_installation_pack(
     parts: Sequence[str] = PACK_PARTS,
     paper_name: str = "",
     margin_mm: float = 10.0,
-    spares_percent: float = SPARES_PERCENT,
+    items: Sequence[BillItem] | None = None,
 ) -> InstallationPack:
     """Draw the installation pack of a floor as designed, not as built.
 
@@ -67,8 +68,8 @@ def draw_installation_pack(
     paper_name : str
         Name of the paper in error messages.
     margin_mm : float
-    spares_percent : float
-        Bars to buy in addition, in percent of the bars of the floor.
+    items : sequence of BillItem, optional
+        Bill of materials, by default that of the floor with the usual spares.
 
     Raises
     ------
@@ -94,7 +95,7 @@ def draw_installation_pack(
             pages += drawn
             templates = [replace(item, page=item.page + first) for item in placed]
         elif part == "materials":
-            items = bill_of_materials(floor, spares_percent)
+            items = bill_of_materials(floor) if items is None else items
             pages += bill_pages(floor, items, title, text_paper_mm, margin_mm)
         elif part == "checklist":
             pages += checklist_pages(floor, title, text_paper_mm, margin_mm)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from locatk.core.drawing import (
+    MIN_TEXT_POINTS,
     MM_PER_POINT,
     Box,
     Circle,
@@ -19,7 +23,8 @@ from locatk.core.drawing import (
     rectangle,
     text_width,
 )
-from locatk.core.drawing.pages import SMALL_TEXT_POINTS, TEXT_POINTS, PageFrame, UnnumberedPage
+from locatk.core.drawing.pages import TEXT_POINTS, PageFrame, UnnumberedPage
+from locatk.core.drawing.placement import Obstacles
 from locatk.core.drawing.scale import axes, round_scale
 from locatk.core.drawing.tiles import tile_name
 from locatk.core.errors import InputError
@@ -35,7 +40,13 @@ MAX_CELL_MM = 45.0
 """Largest side of a cell on the paper; larger symbols show nothing more."""
 
 MIN_LABELLED_CELL_MM = 20.0
-"""Side of a cell on the paper above which it contains its row, column and position."""
+"""Side of a cell on the paper above which it contains its row, column and position if they fit."""
+
+CELL_TEXT_INSET_MM = 1.2
+"""Distance of the texts of a cell from its borders."""
+
+NUMBER_GAP_MM = 1.2
+"""Distance of the number of a row or column from the cells, and of its position from the number."""
 
 AXIS_SPACE_MM = 7.0
 """Space for the arrows of the axes at the left of and below the numbers."""
@@ -70,12 +81,28 @@ class CellBlock:
 
 @dataclass(frozen=True)
 class _PlanLayout:
-    """Division of a plan over pages of one orientation; ``scale`` is the n of 1 : n."""
+    """Division of a plan over pages of one orientation.
+
+    Attributes
+    ----------
+    frame : PageFrame
+    blocks : tuple of CellBlock
+    blocks_across : int
+    scale : float
+        The n of 1 : n.
+    has_overview : bool
+        The legend has a page of its own, with an overview of the blocks.
+    """
 
     frame: PageFrame
     blocks: tuple[CellBlock, ...]
     blocks_across: int
     scale: float
+    has_overview: bool
+
+    @property
+    def page_count(self) -> int:
+        return len(self.blocks) + self.has_overview
 
 
 def draw_plan(
@@ -98,13 +125,13 @@ def draw_plan(
             f"a page of {width:g} x {height:g} mm is too small for the plan of the floor",
             hint="Use a larger paper",
         )
-    layout = min(layouts, key=lambda item: (len(item.blocks), item.scale))
+    layout = min(layouts, key=lambda item: (item.page_count, item.scale))
     frame = layout.frame
     cell_mm = 1e3 * floor.pitch_m / layout.scale
     left, bottom, right, top = frame.content_box
     legend = Group("legend", tuple(draw_legend(floor, layout.scale, (left, bottom), right - left)))
     above_legend = (left, bottom + legend_height(right - left), right, top)
-    if len(layout.blocks) == 1:
+    if not layout.has_overview:
         plan = _BlockDrawing.in_box(floor, cell_mm, layout.blocks[0], above_legend)
         return [UnnumberedPage(frame, (legend, Group("plan", tuple(plan.marks()))))]
     overview = Group("key", tuple(_draw_overview(floor, layout, above_legend)))
@@ -141,7 +168,8 @@ def _lay_out_plan(
         return None
     cell_mm = min(width / columns, height_above_legend / rows, MAX_CELL_MM)
     across = down = 1
-    if cell_mm < MIN_CELL_MM:
+    has_overview = cell_mm < MIN_CELL_MM
+    if has_overview:
         # The legend is on the page of the overview, so the blocks have the whole height.
         across = math.ceil(columns / max(1, int(width / MIN_CELL_MM)))
         down = math.ceil(rows / max(1, int(height / MIN_CELL_MM)))
@@ -158,7 +186,8 @@ def _lay_out_plan(
         for row in range(down)
         for column in range(across)
     ]
-    return _PlanLayout(frame, tuple(blocks), across, round_scale(1e3 * floor.pitch_m / cell_mm))
+    scale = round_scale(1e3 * floor.pitch_m / cell_mm)
+    return _PlanLayout(frame, tuple(blocks), across, scale, has_overview)
 
 
 def _count(number: int, noun: str) -> str:
@@ -167,10 +196,25 @@ def _count(number: int, noun: str) -> str:
 
 def _label_space(floor: FloorMap) -> Point:
     """Return the space in mm for numbers and axes at the left of and below the cells."""
+    numbers = 2 * NUMBER_GAP_MM + 1.0
+    row_space, column_space = (_number_width(floor, axis) for axis in (0, 1))
+    longest = _longest_position(floor)
+    return (
+        AXIS_SPACE_MM + longest + row_space + numbers,
+        AXIS_SPACE_MM + longest + column_space + numbers,
+    )
+
+
+def _longest_position(floor: FloorMap) -> float:
+    """Return the width in mm of the longest position of a row or column."""
     rows, columns = floor.shape
-    (x0, y0), (x1, y1) = floor.position((0, 0)), floor.position((rows - 1, columns - 1))
-    longest = max(text_width(mm_text(value), SMALL_TEXT_POINTS) for value in (x0, y0, x1, y1))
-    return AXIS_SPACE_MM + longest + 6.0, AXIS_SPACE_MM + longest + 5.0
+    corners = (*floor.position((0, 0)), *floor.position((rows - 1, columns - 1)))
+    return max(text_width(mm_text(value), TEXT_POINTS) for value in corners)
+
+
+def _number_width(floor: FloorMap, axis: int) -> float:
+    """Return the width in mm of the largest number of a row (axis 0) or column (1)."""
+    return text_width(str(floor.shape[axis] - 1), TEXT_POINTS)
 
 
 @dataclass(frozen=True)
@@ -197,13 +241,14 @@ class _BlockDrawing:
 
     def marks(self) -> list[Mark]:
         cells = [(row, column) for row in self.block.rows for column in self.block.columns]
+        content = [mark for cell in cells for mark in self._cell(cell)]
         return [
             *self._grid(),
             *self._numbers(),
             *self._axes(),
-            *(mark for cell in cells for mark in self._cell(cell)),
+            *content,
             *self._walls(),
-            *self._map_origin(),
+            *self._map_origin(content),
         ]
 
     def _point(self, row: float, column: float) -> Point:
@@ -230,27 +275,31 @@ class _BlockDrawing:
     def _numbers(self) -> list[Mark]:
         """Write the numbers of rows and columns with their positions in mm."""
         left, bottom = self._point(self.block.first_row, self.block.first_column)
-        capital = capital_height(SMALL_TEXT_POINTS)
-        number_points = SMALL_TEXT_POINTS + 1
+        capital = capital_height(TEXT_POINTS)
         marks: list[Mark] = []
         for row in self.block.rows:
             y = self._centre((row, 0))[1] - capital / 2
             position = mm_text(self.floor.position((row, 0))[1])
-            marks.append(Text(str(row), (left - 1.2, y), number_points, "end", bold=True))
-            marks.append(Text(position, (left - 5.5, y), SMALL_TEXT_POINTS, "end"))
-        longest = _label_space(self.floor)[1] - AXIS_SPACE_MM - 4.0
-        is_upright = longest > self.cell_mm
+            x = left - NUMBER_GAP_MM
+            marks.append(Text(str(row), (x, y), TEXT_POINTS, "end", bold=True))
+            x -= _number_width(self.floor, 0) + NUMBER_GAP_MM
+            marks.append(Text(position, (x, y), TEXT_POINTS, "end"))
+        column_width = _number_width(self.floor, 1)
+        is_upright = max(_longest_position(self.floor), column_width) + 1.0 > self.cell_mm
         for column in self.block.columns:
             x, _ = self._centre((0, column))
-            y = bottom - 1.2 - 1.2 * capital
-            position = mm_text(self.floor.position((0, column))[0])
-            marks.append(Text(str(column), (x, y), number_points, "middle", bold=True))
+            y = bottom - NUMBER_GAP_MM
+            number, position = str(column), mm_text(self.floor.position((0, column))[0])
             if is_upright:
-                corner = (x + capital / 2, y - 1.2)
-                marks.append(Text(position, corner, SMALL_TEXT_POINTS, "end", angle_deg=90))
+                for text, is_bold in ((number, True), (position, False)):
+                    corner = (x + capital / 2, y)
+                    marks.append(Text(text, corner, TEXT_POINTS, "end", bold=is_bold, angle_deg=90))
+                    y -= column_width + NUMBER_GAP_MM
             else:
-                below = (x, y - 1.0 - capital)
-                marks.append(Text(position, below, SMALL_TEXT_POINTS, "middle"))
+                y -= capital
+                marks.append(Text(number, (x, y), TEXT_POINTS, "middle", bold=True))
+                below = (x, y - NUMBER_GAP_MM - capital)
+                marks.append(Text(position, below, TEXT_POINTS, "middle"))
         return marks
 
     def _axes(self) -> list[Mark]:
@@ -268,17 +317,30 @@ class _BlockDrawing:
         code = int(self.floor.codes[cell])
         if code == HOLE_CODE:
             return draw_hole(centre, half, 0.1)
-        if self.cell_mm <= MIN_LABELLED_CELL_MM:
+        if not self.has_cell_texts:
             return draw_symbol(code, centre, 1.2 * self.cell_mm)
-        points = SMALL_TEXT_POINTS * min(1.4, self.cell_mm / 25)
-        left = centre[0] - half + 1.2
-        first_baseline = centre[1] + half - line_height(points) - 0.2
-        position = ", ".join(mm_text(value) for value in self.floor.position(cell))
+        left = centre[0] - half + CELL_TEXT_INSET_MM
+        top = centre[1] + half - CELL_TEXT_INSET_MM - capital_height(TEXT_POINTS)
+        name, position = self._cell_texts(cell)
         return [
             *draw_symbol(code, centre, self.cell_mm),
-            Text(f"row {cell[0]}, column {cell[1]}", (left, first_baseline), points),
-            Text(position, (left, centre[1] - half + 1.2), points),
+            Text(name, (left, top), TEXT_POINTS),
+            Text(position, (left, centre[1] - half + CELL_TEXT_INSET_MM), TEXT_POINTS),
         ]
+
+    def _cell_texts(self, cell: Cell) -> tuple[str, str]:
+        position = ", ".join(mm_text(value) for value in self.floor.position(cell))
+        return f"row {cell[0]}, col {cell[1]}", position
+
+    @cached_property
+    def has_cell_texts(self) -> bool:
+        """Whether the cells have space for their row, column and position."""
+        rows, columns = self.floor.shape
+        corners = itertools.product((0, rows - 1), (0, columns - 1))
+        texts = [text for cell in corners for text in self._cell_texts(cell)]
+        longest = max(text_width(text, TEXT_POINTS) for text in texts)
+        space = self.cell_mm - 2 * CELL_TEXT_INSET_MM
+        return self.cell_mm > MIN_LABELLED_CELL_MM and longest <= space
 
     def _walls(self) -> list[Mark]:
         marks: list[Mark] = []
@@ -291,8 +353,8 @@ class _BlockDrawing:
             marks.append(Line((x - v, y - u), (x + v, y + u), min(1.2, 0.1 * self.cell_mm)))
         return marks
 
-    def _map_origin(self) -> list[Mark]:
-        """Draw a circle at the origin of the map if it is on this page."""
+    def _map_origin(self, content: Sequence[Mark]) -> list[Mark]:
+        """Draw a circle at the origin of the map if it is on this page; texts interrupt it."""
         column, row = (-value / self.floor.pitch_m for value in self.floor.origin_m)
         block = self.block
         is_on_page = (
@@ -301,9 +363,10 @@ class _BlockDrawing:
         )
         if not is_on_page:
             return []
-        relative_radius = 0.33 if self.cell_mm > MIN_LABELLED_CELL_MM else 0.42
+        relative_radius = 0.33 if self.has_cell_texts else 0.42
         centre = self._point(row + 0.5, column + 0.5)
-        return [Circle(centre, relative_radius * self.cell_mm, 0.2)]
+        circle = Circle(centre, relative_radius * self.cell_mm, 0.2)
+        return [*Obstacles(mark for mark in content if isinstance(mark, Text)).interrupt(circle)]
 
 
 def _draw_overview(floor: FloorMap, layout: _PlanLayout, box: Box) -> list[Mark]:
@@ -312,29 +375,41 @@ def _draw_overview(floor: FloorMap, layout: _PlanLayout, box: Box) -> list[Mark]
     cell = min((box[2] - box[0] - 10) / columns, (box[3] - box[1] - 10) / rows)
     left = (box[0] + box[2] - cell * columns) / 2
     bottom = box[3] - 5 - cell * rows
+    labels: list[Text] = []
     marks: list[Mark] = []
+    for number, block in enumerate(layout.blocks):
+        x, y = left + block.first_column * cell, bottom + block.first_row * cell
+        box = (x, y, x + len(block.columns) * cell, y + len(block.rows) * cell)
+        marks.append(rectangle(box, 0.25))
+        labels += _block_labels(block, tile_name(number, layout.blocks_across), box)
+    # Holes and walls leave the names of the blocks free.
+    obstacles = Obstacles(labels)
+    content: list[Line] = []
     holes = [(r, c) for r in range(rows) for c in range(columns) if floor.codes[r, c] == HOLE_CODE]
     for row, column in holes:
         x, y = left + column * cell, bottom + row * cell
-        # A single thin diagonal, because the name of a block may be over it.
-        marks.append(Line((x, y), (x + cell, y + cell), 0.05))
+        content.append(Line((x, y), (x + cell, y + cell), 0.05))
     for first, second in sorted(floor.walls):
         x, y = left + max(first[1], second[1]) * cell, bottom + max(first[0], second[0]) * cell
         end = (x, y + cell) if first[0] == second[0] else (x + cell, y)
-        marks.append(Line((x, y), end, 0.8))
-    for number, block in enumerate(layout.blocks):
-        x, y = left + block.first_column * cell, bottom + block.first_row * cell
-        width, height = len(block.columns) * cell, len(block.rows) * cell
-        marks.append(rectangle((x, y, x + width, y + height), 0.25))
-        name = tile_name(number, layout.blocks_across)
-        points = min(14.0, 0.5 * height / MM_PER_POINT, 0.8 * width / text_width(name, 1.0))
-        centre = (x + width / 2, y + height / 2)
-        marks.append(Text(name, centre, points, "middle", bold=True))
-        cells = (
-            f"rows {block.first_row}-{block.end_row - 1}, "
-            f"columns {block.first_column}-{block.end_column - 1}"
-        )
-        cells_points = min(TEXT_POINTS, 0.9 * width / text_width(cells, 1.0))
-        below = (centre[0], centre[1] - 1.3 * line_height(cells_points))
-        marks.append(Text(cells, below, cells_points, "middle"))
-    return [*marks, *north_mark((left - 5.0, bottom), 8.0, "")]
+        content.append(Line((x, y), end, 0.8))
+    marks += [line for line in content if not obstacles.are_touched_by(line)]
+    return [*marks, *labels, *north_mark((left - 5.0, bottom), 8.0, "")]
+
+
+def _block_labels(block: CellBlock, name: str, box: Box) -> list[Text]:
+    """Return the name of a block and its cells, as far as the block has space for them."""
+    width, height = box[2] - box[0], box[3] - box[1]
+    centre = ((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+    points = min(14.0, 0.5 * height / MM_PER_POINT, 0.8 * width / text_width(name, 1.0))
+    if points < MIN_TEXT_POINTS:
+        return []
+    labels = [Text(name, centre, points, "middle", bold=True)]
+    cells = (
+        f"rows {block.first_row}-{block.end_row - 1}, "
+        f"columns {block.first_column}-{block.end_column - 1}"
+    )
+    depth = 1.3 * line_height(TEXT_POINTS)
+    if text_width(cells, TEXT_POINTS) < 0.95 * width and depth + 1.0 < height / 2:
+        labels.append(Text(cells, (centre[0], centre[1] - depth), TEXT_POINTS, "middle"))
+    return labels

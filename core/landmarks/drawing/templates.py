@@ -23,7 +23,6 @@ from locatk.core.drawing import (
 )
 from locatk.core.drawing.cards import CardGrid, cards_along
 from locatk.core.drawing.pages import (
-    SMALL_TEXT_POINTS,
     TEXT_POINTS,
     TITLE_POINTS,
     PageFrame,
@@ -149,7 +148,7 @@ def _available_mm(frame: PageFrame) -> Point:
 
 
 def _too_small(frame: PageFrame, min_half: float, paper_name: str) -> InputError:
-    side = 2 * min_half
+    side = float(math.ceil(2 * min_half))
     paper = larger_paper_text(frame.size_mm, (side, side), _available_mm(frame))
     return InputError(
         f"a template needs {side:.0f} x {side:.0f} mm and space for its texts, which paper "
@@ -252,11 +251,11 @@ class _Template:
         """Draw north mark and meaning of the edges in the corners, which are always free."""
         x, y = centre[0] - self.half + 2.0, centre[1] + self.half - 1.0 - NORTH_MARK_MM
         marks = north_mark((x + 2.5, y), NORTH_MARK_MM)
-        width = max(self.half - 8.0, text_width("x" * 20, SMALL_TEXT_POINTS))
-        lines = wrap(self._edge_note(), SMALL_TEXT_POINTS, width)
-        bottom = centre[1] - self.half + 1.0 + capital_height(SMALL_TEXT_POINTS)
-        top = bottom + len(lines) * line_height(SMALL_TEXT_POINTS)
-        marks += paragraph(lines, (x, top), SMALL_TEXT_POINTS)
+        width = max(self.half - 8.0, text_width("x" * 20, TEXT_POINTS))
+        lines = wrap(self._edge_note(), TEXT_POINTS, width)
+        bottom = centre[1] - self.half + 1.0 + capital_height(TEXT_POINTS)
+        top = bottom + len(lines) * line_height(TEXT_POINTS)
+        marks += paragraph(lines, (x, top), TEXT_POINTS)
         axis_label = (centre[0] + self.half - 4.5, centre[1] - capital_height(TEXT_POINTS) - 1.2)
         return [*marks, Text("+x", axis_label, TEXT_POINTS, "end", bold=True)]
 

@@ -13,17 +13,18 @@ from locatk.core.drawing.pages import (
     TableColumn,
     TextFlow,
     UnnumberedPage,
+    printable,
     table_pages,
 )
 from locatk.core.landmarks.design.materials import count_patterns
 from locatk.core.landmarks.drawing.landmark import code_digit
 from locatk.core.landmarks.landmark import PATTERN_OF, name
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.core.materials import BillItem
+from locatk.core.materials import BillItem, total_of
 from locatk.core.units import mm_text
 
-BILL_COLUMNS_MM = (42.0, 18.0)
-"""Widths of the columns part and count; the description takes the rest."""
+BILL_COLUMNS_MM = (38.0, 15.0, 17.0, 20.0)
+"""Widths of the columns part, count, price of one and of all; the description takes the rest."""
 
 PATTERN_COLUMNS_MM = (20.0, 22.0, 18.0)
 """Widths of the columns pattern, bars and count; the templates take the rest."""
@@ -35,14 +36,23 @@ def bill_pages(
     """Write the bill of materials and the number of landmarks by pattern."""
     flow = TextFlow(PageFrame(paper_mm, margin_mm, f"{title}: bill of materials"))
     flow.add_space(4.0)
-    flow.add_row(("Part", "Count", "What to buy"), BILL_COLUMNS_MM, bold=True)
+    total = total_of(items)
+    head = ("Part", "Count", "Each", f"Sum {total.currency}".strip(), "What to buy")
+    flow.add_row(head, BILL_COLUMNS_MM, bold=True)
     for item in items:
-        flow.add_row((item.part, str(item.count), item.detail), BILL_COLUMNS_MM)
+        prices, origin = ("-", "-"), ""
+        if item.price is not None:
+            prices = (f"{item.price.amount:g}", f"{item.amount:.2f}")
+            origin = f" (price: {item.price.source}, {item.price.date})"
+        cells = (item.part, str(item.count), *prices, printable(item.detail + origin))
+        flow.add_row(cells, BILL_COLUMNS_MM)
+    flow.add_space(2.0)
+    flow.add_paragraph(printable(f"{total.text[0].upper()}{total.text[1:]}."), bold=True)
     flow.add_space(8.0)
     flow.add_paragraph("Landmarks by pattern", points=TITLE_POINTS, bold=True)
     flow.add_space(2.0)
-    head = ("Pattern", "Bars", "Count", "Templates: code x count")
-    flow.add_row(head, PATTERN_COLUMNS_MM, bold=True)
+    pattern_head = ("Pattern", "Bars", "Count", "Templates: code x count")
+    flow.add_row(pattern_head, PATTERN_COLUMNS_MM, bold=True)
     for pattern in count_patterns(floor):
         codes = ", ".join(
             f"{code_digit(code)} ({name(code)}) x {count}" for code, count in pattern.codes

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from locatk.core.drawing import Box, Line, Mark, Point, Text
 from locatk.core.drawing.pages import TEXT_POINTS, check_margin, printable, size_text
+from locatk.core.drawing.placement import Obstacles
 from locatk.core.drawing.tiles import Tile, TileGrid, divide_area
 from locatk.core.errors import InputError
 from locatk.core.landmarks.drawing.landmark import (
@@ -23,6 +25,12 @@ from locatk.core.units import mm_text
 
 MAX_TILES = 500
 """Largest number of pages of a floor; more of them are hardly joined by hand."""
+
+EDGE_GAP_MM = 1.5
+"""Distance of labels from the border of a cell, on which a wall may be drawn."""
+
+WALL_LABEL_FRACTIONS = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8, 0.1, 0.9)
+"""Positions along a wall at which its label is tried; it is left out if none is free."""
 
 MIN_MARGIN_MM = 7.0
 """Smallest margin that holds rulers, joining marks and texts."""
@@ -76,15 +84,12 @@ def draw_floor(
             f"{paper.name}; at most {MAX_TILES} are possible",
             hint="Use a larger paper, as in --paper roll:914mm, or the templates",
         )
-    return [
-        FloorPage(
-            grid.page_mm,
-            tile,
-            (*_draw_area(floor, tile.corner_mm, tile.box), *tile.seam_marks),
-            _margin_notes(floor, grid, tile),
-        )
-        for tile in grid.tiles()
-    ]
+    pages = []
+    for tile in grid.tiles():
+        area = _draw_area(floor, tile.corner_mm, tile.box)
+        notes = _margin_notes(floor, grid, tile)
+        pages.append(FloorPage(grid.page_mm, tile, (*area, *tile.seam_marks(area)), notes))
+    return pages
 
 
 def floor_extent(floor: FloorMap) -> Box:
@@ -125,7 +130,10 @@ def _draw_area(floor: FloorMap, corner: Point, box: Box) -> list[Mark]:
     for cell in _cells_in_area(floor, corner, box):
         x, y = floor.position(cell)
         marks += _draw_cell(floor, cell, (1e3 * x + dx, 1e3 * y + dy))
-    return [*marks, *_draw_walls(floor, (dx, dy), box)]
+    walls = _draw_walls(floor, (dx, dy), box)
+    obstacles = Obstacles([*marks, *walls])
+    labels = [label for wall in walls for label in obstacles.place(_wall_labels(wall))]
+    return [*marks, *walls, *labels]
 
 
 def _cells_in_area(floor: FloorMap, corner: Point, box: Box) -> list[Cell]:
@@ -147,14 +155,14 @@ def _draw_cell(floor: FloorMap, cell: Cell, centre: Point) -> list[Mark]:
         return [*draw_hole(centre, 10.0, 0.2), Text("no landmark", (x + 2, y + 12), TEXT_POINTS)]
     notes = (f"row {cell[0]}", f"column {cell[1]}", f"code {code_digit(code)}")
     return [
-        *draw_landmark(floor.geometry, code, centre, notes),
+        *draw_landmark(floor.geometry, code, centre, notes, 0.5e3 * floor.pitch_m - EDGE_GAP_MM),
         *north_mark((x + 3.0, y + 3.0), 5.0, "+y"),
     ]
 
 
-def _draw_walls(floor: FloorMap, shift: Point, box: Box) -> list[Mark]:
+def _draw_walls(floor: FloorMap, shift: Point, box: Box) -> list[Line]:
     """Draw the walls near a box as thick lines between their cells."""
-    marks: list[Mark] = []
+    marks: list[Line] = []
     half = 0.5e3 * floor.pitch_m
     for first, second in sorted(floor.walls):
         (x1, y1), (x2, y2) = floor.position(first), floor.position(second)
@@ -163,5 +171,12 @@ def _draw_walls(floor: FloorMap, shift: Point, box: Box) -> list[Mark]:
             continue
         u, v = (0.0, half) if first[0] == second[0] else (half, 0.0)
         marks.append(Line((x - u, y - v), (x + u, y + v), 2.0))
-        marks.append(Text("wall", (x + 2.0, y + 2.0), TEXT_POINTS))
     return marks
+
+
+def _wall_labels(wall: Line) -> Iterator[Text]:
+    """Yield the label of a wall at positions at its right or above it, from its middle on."""
+    (x0, y0), (x1, y1) = wall.start, wall.end
+    for fraction in WALL_LABEL_FRACTIONS:
+        x, y = x0 + fraction * (x1 - x0), y0 + fraction * (y1 - y0)
+        yield Text("wall", (x + 2.0, y + 2.0), TEXT_POINTS)

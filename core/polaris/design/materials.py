@@ -5,17 +5,23 @@ from __future__ import annotations
 import math
 
 from locatk.core.errors import InputError
-from locatk.core.materials import MAX_REMANENCE_T, BillItem, remanence_of_grade, size_mm_text
+from locatk.core.materials import MAX_REMANENCE_T, BillItem, Price, remanence_of_grade, size_mm_text
 from locatk.core.polaris.tag import Magnet, Tags
 
 PAPER_DISCS_M = ((2e-3, 0.5e-3), (1e-3, 0.5e-3))
 """Diameter and height of the discs of the Polaris paper (section 7.2)."""
 
-PAPER_DISC_PRICE_USD = 0.015
-"""Upper limit of the price of these discs (Polaris paper, section 7.2)."""
+PAPER_DISC_PRICE = Price(0.015, "USD", "2024-11", "upper limit, Polaris paper, section 7.2")
+"""Price of these discs, as stated by the authors (ACM MobiCom 2024)."""
 
-MAGNETOMETER_PRICE_USD = 2.0
-"""Upper limit of the price of an MLX90393 (Polaris paper, section 7.1)."""
+MAGNETOMETER_PRICE = Price(2.0, "USD", "2024-11", "upper limit, Polaris paper, section 7.1")
+"""Price of an MLX90393, as stated by the authors (ACM MobiCom 2024)."""
+
+PUBLISHED_PRICES = {"disc magnet": PAPER_DISC_PRICE, "magnetometer": MAGNETOMETER_PRICE}
+"""Prices of the paper by part."""
+
+PARTS = ("disc magnet", "substrate", "glue", "magnetometer", "microcontroller")
+"""Parts of :func:`bill_of_materials`."""
 
 SUBSTRATE = "PVC sheet 0.2 mm"
 """Substrate of the tags of the Polaris paper (section 7.2)."""
@@ -68,11 +74,10 @@ def bill_of_materials(
             tags.magnets * count,
             f"{size_mm_text(magnet.diameter_m, magnet.height_m)} NdFeB {strength}, magnetised "
             "across, north marked",
-            PAPER_DISC_PRICE_USD if is_paper_disc else None,
-            "Polaris 7.2" if is_paper_disc else "",
+            PAPER_DISC_PRICE if is_paper_disc else None,
         ),
         BillItem("substrate", count, f"{side_mm:.0f} x {side_mm:.0f} mm, {SUBSTRATE}"),
         BillItem("glue", 1, "industrial, thin"),
-        BillItem("magnetometer", sensors, sensor, MAGNETOMETER_PRICE_USD, "Polaris 7.1"),
+        BillItem("magnetometer", sensors, sensor, MAGNETOMETER_PRICE),
         BillItem("microcontroller", 1, "SPI at 2 MHz; USB or Bluetooth LE to the computer"),
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from locatk.core.drawing import (
     CUT_MARK_MM,
+    MIN_TEXT_POINTS,
     MM_PER_POINT,
     TRUE_SIZE_INSTRUCTION,
     Box,
@@ -17,6 +18,7 @@ from locatk.core.drawing import (
     Text,
     cut_marks,
     paragraph,
+    shifted,
     wrap,
 )
 from locatk.core.drawing.cards import CardGrid
@@ -36,7 +38,9 @@ from locatk.core.materials import size_mm_text
 from locatk.core.polaris.drawing.tag import (
     AXIS_ARROW_MM,
     AXIS_TICK_MM,
+    angle_text,
     draw_tag,
+    has_all_angles,
     tag_half_side,
 )
 from locatk.core.polaris.tag import TagLayout, Tags
@@ -56,7 +60,7 @@ TEXT_INDENT_MM = 1.0
 ID_POINTS = 8.0
 """Font size of the id of a tag."""
 
-DETAIL_POINTS = 5.0
+DETAIL_POINTS = MIN_TEXT_POINTS
 """Font size of the design of a tag."""
 
 SPACING_EM = 1.25
@@ -123,7 +127,10 @@ def draw_tag_cards(
     if not requested:
         raise InputError("no tag to draw")
     check_margin(paper_mm, margin_mm, min_content_mm=0.0)
-    card = _TagCard.for_ids(tags, [tag_id for tag_id, _ in requested], mirror)
+    drawings = {
+        tag_id: _TagDrawing.of(tags, tag_id, layout, mirror) for tag_id, layout in requested
+    }
+    card = _TagCard.for_drawings(tags, list(drawings.values()), mirror)
     frames = [
         PageFrame(size_mm, margin_mm, TRUE_SIZE_INSTRUCTION, (_LEGEND,), TEXT_POINTS, SPACING_EM)
         for size_mm in (paper_mm, paper_mm[::-1])
@@ -142,11 +149,11 @@ def draw_tag_cards(
     groups: list[list[Group]] = [[] for _ in range(page_count)]
     placed: list[PlacedTag] = []
     slots = grid.slots(len(requested), centred=True)
-    for (tag_id, layout), slot in zip(requested, slots, strict=True):
+    for (tag_id, _), slot in zip(requested, slots, strict=True):
         copy = sum(item.tag_id == tag_id for item in placed)
         name = f"tag-{tag_id}" + (f"-copy-{copy}" if copy else "")
         origin = card.origin(slot.corner_mm)
-        groups[slot.page].append(Group(name, card.marks(tag_id, layout, origin)))
+        groups[slot.page].append(Group(name, card.marks(drawings[tag_id], origin)))
         placed.append(PlacedTag(tag_id, slot.page, origin))
     pages = number_pages([UnnumberedPage(frame, tuple(page)) for page in groups])
     return TagPages(pages, tuple(placed))
@@ -172,31 +179,78 @@ def _too_small(frame: PageFrame, card: _TagCard) -> InputError:
 
 
 @dataclass(frozen=True)
+class _TagDrawing:
+    """Drawing of a tag around (0, 0), with the texts above and below it."""
+
+    marks: tuple[Mark, ...]
+    id_text: str
+    meaning: str
+    details: str
+
+    @classmethod
+    def of(cls, tags: Tags, tag_id: int, layout: TagLayout, mirror: bool) -> _TagDrawing:
+        """Draw a tag; angles that have no space between its magnets are listed below it."""
+        marks = draw_tag(tags, layout, mirror=mirror)
+        details = _design_text(tags)
+        if not has_all_angles(tags, marks):
+            details += f". {_angle_list(tags, layout, mirror)}"
+        id_text = f"id {tag_id}" + (", MIRRORED: seen from below" if mirror else "")
+        return cls(marks, id_text, printable(tags.meanings.get(tag_id, "")), details)
+
+
+def _design_text(tags: Tags) -> str:
+    disc = tags.magnet
+    return (
+        f"{tags.codec}, K={tags.order}, M={tags.magnets}, P={tags.orientations}, "
+        f"d={size_mm_text(tags.spacing_m)}, "
+        f"magnets D{size_mm_text(disc.diameter_m, disc.height_m)} "
+        f"{disc.grade or f'{disc.remanence_t:g} T'}, "
+        f"clearance {size_mm_text(tags.clearance_m)}"
+    )
+
+
+def _angle_list(tags: Tags, layout: TagLayout, mirror: bool) -> str:
+    """List the angles of the magnets as they are on the page, row by row from the top."""
+    angles = {
+        cell: angle_text(tags, symbol)
+        for cell, symbol in zip(layout.cells, layout.symbols, strict=True)
+    }
+    columns = range(tags.order)
+    rows = (
+        " ".join(
+            angles.get((column, row), "-") for column in (columns[::-1] if mirror else columns)
+        )
+        for row in reversed(columns)
+    )
+    return f"Angles, row by row from the top: {'; '.join(rows)}"
+
+
+@dataclass(frozen=True)
 class _TagCard:
     """Area that is cut out: a tag with axes above and at the left, and labels above and below.
 
-    The edges are in mm from the origin of the tag.
+    The edges are in mm from the origin of the tag; ``tag_bottom`` is that of its drawing.
     """
 
-    tags: Tags
-    mirror: bool
     left: float
     bottom: float
     right: float
     top: float
+    tag_bottom: float
 
     @classmethod
-    def for_ids(cls, tags: Tags, ids: Sequence[int], mirror: bool) -> _TagCard:
-        """Return the card that fits the labels of all of these ids."""
+    def for_drawings(cls, tags: Tags, drawings: Sequence[_TagDrawing], mirror: bool) -> _TagCard:
+        """Return the card that fits all of these drawings with their texts."""
         half = tag_half_side(tags)
         left, right = -half - AXIS_ARROW_MM, half + AXIS_TICK_MM
         if mirror:
             left, right = -right, -left
-        bare = cls(tags, mirror, left, -half - AXIS_TICK_MM, right, half + AXIS_ARROW_MM)
-        id_lines = max(len(bare._id_lines(tag_id)) for tag_id in ids)
-        top = bare.top + _block_height(id_lines, ID_POINTS)
-        bottom = bare.bottom - _block_height(len(bare._detail_lines()), DETAIL_POINTS)
-        return replace(bare, top=top, bottom=bottom)
+        bottom, top = -half - AXIS_TICK_MM, half + AXIS_ARROW_MM
+        bare = cls(left, bottom, right, top, bottom)
+        id_lines = max(len(bare._id_lines(drawing)) for drawing in drawings)
+        detail_lines = max(len(bare._detail_lines(drawing)) for drawing in drawings)
+        top += _block_height(id_lines, ID_POINTS)
+        return replace(bare, top=top, bottom=bottom - _block_height(detail_lines, DETAIL_POINTS))
 
     @property
     def size_mm(self) -> Point:
@@ -206,42 +260,33 @@ class _TagCard:
         """Return the origin of the tag on the page from the upper left corner of the card."""
         return round(corner[0] - self.left, 3), round(corner[1] - self.top, 3)
 
-    def marks(self, tag_id: int, layout: TagLayout, origin: Point) -> tuple[Mark, ...]:
+    def marks(self, drawing: _TagDrawing, origin: Point) -> tuple[Mark, ...]:
         """Draw the card of a tag with the origin of the tag at ``origin``."""
-        x, y = origin
-        left, top = x + self.left, y + self.top
-        bottom_of_tag = y - tag_half_side(self.tags) - AXIS_TICK_MM
-        return (
-            *draw_tag(self.tags, layout, origin, mirror=self.mirror),
-            *self._paragraph(self._id_lines(tag_id), top, left, ID_POINTS, bold=True),
-            *self._paragraph(self._detail_lines(), bottom_of_tag, left, DETAIL_POINTS),
-            *cut_marks(left, y + self.bottom, x + self.right, top),
+        corner = (self.left + TEXT_INDENT_MM, self.top)
+        below = (corner[0], self.tag_bottom)
+        marks = (
+            *drawing.marks,
+            *_paragraph(self._id_lines(drawing), corner, ID_POINTS, bold=True),
+            *_paragraph(self._detail_lines(drawing), below, DETAIL_POINTS),
+            *cut_marks(self.left, self.bottom, self.right, self.top),
         )
+        return tuple(shifted(mark, *origin) for mark in marks)
 
-    def _paragraph(
-        self, lines: list[str], top: float, left: float, points: float, *, bold: bool = False
-    ) -> list[Text]:
-        corner = (left + TEXT_INDENT_MM, top)
-        return paragraph(lines, corner, points, spacing_em=SPACING_EM, bold=bold)
-
-    def _id_lines(self, tag_id: int) -> list[str]:
+    def _id_lines(self, drawing: _TagDrawing) -> list[str]:
         """Return the id of the tag and its meaning, which are written above it."""
-        text = f"id {tag_id}" + (", MIRRORED: seen from below" if self.mirror else "")
-        lines = wrap(text, ID_POINTS, self.size_mm[0] - TEXT_INDENT_MM)
-        meaning = printable(self.tags.meanings.get(tag_id, ""))
-        return lines + wrap(meaning, ID_POINTS, self.size_mm[0] - TEXT_INDENT_MM)
+        texts = (drawing.id_text, drawing.meaning)
+        return [line for text in texts for line in self._wrap(text, ID_POINTS)]
 
-    def _detail_lines(self) -> list[str]:
+    def _detail_lines(self, drawing: _TagDrawing) -> list[str]:
         """Return the design of the tag, which is written below it."""
-        tags, disc = self.tags, self.tags.magnet
-        text = (
-            f"{tags.codec}, K={tags.order}, M={tags.magnets}, P={tags.orientations}, "
-            f"d={size_mm_text(tags.spacing_m)}, "
-            f"magnets D{size_mm_text(disc.diameter_m, disc.height_m)} "
-            f"{disc.grade or f'{disc.remanence_t:g} T'}, "
-            f"clearance {size_mm_text(tags.clearance_m)}"
-        )
-        return wrap(text, DETAIL_POINTS, self.size_mm[0] - TEXT_INDENT_MM)
+        return self._wrap(drawing.details, DETAIL_POINTS)
+
+    def _wrap(self, text: str, points: float) -> list[str]:
+        return wrap(text, points, self.size_mm[0] - TEXT_INDENT_MM)
+
+
+def _paragraph(lines: list[str], corner: Point, points: float, *, bold: bool = False) -> list[Text]:
+    return paragraph(lines, corner, points, spacing_em=SPACING_EM, bold=bold)
 
 
 def _block_height(lines: int, points: float) -> float:

@@ -64,7 +64,7 @@ def test_a_pack(locatk, map_file: Path, tmp_path: Path) -> None:
     sevens = next(item for item in answer["templates"] if item["code"] == "7")
     assert "row 0: 2; row 1: 0; row 2: 2" in words(out, sevens["page"])
     with parts.open() as stream:
-        rows = {row["part"]: int(row["count"]) for row in csv.DictReader(stream)}
+        rows = {row["part"]: int(row["count"]) for row in csv.DictReader(stream) if row["count"]}
     assert (rows["bar magnet"], rows["bar magnet, spare"]) == (32, 8)
     assert {item["part"]: item["count"] for item in answer["materials"]} == rows
     listed = words(out, answer["parts"]["list"][0])
@@ -196,3 +196,31 @@ def test_maps_that_cannot_be_built_are_named(locatk, tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert str(broken) in result.stderr
     assert not (tmp_path / "a.pdf").exists()
+
+
+def test_prices_are_in_the_pack_and_errors_are_one_line(
+    locatk, map_file: Path, tmp_path: Path
+) -> None:
+    template = locatk("print", "landmarks", "--print-prices")
+    assert template.exit_code == 0
+    prices, out = tmp_path / "prices.toml", tmp_path / "pack.pdf"
+    keys = 'price = 0.4\ncurrency = "EUR"\ndate = "2026-11"\nsource = "shop"\n'
+    bars = '[[parts]]\npart = "bar magnet"\n'
+    # A file has one currency: the published prices are in USD.
+    prices.write_text(template.stdout.replace(bars, bars + keys))
+    words_of = ("print", "landmarks", map_file, "-o", out, "--prices", prices)
+    refused = locatk(*words_of)
+    assert refused.exit_code == 1
+    assert len(refused.stderr.strip().split("Hint:")) == 2
+    assert not out.exists()
+    prices.write_text(template.stdout.replace(bars, bars + keys).replace("USD", "EUR"))
+    result = locatk(*words_of, "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    bar = answer["materials"][0]
+    assert bar["sum"] == pytest.approx(0.4 * bar["count"])
+    assert answer["materials_total"]["currency"] == "EUR"
+    assert "compass" in answer["materials_total"]["parts_without_price"]
+    page = words(out, answer["parts"]["materials"][0])
+    assert f"Total {answer['materials_total']['amount']:.2f} EUR, incomplete: no price of" in page
+    assert "shop, 2026-11" in page

@@ -47,12 +47,12 @@ def test_tags_that_are_named(locatk, tag_file: Path, tmp_path: Path) -> None:
         "print", "tag", tag_file, "--id", 262143, "--id", 5, "-o", out, "--size", "letter"
     )
     assert result.exit_code == 0, result.stderr
-    assert result.stdout == f"Wrote {out}: 2 tags on 1 page of 215.9 x 279.4 mm\n"
+    assert result.stdout == f"Wrote {out}: 2 tags on 1 page of 279.4 x 215.9 mm\n"
     assert "100 %" in result.stderr
     assert names(tmp_path) == ["tag.toml", "tags.pdf"]
     page = pypdfium2.PdfDocument(str(out))[0]
     size = [side * 25.4 / 72 for side in page.get_size()]
-    assert size == pytest.approx([215.9, 279.4], abs=0.05)
+    assert size == pytest.approx([279.4, 215.9], abs=0.05)
     assert "id 262143" in words(out)
     assert "id 5" in words(out)
 

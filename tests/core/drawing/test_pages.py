@@ -22,6 +22,7 @@ from locatk.core.drawing.pages import (
     size_text,
     table_pages,
 )
+from locatk.core.drawing.placement import text_box
 from locatk.core.errors import InputError
 
 A4 = (210.0, 297.0)
@@ -160,3 +161,15 @@ def test_a_row_with_an_empty_last_cell_takes_a_line() -> None:
     flow.add_row(("b", "c"), (30.0,))
     first, *_, second, _ = texts(flow.pages()[0].groups[0].marks)
     assert first.position[1] - second.position[1] >= line_height(FLOW_TEXT_POINTS)
+
+
+def test_rules_of_a_table_keep_their_distance_from_its_texts() -> None:
+    """Half a millimetre above and below, so that they do not merge on a screen either."""
+    rows = [("qj[ ]", "8")] * 23
+    columns = (TableColumn("yg", 30.0), TableColumn("(mm)", 30.0, is_right_aligned=True))
+    (page,) = table_pages(rows, columns, FRAME)
+    marks = page.groups[0].marks
+    rules = [mark.start[1] for mark in marks if isinstance(mark, Line)]
+    assert len(rules) == 5
+    for _, bottom, _, top in map(text_box, texts(marks)):
+        assert all(rule < bottom - 0.5 or rule > top + 0.5 for rule in rules)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from locatk.core.materials import BillItem
+from locatk.core.materials import BillItem, Price
 from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.bill_of_materials import write_bill
 from locatk.formats.exporters.export import plan_files
@@ -36,8 +36,10 @@ def test_names_of_devices_are_no_formulas(tmp_path: Path) -> None:
 
 def test_items_of_a_bill_are_no_formulas(tmp_path: Path) -> None:
     path = tmp_path / "parts.csv"
-    write_bill(path, [BillItem("=part", 3, "@detail", 1.5, "-source")], overwrite=False)
-    assert path.read_text().splitlines()[1] == "'=part,3,'@detail,1.5,'-source"
+    price = Price(1.5, "=EUR", "+2026", "-source")
+    write_bill(path, [BillItem("=part", 3, "@detail", price)], overwrite=False)
+    row = path.read_text().splitlines()[1]
+    assert row == "'=part,3,'@detail,1.5,'=EUR,4.5,'+2026,'-source"
 
 
 def test_names_of_devices_are_safe_names_of_files(tmp_path: Path) -> None:
