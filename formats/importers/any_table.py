@@ -19,8 +19,9 @@ from locatk.core.landmarks.halls import NAMES as HALL_NAMES
 from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats.importers.field_readings import exclude_readings, find_absent_readings
-from locatk.formats.importers.landmark_csv import POSE_KEYS, TIME_KEY, read_odometry, read_times
+from locatk.formats.importers.landmark_csv import POSE_KEYS, TIME_KEY, read_odometry
 from locatk.formats.importers.polaris_csv import ImportedSamples
+from locatk.formats.tables.clocks import read_times
 from locatk.formats.tables.delimited import Table
 from locatk.formats.tables.quantities import (
     TIME_NAMES,

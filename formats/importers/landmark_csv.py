@@ -20,6 +20,7 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.importers.field_readings import exclude_readings, find_absent_readings
+from locatk.formats.tables.clocks import read_times
 from locatk.formats.tables.delimited import Table
 from locatk.formats.tables.dialects import read_any_table
 from locatk.formats.tables.quantities import (
@@ -28,18 +29,11 @@ from locatk.formats.tables.quantities import (
     find_columns,
     units_by_quantity,
 )
-from locatk.formats.tables.timestamps import parse_decimal_time
 
 Array = NDArray[np.float64]
 
 DEVICE = "robot"
 FRAME = "odometry"
-
-MIN_EPOCH_NS = 946_684_800_000_000_000
-"""Times from the year 2000 on belong to a clock that counts from 1970."""
-
-MAX_TIME_NS = 2**62
-"""Largest time; differences of two of them fit into int64."""
 
 TIME_KEY = "t"
 
@@ -227,40 +221,6 @@ def read_landmarks(
         )
     warnings += _time_warnings(table, time_ns) + _odometry_warnings(odometry)
     return ImportedHalls(samples, odometry, facts, warnings, excluded, len(partial_poses))
-
-
-def read_times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str]:
-    """Return the times of the rows in nanoseconds since the epoch, and a text on their clock."""
-    table, unit = column.table, column.unit
-    if not unit:
-        time_ns, clock = table.iso_times_ns(column.name), "dates and times of the file"
-    else:
-        limit = MAX_TIME_NS / UNITS["time"][unit]
-        table.floats(column.name, -limit, limit)
-        cells = table.columns[column.name]
-        # Nanoseconds since 1970 have more digits than a float.
-        time_ns = np.array([parse_decimal_time(cell, unit) for cell in cells], np.int64)
-        if time_ns[0] >= MIN_EPOCH_NS:
-            clock = f"{unit} since 1970"
-        elif time_ns[0] >= 0:
-            clock = "unknown: times as in the file"
-        else:
-            # Sessions store no negative times.
-            time_ns = time_ns - time_ns[0]
-            clock = "unknown: the first row is at 0 s, which is negative in the file"
-    if start_ns is not None:
-        time_ns, clock = time_ns - time_ns[0] + start_ns, "the first row is at the given time"
-    steps_ns = np.diff(time_ns)
-    if (steps_ns <= 0).any():
-        row = int(np.argmax(steps_ns <= 0)) + 1
-        table.fail(
-            row,
-            "the time goes backwards"
-            if steps_ns[row - 1] < 0
-            else "the time is that of the previous row",
-            "Sort the rows by time, and write times with all of their digits",
-        )
-    return time_ns, clock
 
 
 def _fields(columns: Sequence[Column], volts: Volts | None) -> Array:
