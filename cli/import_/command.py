@@ -62,7 +62,7 @@ IMPORTERS = "locatk.formats.importers."
 
 LIGHTHOUSE, DOTS = "Lighthouse base stations", "Micro-dot sheets"
 POLARIS, LANDMARKS = "Magnetic tags (polaris)", "Landmarks"
-TABLES = "Magnetic tags or landmarks"
+TABLES = "Base stations, magnetic tags or landmarks"
 
 SCENE_FORMAT = "crazyflie-config"
 """Format whose output is a scene instead of a session."""
@@ -200,17 +200,22 @@ FORMATS = {
     ),
     "table": Format(
         TABLES,
-        "Magnetometers, hall sensors, odometry in any table (CSV, TSV, Parquet).",
+        "Sweeps, magnetometers, hall sensors, odometry, IMUs in any table.",
         "locatk.formats.tables.dialects:read_any_table",
         table.import_table,
-        "Magnetometers or hall sensors, and odometry, in any table: CSV with commas, semicolons or "
-        "tabs, or Parquet. Columns are recognised by usual names, as in mag0_x [uT], Bx1 (mT), "
-        "hall_front_mt, odom_x_m; --columns names others by the keys t, b0x, b0y, b0z, b1x, ..., "
-        "front, left, rear, right, x, y, heading. What was recognised is printed. Units are part "
-        "of the names or given by --units; times since 1970 and in ISO 8601 need none.",
+        "Sweeps of base stations, magnetometers or hall sensors, with an IMU and odometry, in any "
+        "table: CSV with commas, semicolons or tabs, or Parquet. Columns are recognised by usual "
+        "names, as in lfsr_count, mag0_x [uT], Bx1 (mT), hall_front_mt, odom_x_m, accel_x (g); "
+        "--columns names others by keys: t, date, device; channel (from 1), station (from 0), "
+        "sensor, sweep, count, offset, alpha, angle, or count0_ch4_s2; b0x, b0y, b0z, b1x, ...; "
+        "front, left, rear, right; x, y, heading; ax, ay, az, gx, gy, gz. What was recognised is "
+        "printed in the form of a file for --mapping. Units are part of the names or given by "
+        "--units; times since 1970 and in ISO 8601 need none.",
         (
+            "table sweeps.csv --units us,24mhz --receiver deck -o run.mcap",
             "table log.csv --spacing 20 --tag tag.toml -o run.mcap",
             "table log.tsv --columns b0x=u,b0y=v,b0z=w --units ut -o a.mcap",
+            'table log.csv --mapping lab.toml --clock "us, 32 bit" -o b.mcap',
             "table robot.parquet --map map.toml -o run.mcap",
         ),
         table.OPTIONS,

@@ -133,6 +133,7 @@ def read_landmarks(
     volts: Volts | None = None,
     downward: bool = False,
     start_ns: int | None = None,
+    times: tuple[NDArray[np.int64], str] | None = None,
 ) -> ImportedHalls:
     """Read one recording.
 
@@ -153,6 +154,9 @@ def read_landmarks(
     start_ns : int, optional
         Time of the first row since the epoch. [default: times are kept; if the first one is
         negative, it becomes 0]
+    times : tuple of (n,) int64 ndarray and str, optional
+        Times of the rows since the epoch, and a text on their clock. [default: of the column
+        ``t``]
 
     Raises
     ------
@@ -170,14 +174,14 @@ def read_landmarks(
         )
     table = path if isinstance(path, Table) else read_any_table(path)
     quantities = {
-        TIME_KEY: ("time",),
+        **({TIME_KEY: ("time",)} if times is None else {}),
         "x": ("length",),
         "y": ("length",),
         "heading": ("angle",),
         **dict.fromkeys(sensors.names, ("field", "voltage")),
     }
     by_key = find_columns(table, quantities, columns or {}, given_units)
-    time_ns, clock = read_times(by_key[TIME_KEY], start_ns)
+    time_ns, clock = times or read_times(by_key[TIME_KEY], start_ns)
     odometry, repeated_poses, partial_poses = read_odometry(table, by_key, time_ns)
     readings = [by_key[name] for name in sensors.names]
     field_t = _fields(readings, volts)

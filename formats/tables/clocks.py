@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -256,7 +257,7 @@ def _continue(
     """Return the counts of some rows, continued over wraps of the counter."""
     indices = rows.tolist()
     own = [counts[row] for row in indices]
-    max_delay = (max_delay_ns or 0) / clock.period_ns
+    max_delay = int((max_delay_ns or 0) / clock.period_ns)
     size = clock.range
     if size is None:
         for k in range(1, len(own)):
@@ -275,7 +276,7 @@ def _continue(
     continued = own[:1]
     for k in range(1, len(own)):
         step = own[k] - own[k - 1]
-        if step < 0 and step + size <= size / 2:
+        if step < 0 and 2 * (step + size) <= size:
             wraps += size
         elif step > 0 and size - step <= max_delay:
             wraps -= size  # a late row from before the wrap
@@ -313,7 +314,7 @@ def _suggest_clock(counts: Sequence[Count], k: int, clock: Clock) -> str | None:
     The width is the smallest one that the count before the jump needs, in the unit of the column
     or in a finer one, from which a program converted it. The step over the wrap must be usual.
     """
-    steps = sorted(b - a for a, b in zip(counts[: k - 1], counts[1:k], strict=True) if b > a)
+    steps = sorted(b - a for a, b in pairwise(counts[:k]) if b > a)
     if not steps or counts[k] < 0:
         return None
     usual = steps[len(steps) // 2]
@@ -375,9 +376,7 @@ def _dated_times(table: Table, dates: str, times: str) -> Times:
             text = f"{day[1]}-{month:>02}-{month_day:>02}T{clock[1]:>02}{clock[2]}"
             joined.append(parse_iso_time(text, utc_only=False))
         except ValueError:
-            table.fail(
-                row,
-                f"{date[:MAX_QUOTED_CHARACTERS]!r} and {time[:MAX_QUOTED_CHARACTERS]!r} are not a date and a time",
-                "Write them as 2026-01-31 and 12:00:00.5",
-            )
+            cell = f"{date} {time}"[:MAX_QUOTED_CHARACTERS]
+            hint = "Write them as 2026-01-31 and 12:00:00.5"
+            table.fail(row, f"{cell!r} is not a date and a time", hint)
     return np.array(joined, np.int64)

@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError
-from locatk.formats.importers.any_table import guess_columns, read_magnetometers
+from locatk.formats.importers.any_table.columns import guess_columns
+from locatk.formats.importers.any_table.magnetometers import read_magnetometers
 from locatk.formats.tables.dialects import read_any_table
 
 FIELD_UT = (
@@ -167,7 +168,7 @@ def test_an_exported_drive_is_solved_again(locatk: Callable[..., Any], tmp_path:
         *("--spacing", f"{spacing:g}", "--tag", tag, "-o", tmp_path / "again.mcap"),
     )
     assert result.exit_code == 0, result.stderr
-    assert "Columns: --columns t=zeit,b1x=mag1_x" in result.stderr
+    assert '[columns]\nt = "zeit"\nb1x = "mag1_x"\n' in result.stderr
     tags = []
     for path in (run, tmp_path / "again.mcap"):
         solved = locatk("solve", path, "-o", tmp_path / f"{path.stem}-solved.mcap", "--json")
@@ -196,7 +197,11 @@ def test_hall_sensors_and_odometry(locatk: Callable[..., Any], tmp_path: Path) -
 def test_tables_of_nothing_are_refused(locatk: Callable[..., Any], tmp_path: Path) -> None:
     log, output = tmp_path / "log.csv", tmp_path / "run.mcap"
     for text, status, problem in (
-        ("a,b\n1,2\n", 2, "neither magnetometers nor hall sensors"),
+        (
+            "a,b\n1,2\n",
+            2,
+            "none of sweeps of base stations, magnetometers, hall sensors and an IMU",
+        ),
         ("", 1, "empty"),
         ("\x00\x01\x02", 1, ""),
     ):
