@@ -232,7 +232,7 @@ def guess_columns(
                 hint=f"Name one: --columns {key}={names[0]}",
             )
         headers[key] = names[0]
-    ignored = tuple(name for name in table.columns if name not in headers.values())
+    ignored = tuple(name for name in table.columns if name and name not in headers.values())
     time_unit = {} if clock else _time_unit(table, headers.get(TIME_KEY), units)
     return ColumnGuess(headers, time_unit, ignored, halls)
 

@@ -34,6 +34,7 @@ from locatk.core.lighthouse.channels import (
     channel_of,
     period_counts,
 )
+from locatk.core.lighthouse.lfsr import SEQUENCE_LENGTH
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
@@ -61,7 +62,11 @@ IntArray = NDArray[np.int64]
 
 COUNT_HZ = TICK_HZ / TICKS_PER_COUNT
 
+MAX_ROUNDING_COUNTS = 1e-3
+"""Largest rounding error of an angle at the rotor's zero, in counts: 5e-8 rad."""
+
 MAX_SENSOR = 255
+"""Largest number of a photodiode; the largest known receivers have 32."""
 
 MEASUREMENT_HINTS = {
     "count": "Counts are steps of 6 MHz; name a column of other ticks offset",
@@ -321,7 +326,10 @@ def _counts(
         angle = values * UNITS["angle"][column.unit]
         zero = ROTOR_ZERO_RAD[sweep] if measurement.quantity == "angle" else 0.0
         counts = (angle - zero) / (2 * np.pi) * period
-    is_wrong = ~((counts >= 0) & (counts < period))
+    # Decoders that err report any index, also beyond the rotation. Solvers reject these sweeps.
+    is_index = measurement.quantity in ("count", "offset")
+    limit = np.full(len(rows), float(SEQUENCE_LENGTH)) if is_index else period
+    is_wrong = ~((counts >= -MAX_ROUNDING_COUNTS) & (counts <= limit))
     if is_wrong.any():
         index = int(np.argmax(is_wrong))
         row = int(rows[index])
@@ -329,7 +337,7 @@ def _counts(
         table.fail(
             row,
             f"{cell} in column {column.name!r} is not within a rotation of channel "
-            f"{channel[index]} ({period[index]:.6g} counts)",
+            f"{channel[index]} ({period[index]:.8g} counts)",
             MEASUREMENT_HINTS[measurement.quantity],
         )
-    return np.asarray(counts, float)
+    return np.maximum(counts, 0.0)
