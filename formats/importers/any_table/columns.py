@@ -75,9 +75,7 @@ _ACCELERATION = re.compile(
 _ANGULAR_RATE = re.compile(
     r"(?:imu_)?(?:g|gyr|gyro|gyroscope|omega|angular_rate|angular_velocity)_?([xyz])"
 )
-_MEASUREMENT_NAMES = re.compile(
-    r"(?:lfsr|lfsr_count|lfsr_index)(?=_?[01]?(?:_|$))|rotor_angle|raw_angle"
-)
+_MEASUREMENT_NAMES = re.compile(r"lfsr(?:_count|_index)?(?=_?[01]?(?:_|$))|rotor_angle|raw_angle")
 _SWEEP_NAMES = {
     "channel": ("channel", "mode"),
     "polynomial": ("polynomial", "poly", "lfsr_polynomial"),

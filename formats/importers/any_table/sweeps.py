@@ -151,9 +151,12 @@ def read_sweeps(
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     warnings = list(warnings)
-    if measurements and not len(rows):
+    if not len(rows) and (measurements or not imu):
+        names = ", ".join(headers.values())
         raise InputError(
-            "no sweep: the columns of measurements are empty", file=table.file, hint="Check them"
+            f"no sweep: {names + ' is empty' if names else 'no column has a measurement'}",
+            file=table.file,
+            hint="Name the column of measurements: --columns count=NAME",
         )
     if not measurements:
         warnings.append("no sweeps of base stations: the session cannot be solved")
