@@ -304,6 +304,23 @@ def _format_command(name: str, chosen: Format) -> FormatCommand:
     )
 
 
+def _find_format(args: list[str]) -> int | None:
+    """Return the index of the format among arguments; None without one.
+
+    The value of an option, as in ``-o table``, is not the format.
+    """
+    options_with_value = {"-o", "--output"}
+    for option in FORMAT_OPTIONS.values():
+        if isinstance(option, click.Option) and not option.is_flag:
+            options_with_value.update(option.opts)
+    is_value = False
+    for index, word in enumerate(args):
+        if word in FORMATS and not is_value:
+            return index
+        is_value = word in options_with_value
+    return None
+
+
 class ImportGroup(Group):
     """Group of the formats, listed by system."""
 
@@ -318,7 +335,7 @@ class ImportGroup(Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments; options may precede the format."""
         if args and args[0].startswith("-"):
-            index = next((k for k, word in enumerate(args) if word in FORMATS), None)
+            index = _find_format(args)
             if index is not None:
                 args = [args[index], *args[:index], *args[index + 1 :]]
         return super().parse_args(ctx, args)
