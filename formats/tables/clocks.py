@@ -258,13 +258,12 @@ def _continue(
     indices = rows.tolist()
     own = [counts[row] for row in indices]
     max_delay = int((max_delay_ns or 0) / clock.period_ns)
-    size = clock.range
-    if size is None:
+    if clock.range is None:
         for k in range(1, len(own)):
             if own[k - 1] - own[k] > max_delay:
                 _fail_jump(table, indices[k], own, k, clock)
         return own
-    size = int(size) if size.denominator == 1 else size
+    size: Count = int(clock.range) if clock.range.denominator == 1 else clock.range
     for k, count in enumerate(own):
         if not 0 <= count < size:
             table.fail(

@@ -211,15 +211,15 @@ def guess_columns(
     table.require(*headers.values())
     candidates: dict[str, list[str]] = {}
     for name in table.columns:
-        key = _key_of(table, name)
-        if key is not None and name not in headers.values() and key not in headers:
-            candidates.setdefault(key, []).append(name)
+        usual = _key_of(table, name)
+        if usual is not None and name not in headers.values() and usual not in headers:
+            candidates.setdefault(usual, []).append(name)
     _check_stations(table, {*candidates, *headers})
     for key in _unneeded_keys({*candidates, *headers}, halls):
         candidates.pop(key, None)
     if TIME_KEY in headers or TIME_KEY in candidates:
-        name = headers.get(TIME_KEY) or candidates[TIME_KEY][0]
-        if not is_time_of_day(table.columns[name][0]):
+        times = headers.get(TIME_KEY) or candidates[TIME_KEY][0]
+        if not is_time_of_day(table.columns[times][0]):
             candidates.pop(DATE_KEY, None)
     for key, names in candidates.items():
         if len(names) > 1:

@@ -161,12 +161,16 @@ def read_sweeps(
     if not measurements:
         warnings.append("no sweeps of base stations: the session cannot be solved")
     order = np.lexsort((rows, times))
+    integers = [values[order].astype(np.int32) for values in (sensor, channel, polynomial, sweep)]
     sweeps = Sweeps(
-        devices,
-        times[order],
-        groups[rows[order]].astype(np.int32),
-        *(values[order].astype(np.int32) for values in (sensor, channel, polynomial, sweep)),
-        count[order],
+        devices=devices,
+        time_ns=times[order],
+        device=groups[rows[order]].astype(np.int32),
+        sensor=integers[0],
+        channel=integers[1],
+        polynomial=integers[2],
+        sweep=integers[3],
+        count=count[order],
     )
     described = {key: by_key[key] for key in measurements}
     facts = {
