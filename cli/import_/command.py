@@ -215,7 +215,7 @@ FORMATS = {
             "table sweeps.csv --units us,24mhz --receiver deck -o run.mcap",
             "table log.csv --spacing 20 --tag tag.toml -o run.mcap",
             "table log.tsv --columns b0x=u,b0y=v,b0z=w --units ut -o a.mcap",
-            'table log.csv --mapping lab.toml --clock "us, 32 bit" -o b.mcap',
+            'table log.csv --mapping lab.toml --clock "ms, 24 bit" \\\n          -o b.mcap',
             "table robot.parquet --map map.toml -o run.mcap",
         ),
         table.OPTIONS,
@@ -393,6 +393,7 @@ def command() -> None:
       locatk import images frames/ --sheet sheet.toml --rate 46.6 -o run.mcap
       locatk import polaris-csv RawData_1.csv --rate 40 --spacing 20 -o run.mcap
       locatk import landmark-csv run.csv --map map.toml -o run.mcap
+      locatk import table log.csv --mapping lab.toml -o run.mcap
     """
 
 

@@ -99,6 +99,29 @@ def test_small_times_need_a_unit(tmp_path: Path) -> None:
     assert np.diff(imported.samples.time_ns).tolist() == [20_000_000]
 
 
+def test_dates_may_have_a_column_of_their_own(tmp_path: Path) -> None:
+    """A date beside times of the day is used, one beside full times is not."""
+    path = tmp_path / "log.csv"
+    rows = "{}23:59:59,5{sep}1;2;43\n{}00:00:00,5{sep}1;3;43\n"
+    for text, ignored in (
+        ("Date;Time;bx_ut;by_ut;bz_ut\n" + rows.format("2026-01-31;", "2026-02-01;", sep=";"), ()),
+        (
+            "Date;Time;bx_ut;by_ut;bz_ut\n"
+            + rows.format("31.01.26;2026-01-31T", "1.02.26;2026-02-01T", sep="Z;"),
+            ("date",),
+        ),
+    ):
+        path.write_text(text)
+        table = read_any_table(path)
+        guess = guess_columns(table, {}, ())
+        imported, _ = read_magnetometers(table, guess)
+        assert imported.samples.time_ns.tolist() == [1769903999_500000000, 1769904000_500000000]
+        assert guess.ignored == ignored
+    path.write_text("time,bx_ut,by_ut,bz_ut\n12:00:00,1,2,43\n12:00:01,1,3,43\n")
+    with pytest.raises(FormatError, match="times of the day without dates"):
+        read_guessed(path)
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
