@@ -214,7 +214,15 @@ def guess_columns(
         usual = _key_of(table, name)
         if usual is not None and name not in headers.values() and usual not in headers:
             candidates.setdefault(usual, []).append(name)
-    _check_stations(table, {*candidates, *headers})
+    named = {_kind_of(key, halls) for key in headers} - {None}
+    if len(named) == 1:
+        # The user decided which observations of the table to import.
+        candidates = {
+            key: names
+            for key, names in candidates.items()
+            if _kind_of(key, halls) in (None, *named)
+        }
+    _check_stations(table, {*candidates, *headers}, halls)
     for key in _unneeded_keys({*candidates, *headers}, halls):
         candidates.pop(key, None)
     if TIME_KEY in headers or TIME_KEY in candidates:
@@ -321,9 +329,19 @@ def _unneeded_keys(keys: set[str], halls: Iterable[str]) -> set[str]:
     return unneeded
 
 
-def _check_stations(table: Table, keys: set[str]) -> None:
+def _kind_of(key: str, halls: Iterable[str]) -> str | None:
+    """Return the kind of observations of which a key is; None if it may be part of several."""
+    if _MAGNETOMETER_KEY.fullmatch(key):
+        return "magnetometers"
+    if key in halls:
+        return "halls"
+    return "sweeps" if parse_measurement(key) else None
+
+
+def _check_stations(table: Table, keys: set[str], halls: Iterable[str]) -> None:
     """Refuse numbers of stations of which it is not known whether they count from 0 or from 1."""
-    if any(key in keys for key in STATION_KEYS):
+    kinds = {_kind_of(key, halls) for key in keys}
+    if any(key in keys for key in STATION_KEYS) or kinds & {"magnetometers", "halls"}:
         return
     measurements = [each for key in keys if (each := parse_measurement(key))]
     for name in table.columns:

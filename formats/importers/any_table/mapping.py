@@ -107,8 +107,6 @@ def read_mapping(path: Path, halls: Iterable[str] = HALL_NAMES) -> TableMapping:
 def dumps_mapping(guess: ColumnGuess, mapping: TableMapping) -> str:
     """Return the text of a file that names all columns that are used, with their units."""
     units = {**guess.units, **units_by_quantity(mapping.units)}
-    if mapping.clock is not None:
-        units.pop("time", None)
     return toml.dumps(
         {
             "clock": None if mapping.clock is None else mapping.clock.text,

@@ -58,7 +58,9 @@ def axes(header: str) -> list[str]:
     return [header[: at + 1] + axis + header[at + 2 :] for axis in "xyz"]
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(
+    max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
 @given(
     acceleration=st.sampled_from(sorted(ACCELERATIONS)),
     rate=st.sampled_from(sorted(RATES)),

@@ -99,6 +99,23 @@ def test_small_times_need_a_unit(tmp_path: Path) -> None:
     assert np.diff(imported.samples.time_ns).tolist() == [20_000_000]
 
 
+def test_the_user_decides_which_observations_are_imported(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("t_s,bx_ut,by_ut,bz_ut,channel,count,front_mt,station\n0,1,2,43,3,9,7,5\n")
+    table = read_any_table(path)
+    guess = guess_columns(table, {}, ())
+    assert guess.magnetometers
+    assert guess.measurements
+    assert guess.has_halls
+    for key, header in (("b0x", "bx_ut"), ("count", "count"), ("front", "front_mt")):
+        guess = guess_columns(table, {key: header}, ())
+        found = (bool(guess.magnetometers), bool(guess.measurements), guess.has_halls)
+        assert found == (key == "b0x", key == "count", key == "front")
+    # Without a channel, count and station are no sweeps.
+    path.write_text("t_s,bx_ut,by_ut,bz_ut,count,station\n0,1,2,43,9,5\n")
+    assert guess_columns(read_any_table(path), {}, ()).ignored == ("count", "station")
+
+
 def test_dates_may_have_a_column_of_their_own(tmp_path: Path) -> None:
     """A date beside times of the day is used, one beside full times is not."""
     path = tmp_path / "log.csv"

@@ -25,7 +25,9 @@ from locatk.formats.tables.delimited import Table
 KEYS = ["t", "device", "b0x", "b0y", "b0z", "front", "heading", "count0_ch4", "ax", "channel"]
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(
+    max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
 @given(
     headers=st.lists(
         st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=12)

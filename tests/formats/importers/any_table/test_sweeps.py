@@ -55,18 +55,20 @@ TURNS = {
 points straight ahead after 120 degrees, the second after 240."""
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@pytest.mark.parametrize("header", TURNS)
+@settings(
+    max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None
+)
 @given(
     sweeps=st.lists(SWEEP, min_size=1, max_size=12),
-    header=st.sampled_from(sorted(TURNS)),
     station=st.sampled_from(["channel", "station", "Base Station", "polynomial"]),
     time=st.sampled_from([("timestamp [us]", 1000), ("t_ns", 1), ("Time (ms)", 10**6)]),
     dialect=st.sampled_from([(",", "."), (";", ","), ("\t", "."), ("|", ".")]),
     order=st.permutations(range(6)),
 )
 def test_the_same_sweeps_in_any_form(
-    sweeps: list[tuple[int, int, int, float, bool]],
     header: str,
+    sweeps: list[tuple[int, int, int, float, bool]],
     station: str,
     time: tuple[str, int],
     dialect: tuple[str, str],
@@ -116,6 +118,14 @@ def test_a_row_may_have_several_sweeps(tmp_path: Path) -> None:
         assert sweeps.sweep.tolist() == [0, 1, 0, 0]
         assert sweeps.count.tolist() == [100, 200, 101, 7]
         assert sweeps.time_ns.tolist() == [0, 0, 20_000_000, 20_000_000]
+
+
+def test_the_unit_of_the_times_is_not_that_of_offsets(tmp_path: Path) -> None:
+    text = "t,channel,offset_us\n0,1,10\n"
+    (count,) = import_text(tmp_path / "a.csv", text, units=("ms",)).count
+    assert count == pytest.approx(60)
+    with pytest.raises(InputError, match="the unit of column 'offset' is missing"):
+        import_text(tmp_path / "a.csv", text.replace("_us", ""), units=("ms",))
 
 
 def test_sensor_and_plane_may_be_unknown(tmp_path: Path) -> None:
