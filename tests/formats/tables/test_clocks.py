@@ -97,6 +97,18 @@ def test_rows_of_devices_may_be_late(delays_ns: list[int], devices: list[int]) -
         np.testing.assert_array_equal(np.diff(read[own]), np.diff(expected))
 
 
+def test_a_late_row_from_before_a_wrap_stays_before_it() -> None:
+    size = 1 << 24
+    cells = [size - 9000, 1000, size - 4000, 6000]
+    time_ns, _ = read_times(
+        column(list(map(str, cells))),
+        None,
+        clock=parse_clock("us, 24 bit"),
+        max_delay_ns=20_000_000,
+    )
+    assert (time_ns - time_ns[0]).tolist() == [0, 10_000_000, 5_000_000, 15_000_000]
+
+
 @pytest.mark.parametrize(
     ("unit", "cells", "suggestion"),
     [
