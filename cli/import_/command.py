@@ -62,7 +62,7 @@ IMPORTERS = "locatk.formats.importers."
 
 LIGHTHOUSE, DOTS = "Lighthouse base stations", "Micro-dot sheets"
 POLARIS, LANDMARKS = "Magnetic tags (polaris)", "Landmarks"
-TABLES = "Magnetic tags or landmarks"
+TABLES = "Base stations, magnetic tags or landmarks"
 
 SCENE_FORMAT = "crazyflie-config"
 """Format whose output is a scene instead of a session."""
@@ -200,17 +200,22 @@ FORMATS = {
     ),
     "table": Format(
         TABLES,
-        "Magnetometers, hall sensors, odometry in any table (CSV, TSV, Parquet).",
+        "Sweeps, magnetometers, hall sensors, odometry, IMUs in any table.",
         "locatk.formats.tables.dialects:read_any_table",
         table.import_table,
-        "Magnetometers or hall sensors, and odometry, in any table: CSV with commas, semicolons or "
-        "tabs, or Parquet. Columns are recognised by usual names, as in mag0_x [uT], Bx1 (mT), "
-        "hall_front_mt, odom_x_m; --columns names others by the keys t, b0x, b0y, b0z, b1x, ..., "
-        "front, left, rear, right, x, y, heading. What was recognised is printed. Units are part "
-        "of the names or given by --units; times since 1970 and in ISO 8601 need none.",
+        "Sweeps of base stations, magnetometers or hall sensors, with an IMU and odometry, in any "
+        "table: CSV with commas, semicolons or tabs, or Parquet. Columns are recognised by usual "
+        "names, as in lfsr_count, mag0_x [uT], Bx1 (mT), hall_front_mt, odom_x_m, accel_x (g); "
+        "--columns names others by keys: t, date, device; channel (from 1), station (from 0), "
+        "sensor, sweep, count, offset, alpha, angle, or count0_ch4_s2; b0x, b0y, b0z, b1x, ...; "
+        "front, left, rear, right; x, y, heading; ax, ay, az, gx, gy, gz. What was recognised is "
+        "printed in the form of a file for --mapping. Units are part of the names or given by "
+        "--units; times since 1970 and in ISO 8601 need none.",
         (
+            "table sweeps.csv --units us,24mhz --receiver deck -o run.mcap",
             "table log.csv --spacing 20 --tag tag.toml -o run.mcap",
             "table log.tsv --columns b0x=u,b0y=v,b0z=w --units ut -o a.mcap",
+            'table log.csv --mapping lab.toml --clock "ms, 24 bit" \\\n          -o b.mcap',
             "table robot.parquet --map map.toml -o run.mcap",
         ),
         table.OPTIONS,
@@ -299,6 +304,23 @@ def _format_command(name: str, chosen: Format) -> FormatCommand:
     )
 
 
+def _find_format(args: list[str]) -> int | None:
+    """Return the index of the format among arguments; None without one.
+
+    The value of an option, as in ``-o table``, is not the format.
+    """
+    options_with_value = {"-o", "--output"}
+    for option in FORMAT_OPTIONS.values():
+        if isinstance(option, click.Option) and not option.is_flag:
+            options_with_value.update(option.opts)
+    is_value = False
+    for index, word in enumerate(args):
+        if word in FORMATS and not is_value:
+            return index
+        is_value = word in options_with_value
+    return None
+
+
 class ImportGroup(Group):
     """Group of the formats, listed by system."""
 
@@ -313,7 +335,7 @@ class ImportGroup(Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments; options may precede the format."""
         if args and args[0].startswith("-"):
-            index = next((k for k, word in enumerate(args) if word in FORMATS), None)
+            index = _find_format(args)
             if index is not None:
                 args = [args[index], *args[:index], *args[index + 1 :]]
         return super().parse_args(ctx, args)
@@ -371,6 +393,7 @@ def command() -> None:
       locatk import images frames/ --sheet sheet.toml --rate 46.6 -o run.mcap
       locatk import polaris-csv RawData_1.csv --rate 40 --spacing 20 -o run.mcap
       locatk import landmark-csv run.csv --map map.toml -o run.mcap
+      locatk import table log.csv --mapping lab.toml -o run.mcap
     """
 
 

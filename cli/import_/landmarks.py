@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,14 +57,15 @@ landmark_options = section(
         metavar="KEY=NAME,...",
         callback=parse_columns,
         help="Headers of t, x, y, heading and of the sensors front, left, rear, right (or those of "
-        "--halls), if they differ from these names.",
+        "--halls), if they differ from these names; for table of any key.",
     ),
     click.option(
         "--units",
         metavar="UNIT,...",
         callback=parse_words,
         help="Units of columns without a unit in their names: one of s, ms, us, ns; of m, cm, mm; "
-        "of rad, deg; of t, mt, ut, nt, gauss, v, mv.",
+        "of rad, deg; of t, mt, ut, nt, gauss, v, mv; for table also of m/s2, g, mg; of rad/s, "
+        "deg/s; of 6mhz, 24mhz, 48mhz (ticks).",
     ),
     click.option(
         "--circle",
@@ -105,9 +107,17 @@ landmark_options = section(
 
 
 def import_samples(
-    reader: Any, paths: tuple[Path, ...], output: Path, given: dict[str, Any], overwrite: bool
+    reader: Any,
+    paths: tuple[Path, ...],
+    output: Path,
+    given: dict[str, Any],
+    overwrite: bool,
+    imu: Sequence[Any] = (),
 ) -> tuple[dict[str, Any], str | None]:
-    """Import samples; returns the results for ``--json`` and a summary of the losses."""
+    """Import samples; returns the results for ``--json`` and a summary of the losses.
+
+    ``imu`` are samples of inertial sensors to write along with them.
+    """
     from locatk.formats.artifacts import maps
     from locatk.formats.sessions import field_samples
 
@@ -130,6 +140,7 @@ def import_samples(
             [imported.samples],
             floor=floor,
             odometry=[imported.odometry],
+            imu=imu,
             facts=imported.facts,
             warnings=imported.warnings,
             overwrite=overwrite,
@@ -192,4 +203,4 @@ def _sensors(circle_mm: float | None, file: Path | None, floor: Any) -> Any:
         return HallSensors(position_m=circle(circle_mm / 1000))
     if floor is not None:
         return HallSensors(position_m=circle(floor.geometry.circle_m))
-    raise click.UsageError("The format landmark-csv needs --circle, --halls or --map.")
+    raise click.UsageError("A recording of hall sensors needs --circle, --halls or --map.")

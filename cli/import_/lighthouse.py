@@ -88,7 +88,8 @@ lighthouse_options = combine(
         click.option(
             "--receiver",
             metavar="NAME|FILE",
-            help="Layout of the photodiodes: deck, bolt, or a receiver.toml.  [default: deck]",
+            help="Layout of the photodiodes: deck, bolt, or a receiver.toml.  [default: deck, for "
+            "table none]",
         ),
         click.option(
             "--mounting",

@@ -20,6 +20,7 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.trajectory import MAX_ODOMETRY, Trajectory
 from locatk.formats.importers.field_readings import exclude_readings, find_absent_readings
+from locatk.formats.tables.clocks import read_times
 from locatk.formats.tables.delimited import Table
 from locatk.formats.tables.dialects import read_any_table
 from locatk.formats.tables.quantities import (
@@ -28,18 +29,11 @@ from locatk.formats.tables.quantities import (
     find_columns,
     units_by_quantity,
 )
-from locatk.formats.tables.timestamps import parse_decimal_time
 
 Array = NDArray[np.float64]
 
 DEVICE = "robot"
 FRAME = "odometry"
-
-MIN_EPOCH_NS = 946_684_800_000_000_000
-"""Times from the year 2000 on belong to a clock that counts from 1970."""
-
-MAX_TIME_NS = 2**62
-"""Largest time; differences of two of them fit into int64."""
 
 TIME_KEY = "t"
 
@@ -139,6 +133,7 @@ def read_landmarks(
     volts: Volts | None = None,
     downward: bool = False,
     start_ns: int | None = None,
+    times: tuple[NDArray[np.int64], str] | None = None,
 ) -> ImportedHalls:
     """Read one recording.
 
@@ -159,6 +154,9 @@ def read_landmarks(
     start_ns : int, optional
         Time of the first row since the epoch. [default: times are kept; if the first one is
         negative, it becomes 0]
+    times : tuple of (n,) int64 ndarray and str, optional
+        Times of the rows since the epoch, and a text on their clock. [default: of the column
+        ``t``]
 
     Raises
     ------
@@ -176,14 +174,14 @@ def read_landmarks(
         )
     table = path if isinstance(path, Table) else read_any_table(path)
     quantities = {
-        TIME_KEY: ("time",),
+        **({TIME_KEY: ("time",)} if times is None else {}),
         "x": ("length",),
         "y": ("length",),
         "heading": ("angle",),
         **dict.fromkeys(sensors.names, ("field", "voltage")),
     }
     by_key = find_columns(table, quantities, columns or {}, given_units)
-    time_ns, clock = read_times(by_key[TIME_KEY], start_ns)
+    time_ns, clock = times or read_times(by_key[TIME_KEY], start_ns)
     odometry, repeated_poses, partial_poses = read_odometry(table, by_key, time_ns)
     readings = [by_key[name] for name in sensors.names]
     field_t = _fields(readings, volts)
@@ -227,40 +225,6 @@ def read_landmarks(
         )
     warnings += _time_warnings(table, time_ns) + _odometry_warnings(odometry)
     return ImportedHalls(samples, odometry, facts, warnings, excluded, len(partial_poses))
-
-
-def read_times(column: Column, start_ns: int | None) -> tuple[NDArray[np.int64], str]:
-    """Return the times of the rows in nanoseconds since the epoch, and a text on their clock."""
-    table, unit = column.table, column.unit
-    if not unit:
-        time_ns, clock = table.iso_times_ns(column.name), "dates and times of the file"
-    else:
-        limit = MAX_TIME_NS / UNITS["time"][unit]
-        table.floats(column.name, -limit, limit)
-        cells = table.columns[column.name]
-        # Nanoseconds since 1970 have more digits than a float.
-        time_ns = np.array([parse_decimal_time(cell, unit) for cell in cells], np.int64)
-        if time_ns[0] >= MIN_EPOCH_NS:
-            clock = f"{unit} since 1970"
-        elif time_ns[0] >= 0:
-            clock = "unknown: times as in the file"
-        else:
-            # Sessions store no negative times.
-            time_ns = time_ns - time_ns[0]
-            clock = "unknown: the first row is at 0 s, which is negative in the file"
-    if start_ns is not None:
-        time_ns, clock = time_ns - time_ns[0] + start_ns, "the first row is at the given time"
-    steps_ns = np.diff(time_ns)
-    if (steps_ns <= 0).any():
-        row = int(np.argmax(steps_ns <= 0)) + 1
-        table.fail(
-            row,
-            "the time goes backwards"
-            if steps_ns[row - 1] < 0
-            else "the time is that of the previous row",
-            "Sort the rows by time, and write times with all of their digits",
-        )
-    return time_ns, clock
 
 
 def _fields(columns: Sequence[Column], volts: Volts | None) -> Array:

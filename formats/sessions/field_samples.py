@@ -16,6 +16,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
+from locatk.core.inertial import InertialSamples
 from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.polaris.array import Samples, SensorArray
@@ -24,6 +25,7 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import maps as map_files
 from locatk.formats.artifacts import tags as tag_files
 from locatk.formats.sessions import messages
+from locatk.formats.sessions.inertial import imu_streams
 from locatk.formats.sessions.messages import BatchError, Layout, MessageBatch, batch_edges
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import (
@@ -140,6 +142,8 @@ class SessionExtras(TypedDict, total=False):
     ----------
     truth, odometry : sequence of Trajectory
         As in :func:`locatk.formats.sessions.observations.write_session`.
+    imu : sequence of InertialSamples
+        On ``/imu/<device>``, for viewers and programs: the solvers of fields do not use them.
     facts : mapping, optional
         Written as texts to the metadata record ``facts``.
     warnings : sequence of str
@@ -150,6 +154,7 @@ class SessionExtras(TypedDict, total=False):
 
     truth: Sequence[Trajectory]
     odometry: Sequence[Trajectory]
+    imu: Sequence[InertialSamples]
     facts: Mapping[str, object] | None
     warnings: Sequence[str]
     overwrite: bool
@@ -289,6 +294,7 @@ def _write(
     *,
     truth: Sequence[Trajectory] = (),
     odometry: Sequence[Trajectory] = (),
+    imu: Sequence[InertialSamples] = (),
     facts: Mapping[str, object] | None = None,
     warnings: Sequence[str] = (),
     overwrite: bool = False,
@@ -301,7 +307,11 @@ def _write(
         _check(each.device, each.time_ns, each.field_t)
     if not any(len(each.time_ns) for each in samples):
         raise InputError("no sample at all")
-    streams = [*(_messages(kind, each) for each in samples), *reference_streams(truth, odometry)]
+    streams = [
+        *(_messages(kind, each) for each in samples),
+        *reference_streams(truth, odometry),
+        *imu_streams(imu),
+    ]
     with SessionWriter(path, system=kind.system, overwrite=overwrite) as writer:
         writer.facts(facts)
         if artifact is not None:

@@ -25,6 +25,7 @@ pyarrow therefore parses large blocks if it is installed (extra ``parquet``), ot
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -165,8 +166,14 @@ class Table:
             self._fail_cell(int(np.argmax(is_wrong)), name, "a whole number")
         return values.astype(np.int64)
 
-    def iso_times_ns(self, name: str) -> NDArray[np.int64]:
-        """Return a column of ISO 8601 times in UTC as (n,) nanoseconds since the epoch.
+    def iso_times_ns(self, name: str, *, utc_only: bool = True) -> NDArray[np.int64]:
+        """Return a column of ISO 8601 times as (n,) nanoseconds since the epoch.
+
+        Parameters
+        ----------
+        name : str
+        utc_only : bool
+            Refuse zones other than UTC. A time without a zone is in UTC.
 
         Raises
         ------
@@ -175,12 +182,13 @@ class Table:
         """
         cells = self.columns[name]
         try:
-            return parse_iso_times(cells)
+            return parse_iso_times(cells, utc_only=utc_only)
         except ValueError:
-            row = _first_failing(parse_iso_time, cells)
+            row = _first_failing(functools.partial(parse_iso_time, utc_only=utc_only), cells)
         self.fail(
             row,
-            f"{_quoted(cells[row])} in column {name!r} is not a time in UTC",
+            f"{_quoted(cells[row])} in column {name!r} is not a time"
+            f"{' in UTC' if utc_only else ' with its date'}",
             "Write it as 2023-07-24T17:11:36.074800Z",
         )
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
+from locatk.core.inertial import STANDARD_GRAVITY_M_S2
 from locatk.formats.tables.delimited import Table
 from locatk.formats.tables.timestamps import is_iso_time
 
@@ -28,13 +29,42 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "field": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "gauss": 1e-4},
     "voltage": {"v": 1.0, "mv": 1e-3},
     "temperature": {"c": 1.0, "celsius": 1.0},
+    "acceleration": {
+        "m/s2": 1.0,
+        "g": STANDARD_GRAVITY_M_S2,
+        "mg": STANDARD_GRAVITY_M_S2 / 1000,
+    },
+    "angular rate": {"rad/s": 1.0, "deg/s": math.pi / 180},
+    "ticks": {"6mhz": 1 / 6e6, "24mhz": 1 / 24e6, "48mhz": 1 / 48e6},
 }
-"""Units of each quantity, and their factors to SI (times to nanoseconds; degrees Celsius stay)."""
+"""Units of each quantity, and their factors to SI (times to nanoseconds; degrees Celsius stay).
+
+Ticks are durations, counted by a clock of this frequency.
+"""
+
+UNIT_SPELLINGS = {
+    "m/s^2": "m/s2",
+    "m/s\u00b2": "m/s2",
+    "m/s/s": "m/s2",
+    "m_s2": "m/s2",
+    "mps2": "m/s2",
+    "ms2": "m/s2",
+    "rad_s": "rad/s",
+    "radps": "rad/s",
+    "rads": "rad/s",
+    "deg_s": "deg/s",
+    "degps": "deg/s",
+    "dps": "deg/s",
+    "\u00b0/s": "deg/s",
+    "\u00b0": "deg",
+}
+"""Other spellings of units of :data:`UNITS`, in lower case."""
 
 TIME_NAMES = ("t", "time", "timestamp")
 """Names of a column of times."""
 
-_NAME_WITH_UNIT = re.compile(r"(.+?)(?:_([a-z]+)| ?\[([a-z]+)\]| ?\(([a-z]+)\))")
+_UNIT = r"m_s2|rad_s|deg_s|[a-z0-9/^\u00b0\u00b2]+"
+_NAME_WITH_UNIT = re.compile(rf"(.+?)(?:_({_UNIT})| ?\[({_UNIT})\]| ?\(({_UNIT})\))")
 
 
 class ColumnKind(NamedTuple):
@@ -79,6 +109,12 @@ class ColumnMatch(NamedTuple):
     factor: float
 
 
+def canonical_unit(text: str) -> str:
+    """Return a unit in the spelling of :data:`UNITS`; another text in lower case."""
+    plain = text.strip().lower().replace("\u00b5", "u").replace("\u03bc", "u")
+    return UNIT_SPELLINGS.get(plain, plain)
+
+
 def factor_of(unit: str) -> float:
     """Return the factor of a unit of :data:`UNITS` to SI."""
     return next(units[unit] for units in UNITS.values() if unit in units)
@@ -98,7 +134,7 @@ def split_unit(name: str) -> tuple[str, str]:
     match = _NAME_WITH_UNIT.fullmatch(plain)
     if match is None:
         return plain, ""
-    unit = match[2] or match[3] or match[4]
+    unit = canonical_unit(match[2] or match[3] or match[4])
     return (match[1], unit) if any(unit in units for units in UNITS.values()) else (plain, "")
 
 
@@ -148,7 +184,7 @@ def units_by_quantity(units: Sequence[str]) -> dict[str, str]:
         A unit is unknown, or there are two of one quantity.
     """
     given: dict[str, str] = {}
-    for unit in units:
+    for unit in map(canonical_unit, units):
         quantity = next((name for name, known in UNITS.items() if unit in known), None)
         if quantity is None:
             names = ", ".join(name for known in UNITS.values() for name in known)

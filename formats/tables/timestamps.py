@@ -31,11 +31,12 @@ MAX_DIGITS = 19
 _PLAIN_SECONDS = re.compile(r"(-?)(\d{1,10})(?:\.(\d{1,9}))?", re.ASCII)
 
 _ISO_TIME = re.compile(
-    r"((?:19[7-9]\d|2[01]\d\d)-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)\d*"
-    r"(?:Z|([+-])(\d\d):?(\d\d))?",
+    r"((?:19[7-9]\d|2[01]\d\d)-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)\d*"
+    r"(?:Z|([+-])(\d\d)(?::?(\d\d))?)?",
     re.ASCII,
 )
-"""ISO 8601 of the years that int64 nanoseconds hold; digits after the ninth decimal are cut."""
+"""ISO 8601 of the years that int64 nanoseconds hold, with a decimal point or comma; digits after
+the ninth decimal are cut."""
 
 
 # ---- decimal numbers
@@ -173,7 +174,8 @@ def parse_iso_times(cells: Sequence[str], *, utc_only: bool = True) -> Times:
     matches = [match for cell in cells if (match := _ISO_TIME.fullmatch(cell.strip()))]
     if len(matches) < len(cells):
         raise ValueError("not a time in ISO 8601")
-    local = np.array([f"{match[1]}T{match[2]}" for match in matches], "datetime64[ns]")
+    texts = [f"{match[1]}T{match[2].replace(',', '.')}" for match in matches]
+    local = np.array(texts, "datetime64[ns]")
     offset_minutes = {zone: _offset_minutes(*zone) for zone in {m.group(3, 4, 5) for m in matches}}
     if utc_only and any(offset_minutes.values()):
         raise ValueError("a time zone other than UTC")
@@ -183,5 +185,5 @@ def parse_iso_times(cells: Sequence[str], *, utc_only: bool = True) -> Times:
     return local.astype(np.int64) - minutes * 60_000_000_000
 
 
-def _offset_minutes(sign: str | None, hours: str, minutes: str) -> int:
-    return 0 if sign is None else int(f"{sign}1") * (60 * int(hours) + int(minutes))
+def _offset_minutes(sign: str | None, hours: str, minutes: str | None) -> int:
+    return 0 if sign is None else int(f"{sign}1") * (60 * int(hours) + int(minutes or 0))

@@ -315,6 +315,29 @@ def test_wrong_format_or_option(
     assert problem in result.stderr
 
 
+@pytest.mark.parametrize(
+    "order",
+    [
+        "-o {out} dotbot-lh2 {csv}",
+        "dotbot-lh2 {csv} -o {out}",
+        "dotbot-lh2 -o {out} {csv}",
+        "--overwrite -o {out} --truth {csv} dotbot-lh2 {csv}",
+        "--json --output={out} dotbot-lh2 {csv}",
+    ],
+)
+def test_one_command_for_all_formats_is_still_accepted(
+    locatk, order: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before each format had a command, options and format could have any order."""
+    monkeypatch.chdir(tmp_path)
+    table(Path("data.csv"), *ROWS)
+    # The name of the output is that of a format.
+    arguments = order.format(out="table", csv="data.csv").split()
+    result = locatk("import", *arguments)
+    assert result.exit_code == 0, result.stderr
+    assert len(observations.read_sweeps(Session.open(tmp_path / "table"))) == 80
+
+
 def test_options_may_precede_the_format(tmp_path: Path) -> None:
     """The order of options and format does not matter."""
     result = CliRunner().invoke(app, ["import", "-o", "o.mcap", "saleae", str(tmp_path / "no.sal")])

@@ -14,7 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from locatk.core.errors import FormatError, InputError, LocatkError
-from locatk.formats.importers.any_table import guess_columns, read_magnetometers
+from locatk.formats.importers.any_table.columns import guess_columns
+from locatk.formats.importers.any_table.magnetometers import read_magnetometers
 from locatk.formats.tables.dialects import read_any_table
 
 FIELD_UT = (
@@ -98,6 +99,46 @@ def test_small_times_need_a_unit(tmp_path: Path) -> None:
     assert np.diff(imported.samples.time_ns).tolist() == [20_000_000]
 
 
+def test_the_user_decides_which_observations_are_imported(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("t_s,bx_ut,by_ut,bz_ut,channel,count,front_mt,station\n0,1,2,43,3,9,7,5\n")
+    table = read_any_table(path)
+    guess = guess_columns(table, {}, ())
+    assert guess.magnetometers
+    assert guess.measurements
+    assert guess.has_halls
+    for key, header in (("b0x", "bx_ut"), ("count", "count"), ("front", "front_mt")):
+        guess = guess_columns(table, {key: header}, ())
+        found = (bool(guess.magnetometers), bool(guess.measurements), guess.has_halls)
+        assert found == (key == "b0x", key == "count", key == "front")
+    # Without a channel, count and station are no sweeps.
+    path.write_text("t_s,bx_ut,by_ut,bz_ut,count,station\n0,1,2,43,9,5\n")
+    assert guess_columns(read_any_table(path), {}, ()).ignored == ("count", "station")
+
+
+def test_dates_may_have_a_column_of_their_own(tmp_path: Path) -> None:
+    """A date beside times of the day is used, one beside full times is not."""
+    path = tmp_path / "log.csv"
+    rows = "{}23:59:59,5{sep}1;2;43\n{}00:00:00,5{sep}1;3;43\n"
+    for text, ignored in (
+        ("Date;Time;bx_ut;by_ut;bz_ut\n" + rows.format("2026-01-31;", "2026-02-01;", sep=";"), ()),
+        (
+            "Date;Time;bx_ut;by_ut;bz_ut\n"
+            + rows.format("31.01.26;2026-01-31T", "1.02.26;2026-02-01T", sep="Z;"),
+            ("date",),
+        ),
+    ):
+        path.write_text(text)
+        table = read_any_table(path)
+        guess = guess_columns(table, {}, ())
+        imported, _ = read_magnetometers(table, guess)
+        assert imported.samples.time_ns.tolist() == [1769903999_500000000, 1769904000_500000000]
+        assert guess.ignored == ignored
+    path.write_text("time,bx_ut,by_ut,bz_ut\n12:00:00,1,2,43\n12:00:01,1,3,43\n")
+    with pytest.raises(FormatError, match="times of the day without dates"):
+        read_guessed(path)
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
@@ -167,7 +208,7 @@ def test_an_exported_drive_is_solved_again(locatk: Callable[..., Any], tmp_path:
         *("--spacing", f"{spacing:g}", "--tag", tag, "-o", tmp_path / "again.mcap"),
     )
     assert result.exit_code == 0, result.stderr
-    assert "Columns: --columns t=zeit,b1x=mag1_x" in result.stderr
+    assert '[columns]\nt = "zeit"\nb1x = "mag1_x"\n' in result.stderr
     tags = []
     for path in (run, tmp_path / "again.mcap"):
         solved = locatk("solve", path, "-o", tmp_path / f"{path.stem}-solved.mcap", "--json")
@@ -196,7 +237,11 @@ def test_hall_sensors_and_odometry(locatk: Callable[..., Any], tmp_path: Path) -
 def test_tables_of_nothing_are_refused(locatk: Callable[..., Any], tmp_path: Path) -> None:
     log, output = tmp_path / "log.csv", tmp_path / "run.mcap"
     for text, status, problem in (
-        ("a,b\n1,2\n", 2, "neither magnetometers nor hall sensors"),
+        (
+            "a,b\n1,2\n",
+            2,
+            "none of sweeps of base stations, magnetometers, hall sensors and an IMU",
+        ),
         ("", 1, "empty"),
         ("\x00\x01\x02", 1, ""),
     ):
