@@ -4,7 +4,7 @@ Layers: BARS (outlines of the bars), POLES (an arrow from south to north in each
 point each), LABELS (row, column and letters), WALLS. A landmark is an insert of the block
 ``LANDMARK_<letters>``, so that CAD counts them for the bill of materials. The frame of the drawing
 is that of the map. Positions are as built if that is known; the bars are those of the design.
-Written with ezdxf as DXF R2010.
+Written with ezdxf (extra ``dxf``) as DXF R2010.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from locatk.core.drawing import Line, Polygon
 from locatk.core.landmarks.drawing.landmark import bar_outlines, pole_arrow, pole_letters
 from locatk.core.landmarks.landmark import name
 from locatk.core.landmarks.map.floor import FloorMap, as_built_poses
+from locatk.formats.extras import requires_extra
 
 LAYERS = {"BARS": 7, "POLES": 1, "CENTRES": 5, "LABELS": 8, "WALLS": 6}
 """Layers and their colours in AutoCAD's colour index."""
@@ -25,9 +26,16 @@ MAX_LABEL_HEIGHT_MM = 8.0
 
 
 def dumps_dxf(floor: FloorMap) -> str:
-    """Return the DXF text of a map; the same map and ezdxf give the same text."""
-    import ezdxf
-    from ezdxf import units
+    """Return the DXF text of a map; the same map and ezdxf give the same text.
+
+    Raises
+    ------
+    LocatkError
+        ezdxf is not installed.
+    """
+    with requires_extra("dxf", "DXF"):
+        import ezdxf
+        from ezdxf import units
 
     # Otherwise each file contains the time and two random ids.
     before = ezdxf.options.write_fixed_meta_data_for_testing
