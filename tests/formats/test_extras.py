@@ -56,6 +56,11 @@ def test_all_extras_for_users_are_in_all_and_test(extras: dict[str, list[str]]) 
     assert "locatk[test]" in extras["dev"]
 
 
+def test_the_readme_lists_all_extras(root: Path) -> None:
+    text = (root / "README.md").read_text("utf-8")
+    assert set(re.findall(r"^\| `(\w+)` \| \d+ MB \|", text, re.M)) == set(PACKAGES)
+
+
 def test_required_packages_are_not_extras(root: Path, extras: dict[str, list[str]]) -> None:
     project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
     required = {re.split(r"[>=\[]", line)[0].lower() for line in project["dependencies"]}
