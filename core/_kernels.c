@@ -806,12 +806,13 @@ HOT static int match_cells(const Dots *d, float ring, float cell_gate)
     int beyond = 0;
     for (int i = 0; i < d->count; i++) {
         const float u = rintf(us[i]), v = rintf(vs[i]);
-        const int is_dot = valid[i] > 0, near = u * u + v * v < ring;
+        const int is_dot = valid[i] > 0, is_near = u * u + v * v < ring;
         du[i] = us[i] - u;
         dv[i] = vs[i] - v;
-        beyond |= is_dot & !near;
-        use[i] =
-            is_dot & near & (fabsf(du[i]) < cell_gate) & (fabsf(dv[i]) < cell_gate) ? 1.0f : 0.0f;
+        beyond |= is_dot & !is_near;
+        const int is_used =
+            is_dot & is_near & (fabsf(du[i]) < cell_gate) & (fabsf(dv[i]) < cell_gate);
+        use[i] = is_used ? 1.0f : 0.0f;
     }
     return beyond;
 }
@@ -835,9 +836,9 @@ HOT static void match_symbols(const Dots *d, float offset, float symbol_gate)
         nearest_symbol(rest, offset, symbol);
         du[i] = rest[0] - symbol[0];
         dv[i] = rest[1] - symbol[1];
-        use[i] = (valid[i] > 0) & (fabsf(du[i]) < symbol_gate) & (fabsf(dv[i]) < symbol_gate)
-                     ? 1.0f
-                     : 0.0f;
+        const int is_used =
+            (valid[i] > 0) & (fabsf(du[i]) < symbol_gate) & (fabsf(dv[i]) < symbol_gate);
+        use[i] = is_used ? 1.0f : 0.0f;
     }
 }
 

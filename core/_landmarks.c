@@ -125,9 +125,9 @@ typedef struct {
     double step;
 } Scan;
 
-/* Normal matrix and right-hand side of the four bars at one candidate pose, over all samples. */
+/* 4 x 4 normal matrix and right-hand side of the four bars at one candidate pose, over all samples. */
 HOT static void sum_samples(const Scan *scan, const double *centre, double heading,
-                            float normal[restrict 16], float right[restrict 4])
+                            float *restrict normal, float *restrict right)
 {
     const double c = cos(heading) / scan->step, s = sin(heading) / scan->step;
     const float middle = (float)(scan->size - 1) / 2;

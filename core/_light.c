@@ -7,6 +7,43 @@
 #include <stdlib.h>
 #include <string.h>
 
+#define PI 3.14159265358979323846
+
+/* ---- Bits of words ---------------------------------------------------------------------- */
+
+/* Number of zeros before the first one of a word that is not 0, from its highest bit, and after
+ * the last one. */
+#ifdef _MSC_VER
+#include <intrin.h>
+static inline int leading_zeros(uint64_t word)
+{
+    unsigned long bit;
+    _BitScanReverse64(&bit, word);
+    return 63 - (int)bit;
+}
+
+static inline int trailing_zeros(uint64_t word)
+{
+    unsigned long bit;
+    _BitScanForward64(&bit, word);
+    return (int)bit;
+}
+#else
+static inline int leading_zeros(uint64_t word) { return __builtin_clzll(word); }
+
+static inline int trailing_zeros(uint64_t word) { return __builtin_ctzll(word); }
+#endif
+
+/* Number of ones of a word. Compilers replace the sum of pairs, fours and bytes of bits by the
+ * instruction of the processor, if it has one. */
+static inline int count_ones(uint64_t word)
+{
+    word -= word >> 1 & 0x5555555555555555u;
+    word = (word & 0x3333333333333333u) + (word >> 2 & 0x3333333333333333u);
+    word = (word + (word >> 4)) & 0x0F0F0F0F0F0F0F0Fu;
+    return (int)(word * 0x0101010101010101u >> 56);
+}
+
 /* ---- Edges of windows of samples -------------------------------------------------------- */
 
 static inline uint64_t big_endian(const uint8_t *bytes)
@@ -39,7 +76,7 @@ static int64_t row_edges(const uint8_t *row, int width, int64_t base, int64_t *t
         uint64_t changed = word ^ (word >> 1 | last << 63);
         last = word & 1;
         while (changed) {
-            const int bit = __builtin_clzll(changed);
+            const int bit = leading_zeros(changed);
             tick[count++] = base + 64 * w + bit;
             changed &= ~(0x8000000000000000ull >> bit);
         }
@@ -92,7 +129,7 @@ static void make_sines(void)
 {
     if (sines[SINE_STEPS / 4] != 0) return;
     for (int k = 0; k < SINE_STEPS + SINE_STEPS / 4; k++)
-        sines[k] = (int32_t)rint(sin(2 * M_PI / SINE_STEPS * k) * 16384);
+        sines[k] = (int32_t)rint(sin(2 * PI / SINE_STEPS * k) * 16384);
 }
 
 /* Round to the nearest whole number. Sampled times are often halves: these round up despite small
@@ -120,7 +157,7 @@ HOT static double fit_chip_grid(const double *time, int edges, double *skew)
         }
     }
     for (int kind = 0; kind < 2; kind++)
-        phase[kind] = atan2((double)sine[kind], (double)cosine[kind]) / (2 * M_PI);
+        phase[kind] = atan2((double)sine[kind], (double)cosine[kind]) / (2 * PI);
     /* Phases are ambiguous by whole chips. The mean lengths of the runs resolve the ambiguity. */
     double run_skew = 0;
     if (run[1] > 0) run_skew = (run[1] / ((edges - 1) / 2) - run[0] / (edges / 2)) / 2;
@@ -372,13 +409,29 @@ typedef struct {
     int bits, words, padding; /* padding: bits of the first word before the first bit */
 } BitWords;
 
-/* Bits for which the last `count` bits, including their own, are all one. `bits` holds the
- * previous word, then the word itself. */
-static inline unsigned __int128 all_of_last(unsigned __int128 bits, int count)
+/* A word of bits and the one before it. */
+typedef struct {
+    uint64_t previous, word;
+} Pair;
+
+/* Delay a pair by 0 to 63 bits. */
+static inline Pair delay_bits(Pair bits, int delay)
 {
-    int span = 1;
-    for (; 2 * span <= count; span *= 2) bits &= bits >> span;
-    return bits & bits >> (count - span);
+    const Pair result = {bits.previous >> delay,
+                         bits.word >> delay | bits.previous << 1 << (63 - delay)};
+    return result;
+}
+
+/* Bits for which the last `count` bits, including their own, are all one. */
+static inline Pair all_of_last(Pair bits, int count)
+{
+    for (int span = 1, step; span < count; span += step) {
+        step = 2 * span <= count ? span : count - span;
+        const Pair earlier = delay_bits(bits, step);
+        bits.previous &= earlier.previous;
+        bits.word &= earlier.word;
+    }
+    return bits;
 }
 
 HOT static void write_words(const Tables *t, const int8_t *value, int bits, BitWords *text)
@@ -397,11 +450,10 @@ HOT static void write_words(const Tables *t, const int8_t *value, int bits, BitW
         }
         /* A bit is predicted if it and the 17 before it are known, and if these hold a one: state
          * 0 is not part of the sequence. */
-        const unsigned __int128 known_pair = (unsigned __int128)known_before << 64 | known;
-        const unsigned __int128 zero_pair = (unsigned __int128)zero_before << 64 | (uint64_t)~hard;
+        const Pair known_pair = {known_before, known}, zero_pair = {zero_before, ~hard};
         text->hard[w] = hard;
-        text->open[w] = ~(uint64_t)all_of_last(known_pair, REGISTER_BITS + 1)
-                        | (uint64_t)(all_of_last(zero_pair, REGISTER_BITS) >> 1);
+        text->open[w] = ~all_of_last(known_pair, REGISTER_BITS + 1).word
+                        | delay_bits(all_of_last(zero_pair, REGISTER_BITS), 1).word;
         text->summed[w] = 0;
         known_before = known;
         zero_before = ~hard;
@@ -438,7 +490,7 @@ HOT static int best_polynomial(const Tables *t, const BitWords *text, int w)
     int best = 0, min_mispredictions = 65;
     sum_word(text, w);
     for (int p = 0; p < t->polynomials; p++) {
-        const int number = __builtin_popcountll(mispredictions(text, (uint32_t)t->taps[p], w));
+        const int number = count_ones(mispredictions(text, (uint32_t)t->taps[p], w));
         best = number < min_mispredictions ? p : best;
         min_mispredictions = number < min_mispredictions ? number : min_mispredictions;
     }
@@ -460,12 +512,12 @@ static int longest_run(const Tables *t, const BitWords *text, int polynomial, in
         uint64_t run = ~wrong & ~wrong >> 1;
         run &= run >> 2;
         if (t->min_run >= 8) run &= run >> 4;
-        if (!run && t->min_run >= 4 && 64 * w - run_begin + __builtin_clzll(wrong) < t->min_run) {
-            run_begin = 64 * w + 64 - __builtin_ctzll(wrong);
+        if (!run && t->min_run >= 4 && 64 * w - run_begin + leading_zeros(wrong) < t->min_run) {
+            run_begin = 64 * w + 64 - trailing_zeros(wrong);
             continue;
         }
         while (wrong) {
-            const int bit = __builtin_clzll(wrong), position = 64 * w + bit;
+            const int bit = leading_zeros(wrong), position = 64 * w + bit;
             if (position - run_begin > max_run) {
                 max_run = position - run_begin;
                 *begin = run_begin;

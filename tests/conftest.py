@@ -49,6 +49,41 @@ def data_folder() -> Path:
     return Path(os.environ.get("LOCATK_DATA") or ROOT.parent / "shared" / "data").resolve()
 
 
+MODULES_OF_EXTRAS = {
+    "ble": ("bleak",),
+    "dask": ("distributed",),
+    "dxf": ("ezdxf",),
+    "pandas": ("pandas",),
+    "parquet": ("pyarrow",),
+    "pdf": ("pikepdf",),
+    "ros": ("rosbags",),
+    "s3": ("s3fs", "fsspec"),
+    "yaml": ("yaml",),
+}
+"""Names by which the packages of each extra are imported."""
+
+
+@pytest.fixture(scope="session")
+def modules_of_extras() -> dict[str, tuple[str, ...]]:
+    """Names by which the packages of each extra are imported."""
+    return MODULES_OF_EXTRAS
+
+
+@pytest.fixture
+def without_extras(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return a function that hides the packages of extras (default: all) until the test ends."""
+
+    def hide(*extras: str) -> None:
+        for extra in extras or MODULES_OF_EXTRAS:
+            for name in MODULES_OF_EXTRAS[extra]:
+                monkeypatch.setitem(sys.modules, name, None)
+        # These import them at their top; tests before may have imported them.
+        for name in ("printing.overlay", "importers.yaml_tree"):
+            monkeypatch.delitem(sys.modules, f"locatk.formats.{name}", raising=False)
+
+    return hide
+
+
 @pytest.fixture(scope="session")
 def root() -> Path:
     """Root of the repository."""

@@ -141,7 +141,7 @@ FORMATS = {
         IMPORTERS + "crazyflie:read_config",
         lighthouse.import_scene,
         "Stations of a Crazyflie (YAML): poses and calibrations. The output is a scene "
-        "(scene.toml) instead of a session.",
+        "(scene.toml) instead of a session. Needs locatk[yaml].",
         ("crazyflie-config lighthouse.yaml -o scene.toml",),
         takes_one_path=True,
     ),

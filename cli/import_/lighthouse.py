@@ -83,7 +83,8 @@ lighthouse_options = combine(
         options.input_option(
             "--config",
             metavar="FILE",
-            help="Configuration of the Crazyflie (YAML) with the calibrations of the stations.",
+            help="Configuration of the Crazyflie (YAML) with the calibrations of the stations; "
+            "needs locatk[yaml].",
         ),
         click.option(
             "--receiver",

@@ -30,8 +30,8 @@ LIF_VERSIONS = ("1.0.0", "2.0.0")
     "--format",
     "format_name",
     type=click.Choice(tuple(ENDINGS)),
-    help="Format of the output.  [default: by the ending of the output: .csv, .json "
-    "(LIF), .yaml (ROS), .svg, .dxf]",
+    help="Format of the output; dxf needs locatk[dxf].  [default: by the ending of the output: "
+    ".csv, .json (LIF), .yaml (ROS), .svg, .dxf]",
 )
 @options.output("File to write; `ros` also writes an image with the ending .pgm.")
 @click.option(

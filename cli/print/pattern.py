@@ -162,7 +162,7 @@ class PairType(click.ParamType):
     options.input_option(
         "--overlay",
         help="Print over each page of this PDF document, whose pages determine the size. Black "
-        "and grey of the document hide dots and are reported.",
+        "and grey of the document hide dots and are reported. Needs locatk[pdf].",
     ),
     click.option(
         "--strip-black",

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from locatk.core.errors import LocatkError
 from locatk.core.natural_order import natural_key
 from locatk.core.trajectory import Trajectory, has_orientation
+from locatk.formats.extras import requires_extra
 from locatk.formats.importers.trajectory_csv import (
     POSITION_COLUMNS,
     PROBABILITY_COLUMN,
@@ -38,13 +38,8 @@ def poses_to_dataframe(trajectories: Mapping[str, Trajectory]) -> pd.DataFrame:
     LocatkError
         pandas is not installed.
     """
-    try:
+    with requires_extra("pandas", "a data frame"):
         import pandas as pd
-    except ImportError:
-        raise LocatkError(
-            "data frames need pandas, which is not installed",
-            hint='Install it: pip install "locatk[pandas]"',
-        ) from None
     parts = []
     for device, trajectory in trajectories.items():
         quaternion = np.where(has_orientation(trajectory)[:, None], trajectory.quaternion, np.nan)

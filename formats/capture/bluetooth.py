@@ -22,6 +22,7 @@ from typing import Any
 
 from locatk.core.printable import escape_controls
 from locatk.formats.capture.links import LinkLost, Overruns, SourceError
+from locatk.formats.extras import requires_extra
 
 PREFIX = "ble:"
 
@@ -91,7 +92,8 @@ class BluetoothPort:
 
     def open(self) -> BluetoothLink:
         """Find the device and connect to it; see :class:`.links.Port`."""
-        _import_bleak(self.name)
+        with requires_extra("ble", "Bluetooth", file=self.name):
+            import bleak  # noqa: F401 - slow to import
         known = None if self._device is None else self._device.address
         link = BluetoothLink(self.name, self._wanted, known)
         try:
@@ -260,17 +262,6 @@ class BluetoothLink:
                 elif loop.time() >= end_s:
                     raise _missing_error(found, self._port)
                 await asyncio.sleep(POLL_INTERVAL_S)
-
-
-def _import_bleak(port: str) -> None:
-    try:
-        import bleak  # noqa: F401 - optional, and slow to import
-    except ImportError:
-        raise SourceError(
-            "Bluetooth needs the package bleak",
-            file=port,
-            hint='Install it: pip install "locatk[ble]"',
-        ) from None
 
 
 def _ambiguous_error(devices: list[Any], port: str) -> SourceError:

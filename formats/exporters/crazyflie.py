@@ -11,9 +11,9 @@ lands where z is 0. Frames that are not level are therefore refused (:func:`desc
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
-import yaml
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import PARAMETERS
@@ -106,6 +106,8 @@ def dumps_config(scene: Scene, *, allow_tilted: bool = False) -> str:
         if calibration.source != "factory":
             omitted.append(channel)
             continue
+        if not np.all(np.isfinite(calibration.sweeps)):
+            raise InputError(f"the calibration of channel {channel} is not finite")
         calibs[channel - 1] = {
             "sweeps": [
                 dict(zip(PARAMETERS, row, strict=True)) for row in calibration.sweeps.tolist()
@@ -121,15 +123,34 @@ def dumps_config(scene: Scene, *, allow_tilted: bool = False) -> str:
             "the Crazyflie takes it from the light."
         )
     is_of_crazyflie = not {MODEL_NOTE, FORMER_MODEL_NOTE}.isdisjoint(scene.notes)
-    content = {
-        "type": TYPE,
-        "version": VERSION,
-        "systemType": SYSTEM_V2,
-        **({} if is_of_crazyflie else {SOLVER: OWN_SOLVER}),
-        "geos": dict(sorted(geos.items())),
-        "calibs": calibs,
-    }
-    return "\n".join(head) + "\n" + yaml.safe_dump(content, sort_keys=False, width=100)
+    head += [f"type: {TYPE}", f"version: '{VERSION}'", f"systemType: {SYSTEM_V2}"]
+    if not is_of_crazyflie:
+        head.append(f"{SOLVER}: {OWN_SOLVER}")
+    tables = {"geos": dict(sorted(geos.items())), "calibs": calibs}
+    return "\n".join([*head, *_yaml_lines(tables)]) + "\n"
+
+
+def _yaml_lines(value: Any) -> list[str]:
+    """Return the lines of a number, list or mapping in YAML's block style."""
+    lines: list[str] = []
+    if isinstance(value, dict):
+        for key, item in value.items():
+            block = _yaml_lines(item)
+            if isinstance(item, list):
+                lines += [f"{key}:", *block]
+            elif isinstance(item, dict) and item:
+                lines += [f"{key}:", *(f"  {line}" for line in block)]
+            else:
+                lines.append(f"{key}: {block[0]}")
+        return lines or ["{}"]
+    if isinstance(value, list):
+        for item in value:
+            first, *others = _yaml_lines(item)
+            lines += [f"- {first}", *(f"  {line}" for line in others)]
+        return lines
+    text = repr(value)
+    # To YAML 1.1, 1e-07 is a text: a number has a point.
+    return [text if "." in text else text.replace("e", ".0e")]
 
 
 def write_config(

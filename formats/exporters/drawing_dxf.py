@@ -3,7 +3,7 @@
 Each placement is an insert of the block of its shape, so that CAD counts them for the bill of
 materials, with the attributes of the placement. Besides the layers of the shapes there are CENTRES
 (a point each), LABELS, and WALLS if there are walls. The frame of the drawing is that of the floor.
-Written with ezdxf as DXF R2010.
+Written with ezdxf (extra ``dxf``) as DXF R2010.
 """
 
 from __future__ import annotations
@@ -14,14 +14,22 @@ from typing import Any
 
 from locatk.core.drawing import Circle, Line
 from locatk.formats.exporters.floor_drawing import FloorDrawing, Layer, Placement, Shape
+from locatk.formats.extras import requires_extra
 
 CENTRES, LABELS, WALLS = Layer("CENTRES", 5), Layer("LABELS", 8), Layer("WALLS", 6)
 
 
 def dumps_dxf(drawing: FloorDrawing) -> str:
-    """Return the DXF text of a drawing; the same drawing and ezdxf give the same text."""
-    import ezdxf
-    from ezdxf import units
+    """Return the DXF text of a drawing; the same drawing and ezdxf give the same text.
+
+    Raises
+    ------
+    LocatkError
+        ezdxf is not installed.
+    """
+    with requires_extra("dxf", "DXF"):
+        import ezdxf
+        from ezdxf import units
 
     # Otherwise each file contains the time and two random ids.
     before = ezdxf.options.write_fixed_meta_data_for_testing

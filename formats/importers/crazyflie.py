@@ -18,12 +18,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
-from decimal import Decimal, DecimalException
 from typing import Any
 
 import numpy as np
-import yaml
 
 from locatk.core.errors import ArtifactError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION, PARAMETERS, Calibration
@@ -38,6 +35,7 @@ from locatk.formats.artifacts.kinds import (
     type_name,
 )
 from locatk.formats.artifacts.schema import Array, Key, Table, Values, unknown_keys
+from locatk.formats.extras import requires_extra
 from locatk.formats.files import read_head
 
 TYPE = "lighthouse_system_configuration"
@@ -49,9 +47,6 @@ FRAME = "room"
 
 MAX_FILE_BYTES = 1_000_000
 """Sixteen stations take 12,000 bytes."""
-
-MAX_DEPTH = 8
-"""Nested lists and mappings; the format has five levels."""
 
 MAX_DISTANCE_M = 1000.0
 MAX_PARAMETER = 10.0
@@ -80,11 +75,7 @@ SOLVER, OWN_SOLVER = "solver", "locatk"
 
 HINT = "Give a configuration that cfclient or cflib has saved"
 
-_SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
-_NO_NUMBER = re.compile(r"[-+]?\.(?:inf|nan)", re.IGNORECASE)
 _ID = re.compile("[0-9]|1[0-5]")
-_STANDARD_TAG = re.compile("!|tag:yaml.org,2002:(?:str|int|float|map|seq)")
 
 
 def read_config(path: str | os.PathLike[str]) -> Scene:
@@ -103,6 +94,8 @@ def read_config(path: str | os.PathLike[str]) -> Scene:
     ArtifactError
         It is not a system configuration of Lighthouse V2, or has a wrong value; the error names
         the key.
+    LocatkError
+        PyYAML is not installed.
     """
     return loads_config(read_head(path, MAX_FILE_BYTES + 1), file=path)
 
@@ -112,7 +105,7 @@ def loads_config(text: str | bytes, *, file: str | os.PathLike[str] = "<config>"
 
     Raises
     ------
-    ArtifactError
+    ArtifactError, LocatkError
         See :func:`read_config`.
     """
     data = _parse_mapping(text, file)
@@ -266,81 +259,11 @@ def _parse_mapping(text: str | bytes, file: str | os.PathLike[str]) -> dict[str,
         decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text
     except UnicodeDecodeError:
         raise ArtifactError("not UTF-8 text", file=file, hint=HINT) from None
-    try:
-        root = _tree(decoded, file)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        problem = getattr(error, "problem", None) or "damaged text"
-        raise ArtifactError(
-            f"not valid YAML ({problem})",
-            file=file,
-            where=mark.line + 1 if mark else None,
-            hint=HINT,
-        ) from None
+    with requires_extra("yaml", "a Crazyflie configuration", file=file):
+        from locatk.formats.importers.yaml_tree import parse_yaml
+    root = parse_yaml(decoded, file=file, hint=HINT)
     if not isinstance(root, dict):
         raise ArtifactError(
             "not a Crazyflie configuration: expected a YAML mapping", file=file, hint=HINT
         )
     return root
-
-
-def _tree(text: str, file: str | os.PathLike[str]) -> Any:
-    """Parse the only document of a text; anchors, tags and repeated keys are refused.
-
-    It is built from PyYAML's events: its loaders take the last of two equal keys, follow anchors to
-    exponential size, and recurse as deep as the text.
-    """
-    events = yaml.parse(text, Loader=_SAFE_LOADER)
-    root = None
-    for event in events:
-        if isinstance(event, yaml.NodeEvent):
-            if root is not None:
-                raise _error_at(event, file, "more than one YAML document")
-            root = _node(event, events, file, 0)
-    return root
-
-
-def _node(
-    event: yaml.Event, events: Iterator[yaml.Event], file: str | os.PathLike[str], depth: int
-) -> Any:
-    """Build the value that begins with an event, and consume its events."""
-    if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-        raise _error_at(event, file, "YAML anchors and aliases are not read")
-    tag = getattr(event, "tag", None)
-    if tag is not None and not _STANDARD_TAG.fullmatch(tag):
-        raise _error_at(event, file, f"YAML tag {tag[:60]!r} is not read")
-    if isinstance(event, yaml.ScalarEvent):
-        return _scalar(event)
-    if depth == MAX_DEPTH:
-        raise _error_at(event, file, "lists and mappings are nested too deep")
-    if isinstance(event, yaml.SequenceStartEvent):
-        items = []
-        while not isinstance(event := next(events), yaml.SequenceEndEvent):
-            items.append(_node(event, events, file, depth + 1))
-        return items
-    values: dict[str, Any] = {}
-    while not isinstance(event := next(events), yaml.MappingEndEvent):
-        if not isinstance(event, yaml.ScalarEvent):
-            raise _error_at(event, file, "a key that is not a name or number")
-        key = event.value
-        if key in values:
-            raise _error_at(event, file, f"key {key[:60]!r} occurs twice")
-        values[key] = _node(next(events), events, file, depth + 1)
-    return values
-
-
-def _error_at(event: yaml.Event, file: str | os.PathLike[str], message: str) -> ArtifactError:
-    line = event.start_mark.line + 1 if event.start_mark else None
-    return ArtifactError(message, file=file, where=line, hint=HINT)
-
-
-def _scalar(event: yaml.ScalarEvent) -> Any:
-    text = event.value
-    if event.style or not (_NUMBER.fullmatch(text) or _NO_NUMBER.fullmatch(text)):
-        return text
-    if text.isdigit() and len(text) < 20:
-        return int(text)
-    try:
-        return Decimal(text)
-    except DecimalException:  # .inf, .nan, an exponent of twenty digits
-        return Decimal("nan")

@@ -10,7 +10,8 @@ objects of the model space count, not those within blocks. Conventions:
 - a text belongs to the object that is nearest to its insertion point, if it is nearer than half the
   distance of that object to the next one.
 
-Z is ignored. Read with ezdxf: DXF R12 to R2018, as text or binary, also slightly damaged files.
+Z is ignored. Read with ezdxf (extra ``dxf``): DXF R12 to R2018, as text or binary, also slightly
+damaged files.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
 from locatk.core.printable import escape_controls
+from locatk.formats.extras import requires_extra
 from locatk.formats.files import read_bytes
 
 Array = NDArray[np.float64]
@@ -274,8 +276,8 @@ class DxfReader:
 
 def _load(path: str | os.PathLike[str], data: bytes) -> Any:
     """Parse a drawing with ezdxf."""
-    from ezdxf import recover
-
+    with requires_extra("dxf", "DXF", file=path):
+        from ezdxf import recover
     if data.startswith(b"AC10"):
         raise FormatError("a drawing in DWG", file=path, hint="Save it as DXF in the CAD program")
     # ezdxf reports each damage that it repairs.

@@ -13,6 +13,7 @@ from typing import Any
 
 from locatk.core.errors import FormatError, LocatkError
 from locatk.core.trajectory import Trajectory
+from locatk.formats.extras import requires_extra
 from locatk.formats.importers.pose_topics import Topic, read_topics
 
 METADATA_FILE = "metadata.yaml"
@@ -25,27 +26,13 @@ TF_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 
 ROS1_MAGIC = b"#ROSBAG V"
 
+MESSAGES = "a message of ROS"
+"""What needs rosbags, for errors."""
+
 
 def is_bag_folder(path: Path) -> bool:
     """Return whether a path is the folder of a bag of ROS 2."""
     return (path / METADATA_FILE).is_file()
-
-
-def import_rosbags() -> None:
-    """Import rosbags.
-
-    Raises
-    ------
-    LocatkError
-        It is not installed.
-    """
-    try:
-        import rosbags  # noqa: F401 - optional
-    except ImportError:
-        raise LocatkError(
-            "messages of ROS need rosbags, which is not installed",
-            hint='Install it: pip install "locatk[ros]"',
-        ) from None
 
 
 def ros_decoder(topic: Topic) -> Callable[[bytes], Any]:
@@ -56,13 +43,15 @@ def ros_decoder(topic: Topic) -> Callable[[bytes], Any]:
     LocatkError
         rosbags is not installed.
     """
-    import_rosbags()
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    with requires_extra("ros", MESSAGES):
+        from rosbags import typesys
 
     is_ros1 = topic.encoding == "ros1"
-    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(
+        typesys.Stores.ROS1_NOETIC if is_ros1 else typesys.Stores.ROS2_HUMBLE
+    )
     if is_ros1 and topic.type not in store.types:  # It lacks the packages of tf.
-        store.register(get_types_from_msg(TF_DEFINITION, topic.type))
+        store.register(typesys.get_types_from_msg(TF_DEFINITION, topic.type))
     deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
 
     def decode(data: bytes) -> Any:
@@ -93,8 +82,8 @@ def read_bag(path: Path, selected: str = "") -> tuple[list[Trajectory], tuple[st
     LocatkError
         rosbags is not installed.
     """
-    import_rosbags()
-    from rosbags import rosbag1, rosbag2
+    with requires_extra("ros", MESSAGES, file=path):
+        from rosbags import rosbag1, rosbag2
 
     with _errors_of_locatk(path):
         reader = rosbag1.Reader(path) if path.suffix == ".bag" else rosbag2.Reader(path)

@@ -34,7 +34,8 @@ from functools import partial
 from multiprocessing import forkserver, resource_tracker
 from typing import Any, TypeVar
 
-from locatk.core.errors import InputError, LocatkError
+from locatk.core.errors import InputError
+from locatk.formats.extras import requires_extra
 from locatk.formats.output import tool_version
 from locatk.formats.pipeline.file_access import short_reason
 
@@ -426,13 +427,8 @@ def worker_folder() -> str | None:
 
 @contextlib.contextmanager
 def _open_cluster(address: str) -> Iterator[Executor]:
-    try:
+    with requires_extra("dask", "a scheduler"):
         import distributed
-    except ImportError:
-        raise LocatkError(
-            "a scheduler needs dask, which is not installed",
-            hint='Install it: pip install "locatk[dask]"',
-        ) from None
     # distributed logs tracebacks of errors that are reported here in one line.
     for name in [
         name for name in logging.root.manager.loggerDict if name.startswith("distributed")

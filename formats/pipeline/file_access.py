@@ -15,11 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from locatk.core.errors import InputError, LocatkError, MissingDataError
+from locatk.formats.extras import requires_extra
 from locatk.formats.output import PART_SUFFIX, check_output, output_exists_error, remove_stale_parts
 from locatk.formats.pipeline.file_names import file_name, is_url, is_web
 from locatk.formats.sessions.mcap_file import DamageError
 
-OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "oss")
+S3_PROTOCOLS = ("s3", "s3a")
+
+OBJECT_STORES = (*S3_PROTOCOLS, "gs", "gcs", "az", "abfs", "abfss", "oss")
 """Protocols of object stores, in which an object appears completely or not at all."""
 
 MAX_REQUESTS = 16
@@ -162,25 +165,29 @@ def remote(url: str) -> Iterator[tuple[Any, str]]:
     Raises
     ------
     LocatkError
-        fsspec, or the package that it needs for this protocol, is not installed.
+        fsspec, or s3fs for S3, is not installed.
     MissingDataError
         There is no such object.
     InputError
-        The server does not respond, access is refused, or the protocol is unknown.
+        The server does not respond, access is refused, the protocol is unknown, or another package
+        that it needs is not installed.
     """
     protocol = url.partition("://")[0]
     hint = "Check the URL, and that its server runs"
     if protocol.lower() in OBJECT_STORES:
         hint = "Check the credentials, and AWS_ENDPOINT_URL of a store that is not Amazon's"
-    try:
-        import fsspec  # Optional, and slow to import.
+    with requires_extra("s3", "a URL", file=url):
+        import fsspec  # slow to import
 
+        if protocol.lower() in S3_PROTOCOLS:
+            import s3fs  # noqa: F401
+    try:
         store, key = fsspec.core.url_to_fs(url)
     except ImportError as error:
-        raise LocatkError(
-            f"cannot be read or written ({short_reason(error)})",
+        raise InputError(
+            f"{protocol}:// needs another package ({short_reason(error)})",
             file=url,
-            hint='Install it: pip install "locatk[s3]"',
+            hint="Install that package with pip",
         ) from None
     except ValueError as error:
         raise InputError(short_reason(error), file=url, hint=hint) from None

@@ -17,6 +17,7 @@ from locatk.core.errors import InputError
 from locatk.core.paper_sizes import paper_size
 from locatk.formats.artifacts.ledger import Ledger
 from locatk.formats.artifacts.sheets import dumps_manifest
+from locatk.formats.extras import requires_extra
 from locatk.formats.output import atomic_write
 from locatk.formats.printing import rasters
 
@@ -75,8 +76,11 @@ def page_layouts(
         See :func:`locatk.formats.printing.overlay.page_sizes`.
     InputError
         A page is too small for dots.
+    LocatkError
+        pikepdf is not installed.
     """
-    from locatk.formats.printing.overlay import page_sizes  # imports pikepdf
+    with requires_extra("pdf", "an overlay", file=document):
+        from locatk.formats.printing.overlay import page_sizes
 
     layouts = []
     for number, size in enumerate(page_sizes(document), 1):
@@ -126,6 +130,8 @@ def draw(
         The sheets cannot be drawn in this format.
     FormatError, MissingDataError
         The document cannot be read.
+    LocatkError
+        There is a document, but pikepdf is not installed.
     """
     if format_name != "pdf":
         write = rasters.WRITERS[format_name]
@@ -138,7 +144,8 @@ def draw(
     data = render(manifest, marks=marks, crop=crop, done=done)
     if document is None:
         return DrawnSheets([lambda stream: stream.write(data)])
-    from locatk.formats.printing.overlay import overlay  # imports pikepdf
+    with requires_extra("pdf", "an overlay", file=document):
+        from locatk.formats.printing.overlay import overlay
 
     def page_done(number: int, count: int) -> None:
         done()

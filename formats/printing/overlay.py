@@ -1,7 +1,7 @@
 """Dots printed over the pages of a PDF document.
 
 :func:`overlay` draws each page of one PDF over the same page of another at true size, and
-optionally removes the black ink of the lower one.
+optionally removes the black ink of the lower one. It needs pikepdf (extra ``pdf``).
 """
 
 from __future__ import annotations

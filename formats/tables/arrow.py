@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from locatk.core.errors import LocatkError
+from locatk.formats.extras import requires_extra
 
 
 def import_pyarrow() -> tuple[Any, Any]:
@@ -15,12 +15,7 @@ def import_pyarrow() -> tuple[Any, Any]:
     LocatkError
         They are not installed.
     """
-    try:
+    with requires_extra("parquet", "Parquet"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError:
-        raise LocatkError(
-            "Parquet needs pyarrow, which is not installed",
-            hint='Install it: pip install "locatk[parquet]"',
-        ) from None
     return pyarrow, pyarrow.parquet

@@ -179,7 +179,7 @@ def test_the_missing_extra_is_one_line(
     done = locatk("eval", solved, "--truth", path)
     assert done.exit_code == 1
     assert done.stderr == (
-        "Error: messages of ROS need rosbags, which is not installed. "
+        f"Error: {path}: a message of ROS needs rosbags, which is not installed. "
         'Hint: Install it: pip install "locatk[ros]".\n'
     )
 

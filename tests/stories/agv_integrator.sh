@@ -16,7 +16,7 @@ grep -q 'stop' site.txt
 # Two tags closer to each other than their magnets allow are found before they are glued.
 sed 's/^3,0/1,55/' survey.csv > wrong.csv
 locatk site design tag.toml --points wrong.csv -o wrong.toml && status=0 || status=$?
-test $status = 3
+test "$status" = 3
 
 # What is printed, and a drive over the hall: ids come back with their meanings.
 locatk print tag hall.toml -o tags.pdf

@@ -13,7 +13,7 @@ done
 # A group sent an empty file. The others are solved, and it is named.
 touch groups/group-4.mcap
 locatk solve groups/ -o solved/ 2> messages.txt && status=0 || status=$?
-test $status != 0
+test "$status" != 0
 grep -q 'group-4' messages.txt
 rm groups/group-4.mcap
 locatk eval solved/ --truth groups/ --table marks.csv

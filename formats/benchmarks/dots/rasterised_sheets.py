@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pikepdf
 
 from locatk.core.dots.codec import SECTION_LENGTH
 from locatk.core.dots.drawing.layout import DPIS, SheetLayout, lay_out, manifest, pixels, snap
@@ -23,7 +22,8 @@ from locatk.core.errors import LocatkError
 from locatk.core.paper_sizes import paper_size
 from locatk.formats.benchmarks.dots.rasterisers import RASTERISERS, Grey
 from locatk.formats.benchmarks.figures import Figure
-from locatk.formats.printing import overlay, pattern, rasters
+from locatk.formats.extras import requires_extra
+from locatk.formats.printing import pattern, rasters
 
 STUDY_VARIABLE = "LOCATK_PRINT_STUDY"
 """Environment variable that selects all sheets instead of a few; they take 15 to 30 minutes."""
@@ -68,6 +68,8 @@ class PrintedSheets:
         """Write the PDF, as ``locatk print pattern`` does."""
         path.write_bytes(pattern.render(self.manifest))
         if self.document is not None:
+            from locatk.formats.printing import overlay
+
             below = path.with_suffix(".below")
             below.write_bytes(self.document)
             path.write_bytes(overlay.overlay(below, path.read_bytes(), strip_black=True).data)
@@ -86,6 +88,10 @@ def tiled_sheets(dpi: int) -> PrintedSheets:
 
 def overlaid_sheets(dpi: int) -> PrintedSheets:
     """Return sheets over a document whose pages are rotated, cropped, and not whole pixels."""
+    import pikepdf
+
+    from locatk.formats.printing import overlay
+
     pdf = pikepdf.Pdf.new()
     for crop, rotation, unit in (
         ((0, 0, 419.53, 297.64), 0, 1),
@@ -140,6 +146,11 @@ def printed_sheets() -> Iterator[PrintedSheets]:
 
 def rasteriser_figures() -> list[Figure]:
     """Rasterise sheets in all rasterisers, and count the dots that are on their pixels."""
+    try:
+        with requires_extra("pdf", "an overlay"):
+            import pikepdf  # noqa: F401
+    except LocatkError as error:
+        return [row for item in RASTERISERS for row in _figures(item.name, {}, None, error)]
     usable = [rasteriser for rasteriser in RASTERISERS if not rasteriser.missing()]
     reasons: dict[str, object] = {item.name: item.missing() for item in RASTERISERS}
     percents: dict[str, dict[str, float]] = {item.name: {} for item in RASTERISERS}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -286,6 +287,15 @@ def test_an_absent_rasteriser_is_not_measured_and_a_failing_one_has_no_dots(
     assert [figure.value for figure in figures] == [None, None, 0.0, None]
     assert "absent is not installed" in figures[0].how
     assert "spoilt" in figures[2].how
+
+
+def test_without_pikepdf_no_rasteriser_is_measured(without_extras: Callable[..., None]) -> None:
+    without_extras("pdf")
+    figures = rasterised_sheets.rasteriser_figures()
+    assert len(figures) == 2 * len(rasterised_sheets.RASTERISERS)
+    for figure in figures:
+        assert figure.value is None
+        assert figure.how == "not measured: an overlay needs pikepdf, which is not installed"
 
 
 @pytest.mark.slow

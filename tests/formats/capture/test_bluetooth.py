@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +18,7 @@ from bleak.exc import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from locatk.core.errors import LocatkError
 from locatk.formats.capture import bluetooth
 from locatk.formats.capture.bluetooth import BluetoothPort
 from locatk.formats.capture.links import Link, LinkLost, SourceError
@@ -266,10 +266,12 @@ def test_no_name(air: Any, name: str) -> None:
     assert air.scans == 0
 
 
-def test_bleak_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "bleak", None)
-    error = refused("ble:robot7")
-    assert error.hint == 'Install it: pip install "locatk[ble]"'
+def test_bleak_is_missing(without_extras: Callable[..., None]) -> None:
+    without_extras("ble")
+    with pytest.raises(LocatkError) as error:
+        port_of("ble:robot7", baud=115_200).open()
+    assert str(error.value) == "ble:robot7: Bluetooth needs bleak, which is not installed"
+    assert error.value.hint == 'Install it: pip install "locatk[ble]"'
 
 
 @pytest.mark.parametrize(
