@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from plotly.graph_objects import Figure
 
 from locatk.core.evaluation import CHI2_95_QUANTILES, Evaluation, Statistics
 from locatk.core.evaluation.consistency import NORMAL_95_QUANTILE
@@ -28,6 +27,7 @@ from locatk.formats.plots.units import (
     format_count,
     format_length,
     format_number,
+    last_bin_note,
     select_unit,
 )
 from locatk.formats.report.detections import format_probability
@@ -187,7 +187,7 @@ def error_panels(subject: Subject) -> list[Panel]:
     covariance = scored_covariance(solution, evaluation)
     panels = [
         _error_panel(evaluation, covariance, colors, unit, start_ns),
-        Panel("Histogram of errors", "", _draw_histogram(evaluation, colors, unit)),
+        _histogram_panel(evaluation, colors, unit),
         _axis_panel(evaluation, covariance, colors, unit, start_ns),
     ]
     has_rotation = np.isfinite(evaluation.rotation_errors_deg)
@@ -226,8 +226,8 @@ def _error_panel(
     return panel
 
 
-def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Figure:
-    """Draw how often errors occur, with outliers in the last bin, and mark two quantiles."""
+def _histogram_panel(evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Panel:
+    """Return how often errors occur, with outliers in the last bin, and two marked quantiles."""
     series = split_by_device(evaluation, evaluation.errors * unit.per_si)
     every = np.concatenate([s.value for s in series.values()])
     limit = axis_limit(every)
@@ -267,7 +267,7 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
     grid.figure.update_xaxes(range=[0, limit])
     grid.figure.update_yaxes(range=[0, 1.3 * float(highest)])  # Space for the line names.
     title = f"error [{unit.name}]"
-    return grid.finish(
+    figure = grid.finish(
         280,
         ["poses"],
         column_titles=[title],
@@ -278,6 +278,8 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
             "traceorder": "normal",
         },
     )
+    note = last_bin_note(every, limit)
+    return Panel("Histogram of errors", f"{note}." if note else "", figure)
 
 
 def _axis_panel(
