@@ -33,18 +33,13 @@ from locatk.formats.plots.units import (
 from locatk.formats.report.detections import format_probability
 from locatk.formats.report.diagram_grid import DiagramGrid
 from locatk.formats.report.panels import Panel, Table, escape, join_names, join_sentences
-from locatk.formats.report.style import INK
+from locatk.formats.report.style import faded
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.theme import ALL_DEVICES, CARD, INK, UNSOLVED_DEVICE
 from locatk.formats.report.value_diagrams import ValueRow, value_panel
 
 HISTOGRAM_BINS = 50
 """Number of bins of the histogram of errors, on an axis of about 900 pixels."""
-
-ALL_DEVICES_COLOR = "#8896a3"
-"""Color of a histogram of more devices than a legend names."""
-
-UNSOLVED_DEVICE_COLOR = "#5b6875"
-"""Color of a device in the evaluation that is not in the solution."""
 
 MIN_HEIGHT_ERROR_M = 1e-9
 """Largest error in z up to which estimate and truth are in one plane, and z is not drawn."""
@@ -179,7 +174,7 @@ def error_panels(subject: Subject) -> list[Panel]:
     solution, evaluation = subject.solution, subject.evaluation
     if evaluation is None:
         return []
-    colors = dict.fromkeys(evaluation.devices, UNSOLVED_DEVICE_COLOR)
+    colors = dict.fromkeys(evaluation.devices, UNSOLVED_DEVICE)
     colors |= device_colors([t.device for t in solution.trajectories])
     start_ns = origin_ns(subject.session, solution)
     unscaled = is_shown_unscaled(solution, evaluation)
@@ -238,7 +233,7 @@ def _histogram_panel(evaluation: Evaluation, colors: dict[str, str], unit: Unit)
             for name, s in series.items()
         }
     else:
-        groups = {"all": (np.minimum(every, limit), ALL_DEVICES_COLOR)}
+        groups = {"all": (np.minimum(every, limit), ALL_DEVICES)}
     grid = DiagramGrid(1)
     grid.add_histogram(1, edges, groups, f"%{{y}} poses around %{{x:.3g}} {escape(unit.name)}")
     for name, value, side, shift_px in (
@@ -259,7 +254,7 @@ def _histogram_panel(evaluation: Evaluation, colors: dict[str, str], unit: Unit)
                     "yanchor": "top",
                     "xanchor": side,
                     "xshift": shift_px,
-                    "bgcolor": "rgba(255,255,255,0.8)",
+                    "bgcolor": faded(CARD, 0.8),
                     "showarrow": False,
                 },
             )

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 from typing import Any
 
-FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
+from locatk.formats.report.theme import CARD, CONTROL, GRID, INK, PAGE_COLORS
 
-INK, GRID = "#1d2733", "#e9edf1"
-"""Colors of text and of grid lines."""
+FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
 
 DEVICE_LEGEND_RANK = 100
 """Rank of devices in a legend, before everything else (the default of plotly is 1000)."""
 
+
+def faded(color: str, opacity: float) -> str:
+    """Return ``"#rrggbb"`` as a translucent color."""
+    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    return f"rgba({red},{green},{blue},{opacity:g})"
+
+
 _AXIS: dict[str, Any] = {
     "gridcolor": GRID,
-    "linecolor": "#9aa7b3",
-    "tickcolor": "#9aa7b3",
+    "linecolor": CONTROL,
+    "tickcolor": CONTROL,
+    "showline": True,
+    "mirror": True,
     "ticks": "outside",
     "ticklen": 4,
     "zeroline": False,
@@ -27,7 +35,7 @@ TEMPLATE: dict[str, Any] = {
     "layout": {
         "font": {"family": FONT, "size": 13, "color": INK},
         "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "#ffffff",
+        "plot_bgcolor": CARD,
         "margin": {"l": 56, "r": 12, "t": 12, "b": 44},
         "xaxis": _AXIS,
         "yaxis": _AXIS,
@@ -42,7 +50,9 @@ TEMPLATE: dict[str, Any] = {
             "font": {"size": 12.5},
             "bgcolor": "rgba(0,0,0,0)",
         },
-        "modebar": {"bgcolor": "rgba(255,255,255,0.7)", "color": "#8896a3"},
+        "modebar": {"bgcolor": faded(CARD, 0.7), "color": CONTROL, "activecolor": INK},
+        # A figure that is drawn again in other colors keeps its view.
+        "uirevision": "kept",
     }
 }
 """Layout that all figures share; a page contains it once."""
@@ -64,6 +74,35 @@ SCRIPT = """\
   // A finger on a figure scrolls the page.
   const touch = !window.matchMedia("(hover: hover)").matches;
   shared.config.displayModeBar = touch ? false : "hover";
+  // Diagrams are made in light colors; dark ones replace them, but not on paper.
+  const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  function darkened(color) {
+    const parts = color.match(/^rgba\\((\\d+),(\\d+),(\\d+),([\\d.]+)\\)$/);
+    const hex = (n) => Number(n).toString(16).padStart(2, "0");
+    const key = parts ? "#" + parts.slice(1, 4).map(hex).join("") : color.toLowerCase();
+    const other = shared.dark[key];
+    if (!other || !parts) { return other || color; }
+    const channels = [1, 3, 5].map((k) => parseInt(other.slice(k, k + 2), 16));
+    return "rgba(" + channels.join(",") + "," + parts[4] + ")";
+  }
+  function copied(value, isDark, isColor) {
+    if (Array.isArray(value)) { return value.map((each) => copied(each, isDark, isColor)); }
+    if (value && typeof value === "object") {
+      return Object.fromEntries(Object.entries(value).map(([key, each]) =>
+        [key, copied(each, isDark, /color/.test(key) && typeof each !== "number")]));
+    }
+    return isDark && isColor && typeof value === "string" ? darkened(value) : value;
+  }
+  function paint(figure, isDark) {
+    const spec = copied(figure.spec, isDark, false);
+    spec.layout.template = copied(shared.template, isDark, false);
+    return Plotly.react(figure, spec.data, spec.layout, shared.config);
+  }
+  function paintAll(isDark) {
+    for (const figure of figures) { if (figure.spec) { paint(figure, isDark); } }
+  }
+  dark.addEventListener("change", function () { paintAll(dark.matches); });
+
   // One after another, so that the page can be read in the meantime.
   function draw(k) {
     if (k >= figures.length) {
@@ -72,11 +111,10 @@ SCRIPT = """\
     }
     const figure = figures[k];
     const spec = JSON.parse(document.getElementById(figure.id + "-data").textContent);
-    spec.layout.template = shared.template;
     if (touch) { spec.layout.dragmode = false; }
     if (figure.clientWidth < 600) { narrow(figure, spec); }
-    Plotly.newPlot(figure, spec.data, spec.layout, shared.config)
-      .then(function () { setTimeout(draw, 0, k + 1); });
+    figure.spec = spec;
+    paint(figure, dark.matches).then(function () { setTimeout(draw, 0, k + 1); });
   }
   // In a narrow window legends move above the figure, and maps become lower.
   function narrow(figure, spec) {
@@ -121,8 +159,14 @@ SCRIPT = """\
       Plotly.relayout(figure, {width: width, autosize: width === null});
     }
   }
-  window.addEventListener("beforeprint", function () { fit(690); });
-  window.addEventListener("afterprint", function () { fit(null); });
+  window.addEventListener("beforeprint", function () {
+    if (dark.matches) { paintAll(false); }
+    fit(690);
+  });
+  window.addEventListener("afterprint", function () {
+    if (dark.matches) { paintAll(true); }
+    fit(null);
+  });
 
   // Headers of the overview sort it; numbers with units by their size.
   const scales = {"m": 1, "cm": 1e-2, "mm": 1e-3, "\u00b5m": 1e-6, "um": 1e-6};
@@ -171,63 +215,73 @@ SCRIPT = """\
 })();
 """
 
-STYLE = """\
-:root { color-scheme: light; }
+
+def _variables(index: int) -> str:
+    """Return the variables of CSS for the light colors (0) or the dark ones (1)."""
+    return " ".join(f"--{name}: {colors[index]};" for name, colors in PAGE_COLORS.items())
+
+
+STYLE = (
+    f":root {{ color-scheme: light; {_variables(0)} }}\n"
+    "@media screen and (prefers-color-scheme: dark) {\n"
+    f"  :root {{ color-scheme: dark; {_variables(1)} }}\n"
+    "}\n"
+    """\
 * { box-sizing: border-box; }
 html { -webkit-text-size-adjust: 100%; scroll-behavior: smooth; }
 body {
-  margin: 0; background: #f3f5f7; color: #1d2733; line-height: 1.5; font-size: 16px;
+  margin: 0; background: var(--page); color: var(--ink); line-height: 1.5; font-size: 16px;
   font-family: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
 }
 main, body > header, body > footer { max-width: 1080px; margin: 0 auto; padding: 0 20px; }
 body > header { padding-top: 28px; }
 body > header .brand {
-  font-size: 13px; letter-spacing: .06em; text-transform: uppercase; color: #5b6875; margin: 0;
+  font-size: 13px; letter-spacing: .06em; text-transform: uppercase; color: var(--muted); margin: 0;
 }
 h1 { font-size: 30px; line-height: 1.2; margin: 2px 0 10px; overflow-wrap: anywhere; }
 h2 { font-size: 25px; line-height: 1.25; margin: 44px 0 4px; overflow-wrap: anywhere; }
 h3 { font-size: 18px; line-height: 1.3; margin: 0 0 2px; }
 p { margin: 0 0 10px; }
-a { color: #0060a0; }
-.sub { color: #5b6875; margin: 0 0 14px; overflow-wrap: anywhere; }
+a { color: var(--link); }
+.sub { color: var(--muted); margin: 0 0 14px; overflow-wrap: anywhere; }
 .verdict { font-size: 18px; margin: 0 0 14px; max-width: 60em; }
 .tiles {
   display: flex; flex-wrap: wrap; gap: 10px; margin: 0 0 16px;
 }
 .tile {
   flex: 1 1 116px; padding: 8px 11px 9px;
-  background: #fff; border: 1px solid #d5dbe1; border-radius: 8px;
+  background: var(--card); border: 1px solid var(--frame); border-radius: 8px;
 }
 .tile b {
   display: block; font-size: 19px; white-space: nowrap; line-height: 1.25; font-weight: 600;
 }
-.tile span { font-size: 13px; color: #5b6875; display: block; line-height: 1.35; }
+.tile span { font-size: 13px; color: var(--muted); display: block; line-height: 1.35; }
 .notes {
-  background: #fff8e6; border: 1px solid #ecd9a0; border-radius: 8px;
+  background: var(--note); border: 1px solid var(--note-frame); border-radius: 8px;
   padding: 10px 16px; margin: 0 0 16px;
 }
 .notes ul { margin: 2px 0 0; padding-left: 20px; }
 .notes li { overflow-wrap: anywhere; }
 .panel {
-  background: #fff; border: 1px solid #d5dbe1; border-radius: 8px;
+  background: var(--card); border: 1px solid var(--frame); border-radius: 8px;
   padding: 14px 18px 12px; margin: 0 0 16px;
 }
-.panel > p { color: #5b6875; font-size: 14.5px; max-width: 68em; }
+.panel > p { color: var(--muted); font-size: 14.5px; max-width: 68em; }
 .wide { overflow-x: auto; overflow-y: hidden; }
 .figure { width: 100%; margin-top: 4px; }
 .table { overflow-x: auto; margin: 6px 0 4px; }
 table { border-collapse: collapse; font-size: 14.5px; font-variant-numeric: tabular-nums; }
 th {
-  text-align: left; font-weight: 600; color: #5b6875; border-bottom: 1px solid #b9c3cc;
+  text-align: left; font-weight: 600; color: var(--muted); border-bottom: 1px solid var(--rule);
   white-space: nowrap;
 }
 th, td { padding: 4px 18px 4px 0; vertical-align: top; }
-td { border-bottom: 1px solid #e9edf1; overflow-wrap: anywhere; min-width: 15em; }
+td { border-bottom: 1px solid var(--grid); overflow-wrap: anywhere; min-width: 15em; }
 td.short { white-space: nowrap; min-width: 0; }
 tr:last-child td { border-bottom: 0; }
 th.number, td.number { text-align: right; white-space: nowrap; min-width: 0; }
 pre {
-  background: #f3f5f7; border: 1px solid #d5dbe1; border-radius: 6px; padding: 9px 12px;
+  background: var(--page); border: 1px solid var(--frame); border-radius: 6px; padding: 9px 12px;
   margin: 6px 0 10px; font-size: 14px; white-space: pre-wrap; overflow-wrap: anywhere;
   font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, monospace;
 }
@@ -235,7 +289,7 @@ pre {
 .command pre { flex: 1; }
 button.copy {
   margin-top: 8px; font: inherit; font-size: 14px; padding: 5px 12px; border-radius: 6px;
-  border: 1px solid #b9c3cc; background: #fff; color: #1d2733; cursor: pointer;
+  border: 1px solid var(--control); background: var(--card); color: var(--ink); cursor: pointer;
 }
 .sortable th button {
   font: inherit; color: inherit; background: none; border: 0; padding: 0; cursor: pointer;
@@ -244,9 +298,9 @@ button.copy {
 .sortable th[aria-sort=descending] button::after { content: " \u25bc"; }
 .pictures { display: flex; flex-wrap: wrap; gap: 14px; margin-top: 8px; }
 .pictures figure { margin: 0; flex: 1 1 220px; max-width: 480px; }
-.pictures img { width: 100%; height: auto; border: 1px solid #d5dbe1; display: block; }
-.pictures figcaption { font-size: 13.5px; color: #5b6875; }
-body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bottom: 36px; }
+.pictures img { width: 100%; height: auto; border: 1px solid var(--frame); display: block; }
+.pictures figcaption { font-size: 13.5px; color: var(--muted); }
+body > footer { color: var(--muted); font-size: 13.5px; padding-top: 8px; padding-bottom: 36px; }
 @media (max-width: 600px) {
   main, body > header, body > footer { padding-left: 10px; padding-right: 10px; }
   .panel { padding: 12px 10px 8px; }
@@ -269,9 +323,4 @@ body > footer { color: #5b6875; font-size: 13.5px; padding-top: 8px; padding-bot
   button.copy, .modebar { display: none !important; }
 }
 """
-
-
-def faded(color: str, opacity: float) -> str:
-    """Return ``"#rrggbb"`` as a translucent color."""
-    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
-    return f"rgba({red},{green},{blue},{opacity:g})"
+)

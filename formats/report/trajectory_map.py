@@ -25,6 +25,7 @@ from locatk.formats.plots.shapes import (
 from locatk.formats.plots.units import abbreviate, format_count
 from locatk.formats.report.panels import Panel, escape, join_sentences
 from locatk.formats.report.style import DEVICE_LEGEND_RANK, faded
+from locatk.formats.report.theme import CARD
 from locatk.formats.report.thinning import Indices, allot_points, thin, thinning_note
 
 Array = NDArray[np.float64]
@@ -219,7 +220,7 @@ def _annotation(label: Label, view: View) -> dict[str, Any]:
         "yanchor": "middle" if is_centred else "bottom",
         "yshift": label.shift_px,
         "font": {"size": 12.5 if is_centred else 11},
-        "bgcolor": "rgba(255,255,255,0.7)" if is_centred else TRANSPARENT,
+        "bgcolor": faded(CARD, 0.7) if is_centred else TRANSPARENT,
     }
 
 
@@ -265,7 +266,7 @@ def _path_traces(
         "customdata": rows[:1, 2:],
         "mode": "markers",
         "showlegend": False,
-        "marker": {"color": "#ffffff", "size": 10, "line": {"color": color, "width": 2.5}},
+        "marker": {"color": CARD, "size": 10, "line": {"color": color, "width": 2.5}},
     }
     return [line, first]
 
@@ -338,7 +339,7 @@ def _ellipse_traces(
             "showlegend": not traces,
             "fill": "toself",
             "fillcolor": faded(colors[device], 0.13),
-            "line": {"color": faded(colors[device], 0.65), "width": 1},
+            "line": {"color": colors[device], "width": 0.7},
             "hoverinfo": "skip",
         }
         traces.append(trace)

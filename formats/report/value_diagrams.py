@@ -21,7 +21,8 @@ from locatk.formats.plots.series import (
 from locatk.formats.plots.shapes import is_in_legend
 from locatk.formats.plots.units import abbreviate, format_count
 from locatk.formats.report.panels import Panel, escape, join_sentences
-from locatk.formats.report.style import DEVICE_LEGEND_RANK, INK, faded
+from locatk.formats.report.style import DEVICE_LEGEND_RANK, faded
+from locatk.formats.report.theme import INK
 from locatk.formats.report.thinning import MAX_POSES, Indices, allot_points, thin, thinning_note
 
 Array = NDArray[np.float64]
@@ -248,7 +249,7 @@ def _expected_traces(
         "mode": "lines",
         "name": "95 % expected",
         "legendgroup": "expected",
-        "line": {"color": faded(color, 0.55), "width": 1.2},
+        "line": {"color": color, "width": 0.8},
         "hoverinfo": "skip",
     }
     fill = {"fill": "tonexty" if signed else "tozeroy", "fillcolor": faded(color, 0.13)}

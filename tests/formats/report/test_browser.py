@@ -17,8 +17,10 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
+from locatk.formats.plots.shapes import COLORS
 from locatk.formats.report.report import write_report
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.theme import DARK_DEVICE_COLORS, PAGE_COLORS
 
 pytestmark = pytest.mark.slow
 
@@ -224,9 +226,57 @@ def test_the_page_is_not_blank(page: Page) -> None:
     assert struct.unpack(">II", data[16:24])[0] == 1200
     image = cv2.imread(str(page.screenshot)).reshape(-1, 3).astype(np.int16)
     blue = np.abs(image - [0xB2, 0x72, 0x00]).max(axis=1) < 12  # of the path; cv2 has b, g, r
-    grey = np.abs(image - 0xBF).max(axis=1) < 6  # of the truth
+    grey = np.abs(image - 0x8C).max(axis=1) < 6  # of the truth
     assert blue.sum() > 500
     assert grey.sum() > 20
+
+
+DARK = "--blink-settings=preferredColorScheme=0"
+"""Switch by which Chromium prefers a dark color scheme."""
+
+
+def test_dark_mode_changes_the_page_and_its_diagrams(browser: str, tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    path, picture = tmp_path / "report.html", tmp_path / "page.png"
+    write_report(path, [subject()])
+    shown = opened(browser, path, tmp_path / "profile", DARK, f"--screenshot={picture}")
+    assert shown.console == []
+    image = cv2.imread(str(picture))[:, :, ::-1].reshape(-1, 3).astype(np.int16)
+
+    def fraction(color: str) -> float:
+        channels = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+        return float(np.mean(np.abs(image - channels).max(axis=1) < 3))
+
+    for name, least in (("page", 0.05), ("card", 0.3)):
+        light, dark = PAGE_COLORS[name]
+        assert fraction(light) < 1e-3
+        assert fraction(dark) > least
+    assert fraction(DARK_DEVICE_COLORS[0]) > 1e-4
+    assert fraction(COLORS[0]) < 1e-5
+    # Text and axes of the diagrams, in the notation of plotly.
+    assert "fill: rgb(230, 235, 240)" in shown.dom
+    assert "fill: rgb(29, 39, 51)" not in shown.dom
+
+
+def test_dark_mode_prints_light_diagrams(browser: str, tmp_path: Path) -> None:
+    """A report that is printed has the light colors, and the dark ones again afterwards."""
+    path = tmp_path / "report.html"
+    write_report(path, [subject()])
+    report = _without_policy(path.read_text("utf-8"))
+    measure = """<script>
+        new MutationObserver(function () {
+          const axis = () => document.querySelector(".figure .xtick text").style.fill;
+          const colors = [axis()];
+          for (const name of ["beforeprint", "afterprint"]) {
+            window.dispatchEvent(new Event(name));
+            colors.push(axis());
+          }
+          document.body.append("[" + colors.join("; ") + "]");
+        }).observe(document.documentElement, {attributeFilter: ["data-drawn"]});
+        </script>"""
+    path.write_text(report.replace("<main>", f"{measure}<main>"), "utf-8")
+    dom = opened(browser, path, tmp_path / "profile", DARK).dom
+    assert "[rgb(230, 235, 240); rgb(29, 39, 51); rgb(230, 235, 240)]" in dom
 
 
 def test_a_narrow_window_shows_all(frames: Opened) -> None:
