@@ -156,7 +156,9 @@ SCRIPT = """\
       figure.dataset.height = height;
       const low = Math.min(parseFloat(height), 0.72 * width) + "px";
       figure.style.height = width && square ? low : height;
-      Plotly.relayout(figure, {width: width, autosize: width === null});
+      const size = width ? {width: width, height: parseFloat(figure.style.height)}
+        : {width: null, height: null};
+      Plotly.relayout(figure, Object.assign(size, {autosize: width === null}));
     }
   }
   window.addEventListener("beforeprint", function () {
