@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from locatk.formats.report.theme import CARD, CONTROL, GRID, INK, PAGE_COLORS
+from locatk.formats.report.theme import CARD, CONTROL, CSS_COLORS, GRID, INK
 
 FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
 
@@ -66,6 +66,9 @@ CONFIG: dict[str, Any] = {
     "modeBarButtonsToRemove": ["select2d", "lasso2d", "autoScale2d"],
 }
 
+MAX_EAGER_FIGURES = 100
+"""Number of figures up to which a page draws all of them; otherwise it draws those in sight."""
+
 SCRIPT = """\
 "use strict";
 (function () {
@@ -103,19 +106,36 @@ SCRIPT = """\
   }
   dark.addEventListener("change", function () { paintAll(dark.matches); });
 
-  // One after another, so that the page can be read in the meantime.
-  function draw(k) {
-    if (k >= figures.length) {
-      document.documentElement.dataset.drawn = String(figures.length);
-      return;
+  // One after another, so that the page can be read in the meantime, and first those in sight.
+  // A page of many figures draws no others: all together would take minutes.
+  const inSight = new Set(), waiting = new Set(figures);
+  let isDrawing = false;
+  function drawNext() {
+    const all = figures.length <= shared.eager ? figures : [];
+    const figure = figures.find((each) => waiting.has(each) && inSight.has(each)) ||
+      all.find((each) => waiting.has(each));
+    isDrawing = Boolean(figure);
+    if (figure) {
+      draw(figure).then(function () { setTimeout(drawNext, 0); });
+    } else {
+      document.documentElement.dataset.drawn = String(figures.length - waiting.size);
     }
-    const figure = figures[k];
+  }
+  function draw(figure) {
+    waiting.delete(figure);
     const spec = JSON.parse(document.getElementById(figure.id + "-data").textContent);
     if (touch) { spec.layout.dragmode = false; }
     if (figure.clientWidth < 600) { narrow(figure, spec); }
     figure.spec = spec;
-    paint(figure, dark.matches).then(function () { setTimeout(draw, 0, k + 1); });
+    return paint(figure, dark.matches);
   }
+  const observer = new IntersectionObserver(function (entries) {
+    for (const entry of entries) {
+      inSight[entry.isIntersecting ? "add" : "delete"](entry.target);
+    }
+    if (!isDrawing) { drawNext(); }
+  }, {rootMargin: "50% 0px"});
+  figures.forEach((figure) => observer.observe(figure));
   // In a narrow window legends move above the figure, and maps become lower.
   function narrow(figure, spec) {
     const legend = spec.layout.legend || {};
@@ -145,8 +165,6 @@ SCRIPT = """\
     }
     figure.style.height = Math.round(height) + "px";
   }
-  draw(0);
-
   // Paper is narrower than most windows.
   function fit(width) {
     for (const figure of figures) {
@@ -162,6 +180,7 @@ SCRIPT = """\
     }
   }
   window.addEventListener("beforeprint", function () {
+    waiting.forEach(draw);
     if (dark.matches) { paintAll(false); }
     fit(690);
   });
@@ -220,7 +239,7 @@ SCRIPT = """\
 
 def _variables(index: int) -> str:
     """Return the variables of CSS for the light colors (0) or the dark ones (1)."""
-    return " ".join(f"--{name}: {colors[index]};" for name, colors in PAGE_COLORS.items())
+    return " ".join(f"--{name}: {colors[index]};" for name, colors in CSS_COLORS.items())
 
 
 STYLE = (
@@ -293,11 +312,34 @@ button.copy {
   margin-top: 8px; font: inherit; font-size: 14px; padding: 5px 12px; border-radius: 6px;
   border: 1px solid var(--control); background: var(--card); color: var(--ink); cursor: pointer;
 }
+.sortable table { font-size: 13.5px; margin-bottom: 14px; }
+.sortable th, .sortable td { padding-right: 9px; }
 .sortable th button {
   font: inherit; color: inherit; background: none; border: 0; padding: 0; cursor: pointer;
 }
 .sortable th[aria-sort=ascending] button::after { content: " \u25b2"; }
 .sortable th[aria-sort=descending] button::after { content: " \u25bc"; }
+.back { float: right; margin: -26px 0 0; font-size: 14.5px; }
+.maps {
+  display: grid; grid-template-columns: repeat(auto-fill, minmax(170px, 1fr)); gap: 10px;
+}
+.maps a {
+  display: block; padding: 8px 10px; overflow-wrap: anywhere; color: inherit;
+  text-decoration: none; font-size: 13px; line-height: 1.35; break-inside: avoid;
+  background: var(--card); border: 1px solid var(--frame); border-radius: 8px;
+}
+.maps a:hover, .maps a:focus-visible { border-color: var(--link); }
+.maps a b { display: block; color: var(--link); font-weight: 600; }
+.maps a span { color: var(--muted); }
+.maps > a > svg { display: block; width: 100%; margin-bottom: 4px; }
+.maps svg { fill: none; }
+.maps svg path { stroke-linecap: round; stroke-linejoin: round; }
+.maps .path { stroke-width: 1.6; }
+.maps .artifact { stroke: var(--control); }
+.maps .dots { stroke: var(--control); stroke-width: 3; }
+.maps .station { stroke: var(--ink); stroke-width: 6; }
+.maps .bar { stroke: var(--ink); stroke-width: 1.5; stroke-linecap: butt; }
+.maps text { fill: var(--muted); font-size: 12px; }
 .pictures { display: flex; flex-wrap: wrap; gap: 14px; margin-top: 8px; }
 .pictures figure { margin: 0; flex: 1 1 220px; max-width: 480px; }
 .pictures img { width: 100%; height: auto; border: 1px solid var(--frame); display: block; }
@@ -311,6 +353,7 @@ body > footer { color: var(--muted); font-size: 13.5px; padding-top: 8px; paddin
   td { min-width: 13em; }
   h1 { font-size: 24px; } h2 { font-size: 21px; }
 }
+@media (prefers-reduced-motion: reduce) { html { scroll-behavior: auto; } }
 @media print {
   @page { margin: 12mm; }
   body { background: #fff; font-size: 11pt; }
@@ -322,7 +365,7 @@ body > footer { color: var(--muted); font-size: 13.5px; padding-top: 8px; paddin
   .table, .wide { overflow: visible; }
   table { font-size: 9pt; }
   th, td { padding-right: 10px; }
-  button.copy, .modebar { display: none !important; }
+  button.copy, .modebar, .back { display: none !important; }
 }
 """
 )

@@ -51,6 +51,12 @@ DARK_DEVICE_COLORS = (
 )  # fmt: skip
 """Counterparts of :data:`locatk.formats.plots.shapes.COLORS`, of similar hues, chosen like them."""
 
+CSS_COLORS = PAGE_COLORS | {
+    f"device-{k}": colors
+    for k, colors in enumerate(zip(shapes.COLORS, DARK_DEVICE_COLORS, strict=True))
+}
+"""Light and dark color of all variables of CSS."""
+
 MAX_SENSOR_SHADES = 32
 """Number of shades of sensors in a row; more sensors share shades."""
 

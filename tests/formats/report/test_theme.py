@@ -114,9 +114,9 @@ def test_the_style_has_no_color_of_its_own() -> None:
     rules = STYLE[STYLE.index("* { box-sizing") :]
     assert re.findall(r"#[0-9a-f]{3,6}\b|rgba?\(", rules) == ["#fff"]  # Paper.
     used = set(re.findall(r"var\(--([a-z-]+)\)", rules))
-    assert used <= set(theme.PAGE_COLORS)
+    assert used == set(theme.PAGE_COLORS)
     light, dark = STYLE[: STYLE.index("* { box-sizing")].split(media)
-    for name, pair in theme.PAGE_COLORS.items():
+    for name, pair in theme.CSS_COLORS.items():
         assert f"--{name}: {pair[0]};" in light
         assert f"--{name}: {pair[1]};" in dark
     assert not re.findall("#[0-9a-f]{6}", SCRIPT)
