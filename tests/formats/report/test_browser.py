@@ -6,7 +6,7 @@ import re
 import shutil
 import struct
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plots.shapes import COLORS
 from locatk.formats.report.report import write_report
+from locatk.formats.report.style import MAX_EAGER_FIGURES
 from locatk.formats.report.subject import Subject
 from locatk.formats.report.theme import DARK_DEVICE_COLORS, PAGE_COLORS
 
@@ -47,8 +48,8 @@ class Opened:
     requests: list[str]
 
 
-def opened(browser: str, page: Path, profile: Path, *more: str) -> Opened:
-    """Open a file and wait until its figures are drawn."""
+def opened(browser: str, page: Path, profile: Path, *more: str, part: str = "") -> Opened:
+    """Open a file, at a part of the page if there is one, and wait until its figures are drawn."""
     log = profile.with_suffix(".netlog")
     done = subprocess.run(
         [
@@ -67,7 +68,7 @@ def opened(browser: str, page: Path, profile: Path, *more: str) -> Opened:
             "--window-size=1200,3000",
             *more,
             "--dump-dom",
-            page.as_uri(),
+            page.as_uri() + part,
         ],
         capture_output=True,
         text=True,
@@ -305,7 +306,36 @@ def test_the_overview_is_sorted_by_a_click(browser: str, tmp_path: Path) -> None
           document.body.append("[" + Array.from(cells).map(cell => cell.textContent) + "]");
         }
         document.body.append("[" + buttons[5].parentNode.getAttribute("aria-sort") + "]");
+        // The links are those of their rows, wherever these are now.
+        for (const link of document.querySelectorAll(".sortable tbody a")) {
+          link.click();
+          const target = document.querySelector(":target");
+          document.body.append(`[${link.textContent}: ${target.querySelector("h2").textContent}`);
+          document.body.append(` ${target.tagName}]`);
+        }
       });</script>"""
     path.write_text(_without_policy(report).replace("</body>", f"{click}</body>"), "utf-8")
     dom = opened(browser, path, tmp_path / "profile").dom
     assert "[20,40,60][60,40,20][descending]" in dom
+    for name in ("r10", "r2", "r1"):
+        assert f"[{name}: {name} ARTICLE]" in dom
+
+
+@pytest.mark.slow
+def test_a_page_of_many_figures_draws_those_in_sight(browser: str, tmp_path: Path) -> None:
+    """All together would take minutes; a link to a solution draws its figures."""
+    path = tmp_path / "report.html"
+    shown = subject(n=20)
+    write_report(path, [replace(shown, name=f"r{k}") for k in range(1, 21)])
+    report = path.read_text("utf-8")
+    total = report.count('<div class="figure"')
+    assert total > MAX_EAGER_FIGURES
+    dom = opened(browser, path, tmp_path / "profile", part="#s15").dom
+    drawn = {int(k) for k in re.findall(r'id="s(\d+)-\d+-figure"[^>]*class="[^"]*js-plotly', dom)}
+    drawn |= {int(k) for k in re.findall(r'class="[^"]*js-plotly[^>]*id="s(\d+)-\d+-figure"', dom)}
+    assert 15 in drawn
+    assert len(drawn) < 6
+    # The window shows more than one figure, and not all.
+    count = re.search(r'data-drawn="(\d+)"', dom)
+    assert count is not None
+    assert 3 <= int(count[1]) < total / 2
