@@ -138,21 +138,23 @@ def error_quantile_95(covariance: Array) -> Array:
 def axis_limit(values: Array, expected: Array | None = None) -> float:
     """Return the upper limit of an axis that shows all values but extreme outliers.
 
-    The axis is extended to the largest of the ``expected`` values that leaves the values readable
+    The axis is extended to those of the ``expected`` values that leave the values readable
     (:data:`MAX_AXIS_EXTENSION`). Larger ones lie beyond the scale: see :func:`peaks_beyond`.
     """
-    finite = values[np.isfinite(values)]
     bounds = np.zeros(0) if expected is None else expected[np.isfinite(expected)]
-    limit = 0.0
-    if len(finite):
-        limit = AXIS_MARGIN * min(float(finite.max()), 1.5 * float(np.percentile(finite, 98)))
-    extended = AXIS_MARGIN * bounds
-    if limit > 0:
-        extended = extended[extended <= MAX_AXIS_EXTENSION * limit]
-    limit = max(limit, float(extended.max(initial=0.0)))
+    limit = AXIS_MARGIN * _max_without_outliers(values[np.isfinite(values)])
+    is_readable = (AXIS_MARGIN * bounds <= MAX_AXIS_EXTENSION * limit) | (limit == 0)
+    limit = max(limit, AXIS_MARGIN * _max_without_outliers(bounds[is_readable]))
     if (bounds > limit).any():
         limit *= MARK_SPACE
     return limit or 1.0
+
+
+def _max_without_outliers(values: Array) -> float:
+    """Return the largest of finite values (n,), but at most 1.5 times their 98 % quantile."""
+    if not len(values):
+        return 0.0
+    return min(float(values.max()), 1.5 * float(np.percentile(values, 98)))
 
 
 def peaks_beyond(series: Series, limit: float) -> NDArray[np.int64]:

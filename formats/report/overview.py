@@ -54,7 +54,8 @@ def overview(subjects: Sequence[Subject]) -> str:
     """
     links = [f"#s{k}" for k in range(1, len(subjects) + 1)]
     table = page.table(_table(subjects), links)
-    return f'<nav class="sortable" id="overview">{table}</nav>\n{_maps(subjects, links)}'
+    nav = f'<nav class="sortable">{table}</nav>'
+    return f'<div id="overview">{nav}\n{_maps(subjects, links)}</div>'
 
 
 # ---- the table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from locatk.formats.report.theme import CARD, CONTROL, CSS_COLORS, GRID, INK
+from locatk.formats.report.theme import CARD, CONTROL, CSS_COLORS, GRID, INK, TRANSPARENT
 
 FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
 
@@ -34,7 +34,7 @@ _AXIS: dict[str, Any] = {
 TEMPLATE: dict[str, Any] = {
     "layout": {
         "font": {"family": FONT, "size": 13, "color": INK},
-        "paper_bgcolor": "rgba(0,0,0,0)",
+        "paper_bgcolor": TRANSPARENT,
         "plot_bgcolor": CARD,
         "margin": {"l": 56, "r": 12, "t": 12, "b": 44},
         "xaxis": _AXIS,
@@ -48,7 +48,7 @@ TEMPLATE: dict[str, Any] = {
             "y": 1.0,
             "yanchor": "bottom",
             "font": {"size": 12.5},
-            "bgcolor": "rgba(0,0,0,0)",
+            "bgcolor": TRANSPARENT,
         },
         "modebar": {"bgcolor": faded(CARD, 0.7), "color": CONTROL, "activecolor": INK},
         # A figure that is drawn again in other colors keeps its view.

@@ -35,6 +35,8 @@ CARD, INK, MUTED, CONTROL, GRID = (
 )
 """Background, text, text of minor importance, axes and grid lines of diagrams, in light mode."""
 
+TRANSPARENT = "rgba(0,0,0,0)"
+
 ALL_DEVICES = "#76848f"
 """Color of more devices than a legend names."""
 

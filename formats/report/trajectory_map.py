@@ -28,7 +28,7 @@ from locatk.formats.plots.shapes import (
 from locatk.formats.plots.units import abbreviate, format_count
 from locatk.formats.report.panels import Panel, escape, join_sentences
 from locatk.formats.report.style import DEVICE_LEGEND_RANK, faded
-from locatk.formats.report.theme import CARD
+from locatk.formats.report.theme import CARD, TRANSPARENT
 from locatk.formats.report.thinning import Indices, allot_points, thin, thinning_note
 
 Array = NDArray[np.float64]
@@ -55,8 +55,6 @@ MIN_RISE_FRACTION = 0.05
 """Height of a trajectory, relative to its width, from which it is also drawn from the side."""
 
 PLOTLY_SYMBOLS = {"circle": "circle", "square": "square", "cross": "x-thin"}
-
-TRANSPARENT = "rgba(0,0,0,0)"
 
 
 def split_frames(

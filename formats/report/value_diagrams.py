@@ -22,7 +22,7 @@ from locatk.formats.plots.shapes import is_in_legend
 from locatk.formats.plots.units import abbreviate, format_count
 from locatk.formats.report.panels import Panel, escape, join_sentences
 from locatk.formats.report.style import DEVICE_LEGEND_RANK, faded
-from locatk.formats.report.theme import INK
+from locatk.formats.report.theme import INK, TRANSPARENT
 from locatk.formats.report.thinning import MAX_POSES, Indices, allot_points, thin, thinning_note
 
 Array = NDArray[np.float64]
@@ -123,20 +123,12 @@ def value_panel(
         }
         shown += sum(map(len, kept.values()))
         mode = "markers" if as_marks else _line_mode(len(kept), sum(counts))
-        triangles = []
         for k, (name, s) in enumerate(row.values.items()):
             traces, color = [], colors[name]
             if name in row.expected:
                 is_first, is_only = k == 0 and number == 1, len(row.expected) == 1
                 bound = row.expected[name]
                 traces = _expected_traces(bound, start_ns, color, signed, is_only, is_first)
-                at = peaks_beyond(bound, limit)
-                large = Series(bound.time_ns[at], bound.value[at])
-                for series in (large, large.scaled(-1))[: 1 + signed]:
-                    triangles.append(_triangles(series, start_ns, color, is_open=True))
-            is_outlier = np.abs(s.value[kept[name]]) > limit
-            outliers = Series(*(each[kept[name]][is_outlier] for each in (s.time_ns, s.value)))
-            triangles.append(_triangles(outliers, start_ns, color, is_open=False))
             look = {
                 "name": escape(abbreviate(name)),
                 "legendgroup": name,
@@ -144,9 +136,9 @@ def value_panel(
                 "showlegend": number == 1 and len(kept) > 1 and is_in_legend(k, len(kept)),
             }
             traces.append({**look, **_value_trace(s, kept[name], start_ns, color, mode)})
-            triangles[-1].update(name=look["name"], legendgroup=name)
             figure.add_traces([{"type": "scatter", **t} for t in traces], number, 1)
-        _add_triangles(figure, number, len(rows), [t for t in triangles if len(t["x"])])
+        triangles = _excess_traces(row, kept, limit, start_ns, colors, signed)
+        _add_overlay(figure, number, len(rows), triangles)
         limits = [-limit if signed else 0, limit]
         figure.update_yaxes(title={"text": row.title}, range=limits, row=number, col=1)
     if reference is not None:
@@ -201,33 +193,51 @@ def _value_trace(s: Series, kept: Indices, start_ns: int, color: str, mode: str)
     }
 
 
-def _triangles(s: Series, start_ns: int, color: str, *, is_open: bool) -> dict[str, Any]:
-    """Return triangles at the limits of a diagram that point to values beyond them.
+def _excess_traces(
+    row: ValueRow,
+    kept: Mapping[str, Indices],
+    limit: float,
+    start_ns: int,
+    colors: Mapping[str, str],
+    signed: bool,
+) -> list[dict[str, Any]]:
+    """Return triangles for the values and the bounds beyond the limit of a row."""
+    traces = []
+    for name, s in row.values.items():
+        at = kept[name][np.abs(s.value[kept[name]]) > limit]
+        look = {"name": escape(abbreviate(name)), "legendgroup": name}
+        filled = {"color": colors[name], "size": 9}
+        traces.append({**look, **_triangles(Series(s.time_ns[at], s.value[at]), start_ns, filled)})
+    for name, bound in row.expected.items():
+        at = peaks_beyond(bound, limit)
+        upper = Series(bound.time_ns[at], bound.value[at])
+        look = {"name": "95 % expected", "legendgroup": "expected"}
+        hollow = {"color": TRANSPARENT, "size": 8, "line": {"color": colors[name], "width": 1.2}}
+        for sided in (upper, upper.scaled(-1)) if signed else (upper,):
+            traces.append({**look, **_triangles(sided, start_ns, hollow)})
+    return [trace for trace in traces if len(trace["x"])]
+
+
+def _triangles(s: Series, start_ns: int, marker: dict[str, Any]) -> dict[str, Any]:
+    """Return triangles at the edges of a diagram that point to values beyond it.
 
     Their ordinates are fractions of its height.
     """
     is_upper = s.value > 0
-    marker = {"color": color, "size": 9, "line": {"color": color, "width": 0}}
-    if is_open:
-        marker |= {"size": 8, "color": "rgba(0,0,0,0)", "line": {"color": color, "width": 1.2}}
-    marker["symbol"] = [f"triangle-{'up' if upper else 'down'}" for upper in is_upper]
+    symbols = np.where(is_upper, "triangle-up", "triangle-down").tolist()
     return {
         "x": (s.time_ns - start_ns) * 1e-9,
         "y": np.where(is_upper, 1 - TRIANGLE_INSET, TRIANGLE_INSET),
         "customdata": s.value,
         "mode": "markers",
-        "marker": marker,
+        "marker": {**marker, "symbol": symbols},
         "hovertemplate": "%{x:.3f} s<br>%{customdata:.4g}",
-        "name": "95 % expected",
-        "legendgroup": "expected",
         "showlegend": False,
     }
 
 
-def _add_triangles(
-    figure: Figure, number: int, rows: int, traces: Sequence[dict[str, Any]]
-) -> None:
-    """Add triangles to a row on an axis from 0 to 1 that lies over its value axis."""
+def _add_overlay(figure: Figure, number: int, rows: int, traces: Sequence[dict[str, Any]]) -> None:
+    """Add traces to a row on an axis from 0 to 1 that lies over its value axis."""
     if not traces:
         return
     axis, row = f"{rows + number}", "" if number == 1 else f"{number}"

@@ -98,6 +98,7 @@ def test_axes_leave_out_outliers() -> None:
         ([2.0, 3.5], 3.675),  # All bounds fit.
         ([2.0, 50.0], 1.2 * 2.1),  # The large one does not, and marks at the limit need space.
         ([50.0, 60.0], 1.2 * 1.05),  # None fits: the values fill the axis.
+        ([2.0] * 99 + [3.9], 1.2 * 3.15),  # A peak may take half of the bounds more.
         ([0.5, np.nan], 1.05),
         ([], 1.05),
     ],

@@ -267,17 +267,21 @@ def test_dark_mode_prints_light_diagrams(browser: str, tmp_path: Path) -> None:
     measure = """<script>
         new MutationObserver(function () {
           const axis = () => document.querySelector(".figure .xtick text").style.fill;
-          const colors = [axis()];
+          const figure = document.querySelector(".figure");
+          const excess = () => figure.querySelector(".main-svg").clientHeight - figure.clientHeight;
+          const colors = [axis()], excesses = [];
           for (const name of ["beforeprint", "afterprint"]) {
             window.dispatchEvent(new Event(name));
             colors.push(axis());
+            excesses.push(excess());
           }
-          document.body.append("[" + colors.join("; ") + "]");
+          document.body.append("[" + colors.join("; ") + "] [" + excesses + "]");
         }).observe(document.documentElement, {attributeFilter: ["data-drawn"]});
         </script>"""
     path.write_text(report.replace("<main>", f"{measure}<main>"), "utf-8")
     dom = opened(browser, path, tmp_path / "profile", DARK).dom
     assert "[rgb(230, 235, 240); rgb(29, 39, 51); rgb(230, 235, 240)]" in dom
+    assert "[0,0]" in dom  # No map covers the figure below it.
 
 
 def test_a_narrow_window_shows_all(frames: Opened) -> None:
