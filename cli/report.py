@@ -70,7 +70,8 @@ def command(
     The page is one file that opens in any browser without a network connection. It contains a map
     of the trajectories over the artifact, errors if there is truth, rejected observations with
     reasons, covariances, the recorded signals, and properties of the run. A folder stands for its
-    solutions; a page on several begins with a table of all.
+    solutions; a page on several begins with a table and small maps of all. The page is light or
+    dark as the browser prefers; paper and pictures are light.
 
     \b
     Examples:

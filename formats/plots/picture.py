@@ -40,6 +40,7 @@ from locatk.formats.plots.series import (
     expected_errors,
     interrupt_at_gaps,
     origin_ns,
+    peaks_beyond,
     position_sigmas,
     split_by_device,
 )
@@ -52,7 +53,13 @@ from locatk.formats.plots.shapes import (
     device_colors,
     is_in_legend,
 )
-from locatk.formats.plots.units import abbreviate, format_count, format_length, select_unit
+from locatk.formats.plots.units import (
+    abbreviate,
+    format_count,
+    format_length,
+    last_bin_note,
+    select_unit,
+)
 
 Array = NDArray[np.float64]
 
@@ -313,16 +320,18 @@ def _draw_values(
             axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center")
             axes.set_xticks([])
             axes.set_yticks([])
+    notes: list[str] = []
     if series:
         shown = expected if len(expected) <= MAX_EXPECTED_DEVICES else {}
         _draw_over_time(over_time, series, shown, colors, start_ns)
-        _draw_histogram(histogram, series, colors)
+        notes = [_draw_histogram(histogram, series, colors)]
     if evaluation is not None:
         lengths = (
             f"{name} {format_length(getattr(evaluation, name), unscaled=unscaled)}"
             for name in ("median", "p95", "max")
         )
-        histogram.set_title(f"APE {', '.join(lengths)}", loc="left", fontsize=9)
+        notes.insert(0, f"APE {', '.join(lengths)}")
+    histogram.set_title("\n".join(filter(None, notes)), loc="left", fontsize=9)
 
 
 def _draw_over_time(
@@ -346,9 +355,14 @@ def _draw_over_time(
         axes.plot(seconds, value, color=colors[name], lw=0.9, alpha=0.6)
         if len(expected) == 1:  # Several shaded areas would cover each other.
             axes.fill_between(seconds, value, color=colors[name], alpha=0.12, lw=0)
+        at = peaks_beyond(s, limit)
+        seconds, at_limit = (s.time_ns[at] - start_ns) * 1e-9, np.full(len(at), 0.97 * limit)
+        axes.plot(seconds, at_limit, "^", color=colors[name], ms=5, mfc="none")
     axes.set_ylim(0, limit)
     axes.grid(color="0.92")
     notes = ["line: 95 % of errors expected below it, by the covariance"] if expected else []
+    if any((s.value > limit).any() for s in expected.values()):
+        notes.append("open triangles: the line is beyond this scale")
     outliers = int(np.count_nonzero(every > limit))
     if outliers:
         count = f"{format_count(outliers)} of {format_count(len(every))}"
@@ -356,7 +370,8 @@ def _draw_over_time(
     axes.set_title("\n".join(notes), loc="left", fontsize=9)
 
 
-def _draw_histogram(axes: Axes, series: dict[str, Series], colors: dict[str, str]) -> None:
+def _draw_histogram(axes: Axes, series: dict[str, Series], colors: dict[str, str]) -> str:
+    """Draw how often values occur; return a note on outliers in the last bin."""
     every = _concatenate(series.values())
     limit = axis_limit(every)
     if len(series) <= MAX_LEGEND_DEVICES:
@@ -367,6 +382,7 @@ def _draw_histogram(axes: Axes, series: dict[str, Series], colors: dict[str, str
     axes.hist(clipped, bins=np.linspace(0, limit, 41).tolist(), stacked=True, color=color)
     axes.set_xlim(0, limit)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    return last_bin_note(every, limit)
 
 
 def _concatenate(series: Iterable[Series]) -> Array:

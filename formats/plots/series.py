@@ -16,8 +16,18 @@ Array = NDArray[np.float64]
 ONE_SIDED_95_QUANTILE = 1.644854
 """95 % quantile of the standard normal distribution."""
 
-MAX_AXIS_EXTENSION = 3
-"""Factor by which a value axis is extended, at most, to include the expected values."""
+MAX_AXIS_EXTENSION = 4
+"""Factor by which a value axis is extended, at most, to include the expected values; the values
+themselves fill at least a quarter of the axis."""
+
+MARK_SPACE = 1.2
+"""Factor by which a value axis is extended for marks at its limit, so that they cover no values."""
+
+AXIS_MARGIN = 1.05
+"""Ratio of the upper limit of an axis to the largest value below it."""
+
+MAX_LIMIT_MARKS = 40
+"""Number of marks along a time axis that indicate where a curve lies beyond the scale."""
 
 MAX_EXPECTED_DEVICES = 3
 """Number of devices up to which expected errors are drawn; of more devices they would cover the
@@ -128,15 +138,39 @@ def error_quantile_95(covariance: Array) -> Array:
 def axis_limit(values: Array, expected: Array | None = None) -> float:
     """Return the upper limit of an axis that shows all values but extreme outliers.
 
-    The ``expected`` values are included if they are not too large.
+    The axis is extended to those of the ``expected`` values that leave the values readable
+    (:data:`MAX_AXIS_EXTENSION`). Larger ones lie beyond the scale: see :func:`peaks_beyond`.
     """
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return 1.0
-    limit = 1.05 * min(float(finite.max()), 1.5 * float(np.percentile(finite, 98))) or 1.0
-    if expected is None or not np.isfinite(expected).any():
-        return limit
-    return max(limit, min(1.2 * float(np.nanmedian(expected)), MAX_AXIS_EXTENSION * limit))
+    bounds = np.zeros(0) if expected is None else expected[np.isfinite(expected)]
+    limit = AXIS_MARGIN * _max_without_outliers(values[np.isfinite(values)])
+    is_readable = (AXIS_MARGIN * bounds <= MAX_AXIS_EXTENSION * limit) | (limit == 0)
+    limit = max(limit, AXIS_MARGIN * _max_without_outliers(bounds[is_readable]))
+    if (bounds > limit).any():
+        limit *= MARK_SPACE
+    return limit or 1.0
+
+
+def _max_without_outliers(values: Array) -> float:
+    """Return the largest of finite values (n,), but at most 1.5 times their 98 % quantile."""
+    if not len(values):
+        return 0.0
+    return min(float(values.max()), 1.5 * float(np.percentile(values, 98)))
+
+
+def peaks_beyond(series: Series, limit: float) -> NDArray[np.int64]:
+    """Return the ascending indices of values beyond a scale, the largest in each part of the time.
+
+    The time is divided into :data:`MAX_LIMIT_MARKS` equal parts.
+    """
+    beyond = np.flatnonzero(series.value > limit)
+    if not len(beyond):
+        return beyond
+    elapsed_ns = series.time_ns[beyond] - series.time_ns[0]
+    part_ns = int(series.time_ns[-1] - series.time_ns[0]) // MAX_LIMIT_MARKS + 1
+    part = elapsed_ns // part_ns
+    order = np.lexsort((series.value[beyond], part))
+    is_largest = np.diff(part[order], append=MAX_LIMIT_MARKS) > 0
+    return np.sort(beyond[order[is_largest]])
 
 
 # ---- time

@@ -29,23 +29,18 @@ from locatk.formats.sessions.foxglove import tags_in_frames
 
 Array = NDArray[np.float64]
 
-BASE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F3C8D")
-"""The palette of Okabe and Ito (Color Universal Design, 2002) without yellow and black, which
-people with any type of color vision can distinguish, and a violet."""
-
-
-def _mix(color: str, other: int, fraction: float) -> str:
-    """Return a color (#rrggbb) mixed with a grey level, 0 to 255."""
-    channels = (int(color[k : k + 2], 16) for k in (1, 3, 5))
-    return "#" + "".join(f"{round((1 - fraction) * c + fraction * other):02X}" for c in channels)
-
-
 COLORS = (
-    *BASE_COLORS,
-    *(_mix(color, 0, 0.45) for color in BASE_COLORS),
-    *(_mix(color, 255, 0.5) for color in BASE_COLORS),
-)
-"""Colors of devices: the palette, then its dark and its light shades."""
+    "#0072B2", "#D55E00", "#009E73", "#CA77A5", "#3A9BCE", "#785203", "#7F3C8D",
+    "#012C44", "#8D59FF", "#610200", "#3F20CE", "#39017D", "#015449", "#4A7366",
+    "#4D3164", "#650798", "#7E87FC", "#C227BB", "#89012B", "#9D658D", "#653DE9",
+)  # fmt: skip
+"""Colors of devices on a white background, with a contrast of at least 3 to 1.
+
+The first are of the palette of Okabe and Ito (Color Universal Design, 2002) without yellow and
+black, darkened as far as the contrast needs it, and a violet. Each of the others is the color with
+the largest distance from all before it: in OKLab (Ottosson, 2020), for normal vision and, by the
+model of Machado et al. (IEEE TVCG 15 (2009) 1291), for people who lack one type of cones.
+"""
 
 MAX_LEGEND_DEVICES = 8
 """Number of devices up to which a legend names all of them."""
@@ -87,14 +82,14 @@ class Style:
     size_px: float = 0.0
 
 
-TRUTH = Style("#BFBFBF", 4)
+TRUTH = Style("#8C8C8C", 4)
 PAPER = Style("#8C8C8C", 1.4, fill="#FFFCF0")
 DOT_PATTERN = Style("#8C8C8C", 1, fill="#78828C", fill_opacity=0.1, dotted=True)
 MAGNET = Style("#333333", 2, fill="#FFFFFF", size_px=11)
 DETECTED_MAGNET = Style("#D55E00", 1.5, fill="#FFFFFF", size_px=6)
 NORTH_POLE = Style("#C0392B", 0.8, fill="#C0392B")
-SOUTH_POLE = Style("#8FA8C8", 0.8, fill="#8FA8C8")
-WEAK_BAR = Style("#999999", 0.8)
+SOUTH_POLE = Style("#6384AE", 0.8, fill="#6384AE")
+WEAK_BAR = Style("#8C8C8C", 0.8)
 WALL = Style("#595959", 3)
 DETECTION = Style("#009E73", 2, size_px=13)
 REFUSED_DETECTION = Style("#7F3C8D", 2, symbol="cross", size_px=13)

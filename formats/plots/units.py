@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,15 @@ def format_count(count: int, noun: str = "") -> str:
         return number
     singular = noun[:-2] if noun.endswith("sses") else noun.removesuffix("s")
     return f"{number} {singular if count == 1 else noun}"
+
+
+def last_bin_note(values: NDArray[np.float64], limit: float) -> str:
+    """Return words on values beyond the scale of a histogram, empty without any."""
+    beyond = int(np.count_nonzero(values > limit))
+    if not beyond:
+        return ""
+    count = f"{format_count(beyond)} of {format_count(len(values), 'poses')}"
+    return f"{count} beyond this scale are in the last bin"
 
 
 def format_time(time_ns: int) -> str:

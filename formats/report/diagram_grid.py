@@ -11,6 +11,7 @@ from plotly.graph_objects import Figure
 from plotly.subplots import make_subplots
 
 from locatk.formats.plots.shapes import COLORS
+from locatk.formats.report.theme import CARD
 from locatk.formats.report.thinning import thin_marks
 
 Array = NDArray[np.float64]
@@ -83,7 +84,7 @@ class DiagramGrid:
                     name=name,
                     legendgroup=name,
                     showlegend=column == 1 and len(groups) > 1,
-                    marker={"color": color, "line": {"width": 0.7, "color": "#ffffff"}},
+                    marker={"color": color, "line": {"width": 0.7, "color": CARD}},
                     hovertemplate=hover,
                 )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from plotly.graph_objects import Figure
 
 from locatk.core.evaluation import CHI2_95_QUANTILES, Evaluation, Statistics
 from locatk.core.evaluation.consistency import NORMAL_95_QUANTILE
@@ -28,23 +27,19 @@ from locatk.formats.plots.units import (
     format_count,
     format_length,
     format_number,
+    last_bin_note,
     select_unit,
 )
 from locatk.formats.report.detections import format_probability
 from locatk.formats.report.diagram_grid import DiagramGrid
 from locatk.formats.report.panels import Panel, Table, escape, join_names, join_sentences
-from locatk.formats.report.style import INK
+from locatk.formats.report.style import faded
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.theme import ALL_DEVICES, CARD, INK, UNSOLVED_DEVICE
 from locatk.formats.report.value_diagrams import ValueRow, value_panel
 
 HISTOGRAM_BINS = 50
 """Number of bins of the histogram of errors, on an axis of about 900 pixels."""
-
-ALL_DEVICES_COLOR = "#8896a3"
-"""Color of a histogram of more devices than a legend names."""
-
-UNSOLVED_DEVICE_COLOR = "#5b6875"
-"""Color of a device in the evaluation that is not in the solution."""
 
 MIN_HEIGHT_ERROR_M = 1e-9
 """Largest error in z up to which estimate and truth are in one plane, and z is not drawn."""
@@ -179,7 +174,7 @@ def error_panels(subject: Subject) -> list[Panel]:
     solution, evaluation = subject.solution, subject.evaluation
     if evaluation is None:
         return []
-    colors = dict.fromkeys(evaluation.devices, UNSOLVED_DEVICE_COLOR)
+    colors = dict.fromkeys(evaluation.devices, UNSOLVED_DEVICE)
     colors |= device_colors([t.device for t in solution.trajectories])
     start_ns = origin_ns(subject.session, solution)
     unscaled = is_shown_unscaled(solution, evaluation)
@@ -187,7 +182,7 @@ def error_panels(subject: Subject) -> list[Panel]:
     covariance = scored_covariance(solution, evaluation)
     panels = [
         _error_panel(evaluation, covariance, colors, unit, start_ns),
-        Panel("Histogram of errors", "", _draw_histogram(evaluation, colors, unit)),
+        _histogram_panel(evaluation, colors, unit),
         _axis_panel(evaluation, covariance, colors, unit, start_ns),
     ]
     has_rotation = np.isfinite(evaluation.rotation_errors_deg)
@@ -226,8 +221,8 @@ def _error_panel(
     return panel
 
 
-def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Figure:
-    """Draw how often errors occur, with outliers in the last bin, and mark two quantiles."""
+def _histogram_panel(evaluation: Evaluation, colors: dict[str, str], unit: Unit) -> Panel:
+    """Return how often errors occur, with outliers in the last bin, and two marked quantiles."""
     series = split_by_device(evaluation, evaluation.errors * unit.per_si)
     every = np.concatenate([s.value for s in series.values()])
     limit = axis_limit(every)
@@ -238,7 +233,7 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
             for name, s in series.items()
         }
     else:
-        groups = {"all": (np.minimum(every, limit), ALL_DEVICES_COLOR)}
+        groups = {"all": (np.minimum(every, limit), ALL_DEVICES)}
     grid = DiagramGrid(1)
     grid.add_histogram(1, edges, groups, f"%{{y}} poses around %{{x:.3g}} {escape(unit.name)}")
     for name, value, side, shift_px in (
@@ -259,7 +254,7 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
                     "yanchor": "top",
                     "xanchor": side,
                     "xshift": shift_px,
-                    "bgcolor": "rgba(255,255,255,0.8)",
+                    "bgcolor": faded(CARD, 0.8),
                     "showarrow": False,
                 },
             )
@@ -267,7 +262,7 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
     grid.figure.update_xaxes(range=[0, limit])
     grid.figure.update_yaxes(range=[0, 1.3 * float(highest)])  # Space for the line names.
     title = f"error [{unit.name}]"
-    return grid.finish(
+    figure = grid.finish(
         280,
         ["poses"],
         column_titles=[title],
@@ -278,6 +273,8 @@ def _draw_histogram(evaluation: Evaluation, colors: dict[str, str], unit: Unit) 
             "traceorder": "normal",
         },
     )
+    note = last_bin_note(every, limit)
+    return Panel("Histogram of errors", f"{note}." if note else "", figure)
 
 
 def _axis_panel(

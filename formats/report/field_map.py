@@ -17,6 +17,7 @@ from locatk.formats.report.diagram_grid import (
     single_precision,
 )
 from locatk.formats.report.panels import as_float
+from locatk.formats.report.theme import FIELD_SCALE
 from locatk.formats.report.thinning import SIGNAL_COLUMNS, column_maxima
 
 Array = NDArray[np.float64]
@@ -40,8 +41,11 @@ def add_field_map(
         z=single_precision(largest.T),
         zmin=0,
         zmax=float(np.nanpercentile(largest, 99.5)) if is_known else 1.0,
-        colorscale="Greys",
-        colorbar={"title": {"text": "µT"}, "len": 0.4, "y": 0.69, "x": 1.01, "thickness": 12},
+        colorscale=FIELD_SCALE,
+        colorbar={
+            **{"title": {"text": "µT"}, "len": 0.4, "y": 0.69, "x": 1.01, "thickness": 12},
+            "outlinewidth": 0,
+        },
         hovertemplate="%{x:.2f} s, %{y:.0f} mm: %{z:.1f} µT<extra></extra>",
         row=row,
         col=1,

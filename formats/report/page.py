@@ -20,7 +20,8 @@ from plotly.offline import get_plotlyjs
 
 from locatk.core.printable import escape_controls
 from locatk.formats.report.panels import Panel, Picture, Table
-from locatk.formats.report.style import CONFIG, SCRIPT, STYLE, TEMPLATE
+from locatk.formats.report.style import CONFIG, MAX_EAGER_FIGURES, SCRIPT, STYLE, TEMPLATE
+from locatk.formats.report.theme import DARK_COLORS
 
 NUMBER = re.compile(r"[<>=~+\-\u2212]? ?\d[\d.,\u202f]*(e[+-]?\d+)?( ?\S{1,5})?")
 """A number with an optional sign and unit; columns of numbers are aligned to the right."""
@@ -40,7 +41,14 @@ def document(title: str, body: Sequence[str]) -> str:
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
         "img-src data: blob:; base-uri 'none'; form-action 'none'"
     )
-    shared = _json({"template": TEMPLATE, "config": CONFIG})
+    shared = _json(
+        {
+            "template": TEMPLATE,
+            "config": CONFIG,
+            "dark": DARK_COLORS,
+            "eager": MAX_EAGER_FIGURES,
+        }
+    )
     return "\n".join(
         [
             "<!DOCTYPE html>",

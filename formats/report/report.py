@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-
-import numpy as np
 
 from locatk.formats.output import atomic_write, check_output, tool_version
-from locatk.formats.plots.ground import build_ground, is_shown_unscaled
 from locatk.formats.plots.series import origin_ns, overlap_in_time, pose_span_ns
-from locatk.formats.plots.units import format_count, format_length, format_time
+from locatk.formats.plots.units import format_time
 from locatk.formats.report import page
 from locatk.formats.report.detections import detection_panel
 from locatk.formats.report.evaluation import (
@@ -20,12 +16,13 @@ from locatk.formats.report.evaluation import (
     key_figures,
     summarize,
 )
-from locatk.formats.report.panels import Panel, Table
+from locatk.formats.report.overview import overview
+from locatk.formats.report.panels import Panel
 from locatk.formats.report.rejections import rejection_panel
 from locatk.formats.report.run import run_panels
 from locatk.formats.report.signals import SIGNALS_TITLE, signal_panels
 from locatk.formats.report.subject import Subject
-from locatk.formats.report.trajectory_map import map_panels
+from locatk.formats.report.trajectory_map import map_panels, split_frames
 
 
 def write_report(
@@ -61,7 +58,7 @@ def render_report(subjects: Sequence[Subject]) -> str:
         "<header>",
         page.paragraph("locatk report", "brand"),
         f"<h1>{page.text(title)}</h1>",
-        "" if is_single else _overview(subjects),
+        "" if is_single else overview(subjects),
         "</header>",
         "<main>",
     ]
@@ -69,6 +66,7 @@ def render_report(subjects: Sequence[Subject]) -> str:
         body.append(f'<article class="subject" id="s{k}">')
         if not is_single:
             body.append(f"<h2>{page.text(subject.name)}</h2>")
+            body.append('<p class="back"><a href="#overview">All solutions</a></p>')
         body += _article(subject, f"s{k}")
         body.append("</article>")
     body.append("</main>")
@@ -77,47 +75,6 @@ def render_report(subjects: Sequence[Subject]) -> str:
         "everything, click a name in a legend to hide it. This file is complete.</footer>"
     )
     return page.document(f"{title} - locatk report", body)
-
-
-def _overview(subjects: Sequence[Subject]) -> str:
-    """Return a table of all subjects with links to them, which the reader can sort."""
-    header = (
-        "solution", "system", "method", "devices", "duration", "poses", "coverage",
-        "APE median", "p95", "max", "NEES", "rejected", "warnings",
-    )  # fmt: skip
-    rows = []
-    for subject in subjects:
-        solution, evaluation = subject.solution, subject.evaluation
-        unscaled = is_shown_unscaled(solution, evaluation)
-        errors, coverage, nees = ["-"] * 3, "-", "-"
-        if evaluation is not None:
-            lengths = (evaluation.median, evaluation.p95, float(np.max(evaluation.errors)))
-            errors = [format_length(value, unscaled=unscaled) for value in lengths]
-            if evaluation.coverage.fraction is not None:
-                coverage = f"{100 * evaluation.coverage.fraction:.1f} %"
-            known = np.isfinite(evaluation.nees)
-            if known.any() and evaluation.nees_dof[known].sum():
-                ratio = np.sum(evaluation.nees[known]) / np.sum(evaluation.nees_dof[known])
-                nees = f"{ratio:.3g}"
-        trajectories = [each for each in solution.trajectories if len(each)]
-        span_ns = pose_span_ns(solution)
-        rows.append(
-            (
-                subject.name,
-                solution.system,
-                solution.method,
-                format_count(len(trajectories)),
-                f"{1e-9 * (span_ns[1] - span_ns[0]):.1f} s" if span_ns else "-",
-                format_count(solution.poses),
-                coverage,
-                *errors,
-                nees,
-                format_count(sum(solution.rejected.values())),
-                format_count(len(solution.warnings)),
-            )
-        )
-    links = [f"#s{k}" for k in range(1, len(rows) + 1)]
-    return f'<nav class="sortable">{page.table(Table(header, rows), links)}</nav>'
 
 
 def _article(subject: Subject, ident: str) -> Iterator[str]:
@@ -150,16 +107,10 @@ def report_panels(subject: Subject) -> list[Panel]:
 def _map_panels(subject: Subject) -> list[Panel]:
     """Return a map for each frame with poses; positions in two frames cannot share a map."""
     start_ns = origin_ns(subject.session, subject.solution)
-    frames = list(dict.fromkeys(t.frame for t in subject.solution.trajectories))
+    frames = split_frames(subject.solution, subject.truth, subject.evaluation)
     panels = []
-    for frame in frames or [""]:
-        trajectories = tuple(t for t in subject.solution.trajectories if t.frame == frame)
-        devices = {t.device for t in trajectories}
-        is_single = len(frames) < 2
-        truth = [t for t in subject.truth if is_single or t.device in devices]
-        solution = replace(subject.solution, trajectories=trajectories)
-        ground = build_ground(solution, truth, subject.evaluation)
-        title = "Trajectory" if is_single else f"Trajectory in {frame}"
+    for frame, solution, ground in frames:
+        title = "Trajectory" if len(frames) == 1 else f"Trajectory in {frame}"
         panels += map_panels(solution, ground, start_ns, title)
     return panels
 

@@ -123,6 +123,7 @@ def add_recording(
         if selected:
             _add_events(grid, selected, name, is_labelled, len(events) > 10 * MAX_EVENT_LABELS)
     grid.figure.update_yaxes(range=[0, 1.6], visible=False, fixedrange=True, row=1, col=1)
+    grid.figure.update_xaxes(showline=False, row=1, col=1)
     if is_labelled and len(events) >= MIN_LABELLED_EVENTS:
         grid.figure.update_layout(width=LABELLED_WIDTH_PX)
     if is_labelled:
@@ -154,7 +155,7 @@ def _add_events(
         mode="markers+text" if is_labelled else "markers",
         text=[event.label for event in drawn],
         textposition="top center",
-        textfont={"size": 10, "color": color},
+        textfont={"size": 10},
         cliponaxis=False,
         customdata=["<br>".join(event.description) for event in drawn],
         hovertemplate="%{customdata}<extra></extra>",

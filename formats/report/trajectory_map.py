@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from plotly.graph_objects import Figure
 
+from locatk.core.evaluation import Evaluation
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.plots.ground import POSITION_FORMATS, Ground, View, fit_view
+from locatk.formats.plots.ground import POSITION_FORMATS, Ground, View, build_ground, fit_view
 from locatk.formats.plots.series import interrupt_at_gaps
 from locatk.formats.plots.shapes import (
     COLORS,
@@ -25,6 +28,7 @@ from locatk.formats.plots.shapes import (
 from locatk.formats.plots.units import abbreviate, format_count
 from locatk.formats.report.panels import Panel, escape, join_sentences
 from locatk.formats.report.style import DEVICE_LEGEND_RANK, faded
+from locatk.formats.report.theme import CARD, TRANSPARENT
 from locatk.formats.report.thinning import Indices, allot_points, thin, thinning_note
 
 Array = NDArray[np.float64]
@@ -52,7 +56,20 @@ MIN_RISE_FRACTION = 0.05
 
 PLOTLY_SYMBOLS = {"circle": "circle", "square": "square", "cross": "x-thin"}
 
-TRANSPARENT = "rgba(0,0,0,0)"
+
+def split_frames(
+    solution: Solution, truth: Sequence[Trajectory], evaluation: Evaluation | None
+) -> list[tuple[str, Solution, Ground]]:
+    """Return each frame with poses, its part of the solution, and the contents of its map."""
+    frames = list(dict.fromkeys(t.frame for t in solution.trajectories))
+    parts = []
+    for frame in frames or [""]:
+        trajectories = tuple(t for t in solution.trajectories if t.frame == frame)
+        devices = {t.device for t in trajectories}
+        of_frame = [t for t in truth if len(frames) < 2 or t.device in devices]
+        part = replace(solution, trajectories=trajectories)
+        parts.append((frame, part, build_ground(part, of_frame, evaluation)))
+    return parts
 
 
 def map_panels(solution: Solution, ground: Ground, start_ns: int, title: str) -> list[Panel]:
@@ -81,7 +98,7 @@ def _map_panel(
         traces += _shape_traces(ground.artifact.shapes, ground, view)
     counts = allot_points([len(t) for t in ground.truth])
     for t, count in zip(ground.truth, counts, strict=True):
-        kept = thin(len(t), count, _curvature(t.position))
+        kept = thin(len(t), count, curvature(t.position))
         line = interrupt_at_gaps(t.position[kept], t.time_ns, kept)
         shape = Shape("line", line[None], TRUTH, "truth")
         traces += _shape_traces([shape], ground, view, first=t is ground.truth[0])
@@ -90,7 +107,7 @@ def _map_panel(
     counts = allot_points([len(path) for path in ground.paths.values()])
     shown = 0
     for k, (t, count) in enumerate(zip(solution.trajectories, counts, strict=True)):
-        kept = thin(len(t), count, _curvature(ground.paths[t.device]))
+        kept = thin(len(t), count, curvature(ground.paths[t.device]))
         shown += len(kept)
         in_legend = is_in_legend(k, len(names), len(COLORS))
         traces += _path_traces(t, ground, view, kept, start_ns, colors[t.device], in_legend)
@@ -115,7 +132,7 @@ def _map_panel(
     return Panel(title, note, figure)
 
 
-def _curvature(path: Array) -> Array:
+def curvature(path: Array) -> Array:
     """Return the distance (n,) of each position from the middle of its neighbours."""
     distance = np.zeros(len(path))
     if len(path) > 2:
@@ -219,7 +236,7 @@ def _annotation(label: Label, view: View) -> dict[str, Any]:
         "yanchor": "middle" if is_centred else "bottom",
         "yshift": label.shift_px,
         "font": {"size": 12.5 if is_centred else 11},
-        "bgcolor": "rgba(255,255,255,0.7)" if is_centred else TRANSPARENT,
+        "bgcolor": faded(CARD, 0.7) if is_centred else TRANSPARENT,
     }
 
 
@@ -265,7 +282,7 @@ def _path_traces(
         "customdata": rows[:1, 2:],
         "mode": "markers",
         "showlegend": False,
-        "marker": {"color": "#ffffff", "size": 10, "line": {"color": color, "width": 2.5}},
+        "marker": {"color": CARD, "size": 10, "line": {"color": color, "width": 2.5}},
     }
     return [line, first]
 
@@ -338,7 +355,7 @@ def _ellipse_traces(
             "showlegend": not traces,
             "fill": "toself",
             "fillcolor": faded(colors[device], 0.13),
-            "line": {"color": faded(colors[device], 0.65), "width": 1},
+            "line": {"color": colors[device], "width": 0.7},
             "hoverinfo": "skip",
         }
         traces.append(trace)

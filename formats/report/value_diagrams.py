@@ -16,11 +16,13 @@ from locatk.formats.plots.series import (
     Series,
     axis_limit,
     interrupt_at_gaps,
+    peaks_beyond,
 )
 from locatk.formats.plots.shapes import is_in_legend
 from locatk.formats.plots.units import abbreviate, format_count
 from locatk.formats.report.panels import Panel, escape, join_sentences
-from locatk.formats.report.style import DEVICE_LEGEND_RANK, INK, faded
+from locatk.formats.report.style import DEVICE_LEGEND_RANK, faded
+from locatk.formats.report.theme import INK, TRANSPARENT
 from locatk.formats.report.thinning import MAX_POSES, Indices, allot_points, thin, thinning_note
 
 Array = NDArray[np.float64]
@@ -30,6 +32,9 @@ MAX_BAND_POINTS = 600
 
 MAX_MARKED_VALUES = 800
 """Number of values up to which each is marked by a point on its line."""
+
+TRIANGLE_INSET = 0.04
+"""Distance of triangles from the limit of a scale, as a fraction of the height of a diagram."""
 
 ROW_HEIGHT_PX = 165
 """Height of one of several diagrams above each other."""
@@ -84,6 +89,8 @@ def value_panel(
 ) -> Panel:
     """Draw values against time, with notes on expected values, outliers and thinning.
 
+    Values beyond the scale are marked by triangles at its limit, expected values by open ones.
+
     Parameters
     ----------
     title, explanation : str
@@ -96,16 +103,19 @@ def value_panel(
     signed : bool
         Values may be negative.
     as_marks : bool
-        Draw marks instead of lines, and outliers as triangles at the upper limit; one row only.
+        Draw marks instead of lines, and the diagram higher; one row only.
     reference : float, optional
         Value to be included and marked by a line.
     """
     figure: Figure = make_subplots(len(rows), 1, shared_xaxes=True, vertical_spacing=0.05)
-    beyond = total = shown = 0
+    beyond = total = shown = beyond_expected = total_expected = 0
     for number, row in enumerate(rows, start=1):
         limit, magnitude = row.limit(reference), row.magnitudes()
         beyond += int(np.count_nonzero(magnitude > limit))
         total += len(magnitude)
+        for s in row.expected.values():
+            beyond_expected += int(np.count_nonzero(s.value > limit))
+            total_expected += int(np.count_nonzero(np.isfinite(s.value)))
         counts = allot_points([len(s.value) for s in row.values.values()], MAX_POSES // len(rows))
         kept = {
             name: thin(len(s.value), count, np.abs(s.value))
@@ -114,25 +124,21 @@ def value_panel(
         shown += sum(map(len, kept.values()))
         mode = "markers" if as_marks else _line_mode(len(kept), sum(counts))
         for k, (name, s) in enumerate(row.values.items()):
-            traces = []
+            traces, color = [], colors[name]
             if name in row.expected:
                 is_first, is_only = k == 0 and number == 1, len(row.expected) == 1
                 bound = row.expected[name]
-                traces = _expected_traces(bound, start_ns, colors[name], signed, is_only, is_first)
+                traces = _expected_traces(bound, start_ns, color, signed, is_only, is_first)
             look = {
                 "name": escape(abbreviate(name)),
                 "legendgroup": name,
                 "legendrank": DEVICE_LEGEND_RANK,
                 "showlegend": number == 1 and len(kept) > 1 and is_in_legend(k, len(kept)),
             }
-            for trace in _value_traces(
-                s, kept[name], start_ns, colors[name], mode, limit if as_marks else None
-            ):
-                traces.append({**look, **trace})
-            for trace in traces:
-                # Triangles are on an overlaid axis, which is not one of a row.
-                cell = {} if "yaxis" in trace else {"row": number, "col": 1}
-                figure.add_trace({"type": "scatter", **trace}, **cell)
+            traces.append({**look, **_value_trace(s, kept[name], start_ns, color, mode)})
+            figure.add_traces([{"type": "scatter", **t} for t in traces], number, 1)
+        triangles = _excess_traces(row, kept, limit, start_ns, colors, signed)
+        _add_overlay(figure, number, len(rows), triangles)
         limits = [-limit if signed else 0, limit]
         figure.update_yaxes(title={"text": row.title}, range=limits, row=number, col=1)
     if reference is not None:
@@ -140,16 +146,17 @@ def value_panel(
     figure.update_xaxes(title={"text": "time [s]"}, row=len(rows), col=1)
     height = 360 if as_marks else ROW_HEIGHT_PX * len(rows) + 60
     figure.update_layout(height=height)
-    if as_marks:
-        overlay = {"overlaying": "y", "range": [0, 1], "fixedrange": True, "visible": False}
-        figure.update_layout(yaxis2=overlay)
+    scale = "this scale" if len(rows) == 1 else "these scales"
     note = join_sentences(
         explanation,
         _expected_note(max(len(row.expected) for row in rows), signed),
-        f"{format_count(beyond)} of {format_count(total, 'values')} lie beyond "
-        + ("this scale (triangles)" if as_marks else "these scales")
-        + ": double-click to see them."
+        f"{format_count(beyond)} of {format_count(total, 'values')} lie beyond {scale} "
+        "(triangles): double-click to see them."
         if beyond
+        else "",
+        f"{format_count(beyond_expected)} of {format_count(total_expected, 'bounds')} lie beyond "
+        f"{scale} (open triangles): double-click to see them."
+        if beyond_expected
         else "",
         thinning_note(shown, total, "values"),
     )
@@ -170,43 +177,81 @@ def _expected_note(devices: int, signed: bool) -> str:
     return f"By the solver's covariance, 95 % of the errors should be {region}."
 
 
-def _value_traces(
-    s: Series, kept: Indices, start_ns: int, color: str, mode: str, limit: float | None
-) -> list[dict[str, Any]]:
-    """Return the trace of a device and, with a ``limit``, triangles there for larger values."""
+def _value_trace(s: Series, kept: Indices, start_ns: int, color: str, mode: str) -> dict[str, Any]:
+    """Return the line or the marks of a device."""
     rows = np.column_stack([(s.time_ns[kept] - start_ns) * 1e-9, s.value[kept]])
-    if limit is None:
+    if "lines" in mode:
         rows = interrupt_at_gaps(rows, s.time_ns, kept)
     x, y = rows.T
-    trace = {
+    return {
         "x": x,
         "y": y,
         "mode": mode,
         "line": {"color": color, "width": 1.1},
-        "marker": {"color": color, "size": 3.5 if limit is None else 4, "opacity": 0.8},
+        "marker": {"color": color, "size": 4 if mode == "markers" else 3.5},
         "hovertemplate": "%{x:.3f} s<br>%{y:.4g}",
     }
-    if limit is None or not (y > limit).any():
-        return [trace]
-    is_outlier = y > limit
-    triangles = {
-        "x": x[is_outlier],
-        "y": np.full(np.count_nonzero(is_outlier), 0.975),
-        "yaxis": "y2",
-        "customdata": y[is_outlier],
+
+
+def _excess_traces(
+    row: ValueRow,
+    kept: Mapping[str, Indices],
+    limit: float,
+    start_ns: int,
+    colors: Mapping[str, str],
+    signed: bool,
+) -> list[dict[str, Any]]:
+    """Return triangles for the values and the bounds beyond the limit of a row."""
+    traces = []
+    for name, s in row.values.items():
+        at = kept[name][np.abs(s.value[kept[name]]) > limit]
+        look = {"name": escape(abbreviate(name)), "legendgroup": name}
+        filled = {"color": colors[name], "size": 9}
+        traces.append({**look, **_triangles(Series(s.time_ns[at], s.value[at]), start_ns, filled)})
+    for name, bound in row.expected.items():
+        at = peaks_beyond(bound, limit)
+        upper = Series(bound.time_ns[at], bound.value[at])
+        look = {"name": "95 % expected", "legendgroup": "expected"}
+        hollow = {"color": TRANSPARENT, "size": 8, "line": {"color": colors[name], "width": 1.2}}
+        for sided in (upper, upper.scaled(-1)) if signed else (upper,):
+            traces.append({**look, **_triangles(sided, start_ns, hollow)})
+    return [trace for trace in traces if len(trace["x"])]
+
+
+def _triangles(s: Series, start_ns: int, marker: dict[str, Any]) -> dict[str, Any]:
+    """Return triangles at the edges of a diagram that point to values beyond it.
+
+    Their ordinates are fractions of its height.
+    """
+    is_upper = s.value > 0
+    symbols = np.where(is_upper, "triangle-up", "triangle-down").tolist()
+    return {
+        "x": (s.time_ns - start_ns) * 1e-9,
+        "y": np.where(is_upper, 1 - TRIANGLE_INSET, TRIANGLE_INSET),
+        "customdata": s.value,
         "mode": "markers",
-        "marker": {"color": color, "size": 9, "symbol": "triangle-up"},
+        "marker": {**marker, "symbol": symbols},
         "hovertemplate": "%{x:.3f} s<br>%{customdata:.4g}",
         "showlegend": False,
     }
-    return [trace, triangles]
+
+
+def _add_overlay(figure: Figure, number: int, rows: int, traces: Sequence[dict[str, Any]]) -> None:
+    """Add traces to a row on an axis from 0 to 1 that lies over its value axis."""
+    if not traces:
+        return
+    axis, row = f"{rows + number}", "" if number == 1 else f"{number}"
+    overlay = {"overlaying": f"y{row}", "anchor": f"x{row}", "range": [0, 1]}
+    figure.update_layout({f"yaxis{axis}": {**overlay, "fixedrange": True, "visible": False}})
+    axes = {"xaxis": f"x{row}", "yaxis": f"y{axis}"}
+    figure.add_traces([{"type": "scatter", **axes, **trace} for trace in traces])
 
 
 def _expected_traces(
     s: Series, start_ns: int, color: str, signed: bool, is_shaded: bool, is_first: bool
 ) -> list[dict[str, Any]]:
     """Return the outline of expected values, shaded for a single device."""
-    kept = thin(len(s.value), MAX_BAND_POINTS)
+    kept = thin(len(s.value), MAX_BAND_POINTS, s.value)
     rows = np.column_stack([(s.time_ns[kept] - start_ns) * 1e-9, s.value[kept]])
     x, y = interrupt_at_gaps(rows, s.time_ns, kept).T
     look: dict[str, Any] = {
@@ -214,7 +259,7 @@ def _expected_traces(
         "mode": "lines",
         "name": "95 % expected",
         "legendgroup": "expected",
-        "line": {"color": faded(color, 0.55), "width": 1.2},
+        "line": {"color": color, "width": 0.8},
         "hoverinfo": "skip",
     }
     fill = {"fill": "tonexty" if signed else "tozeroy", "fillcolor": faded(color, 0.13)}

@@ -16,6 +16,7 @@ from locatk.formats.report.diagram_grid import REFUSED, DiagramGrid
 from locatk.formats.report.panels import Panel, join_sentences
 from locatk.formats.report.signals import DeviceRecording, device_panels
 from locatk.formats.report.sweep_outcomes import classify_sweeps
+from locatk.formats.report.theme import INK
 from locatk.formats.sessions.messages import SWEEPS, BatchError
 from locatk.formats.sessions.reader import Session
 
@@ -107,7 +108,7 @@ def _draw(recording: DeviceRecording[Sweeps]) -> list[Panel]:
         if t.device == device or t.device.startswith(f"{device}/")
     ]
     if pose_times_s:
-        line = {"color": "#222", "width": 2, "dash": "dot"}
+        line = {"color": INK, "width": 2, "dash": "dot"}
         _add_rate(grid, edges, np.concatenate(pose_times_s), "poses", line, name="poses")
     grid.figure.update_yaxes(rangemode="tozero", row=2, col=1)
     invalid = int(np.count_nonzero(~is_valid))

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from plotly.colors import sample_colorscale
 
 from locatk.core.polaris.array import SensorArray
 from locatk.core.polaris.results import TagDetection
@@ -23,6 +22,7 @@ from locatk.formats.report.panels import (
 )
 from locatk.formats.report.signal_diagrams import Event, Signals, add_recording, detail_panels
 from locatk.formats.report.signals import DeviceRecording, field_panels
+from locatk.formats.report.theme import SENSOR_SHADES
 from locatk.formats.sessions.field_samples import MAGNETOMETERS, DeviceSamples
 from locatk.formats.sessions.reader import Session
 
@@ -40,9 +40,6 @@ MIN_PASS_S = 0.1
 
 FIELD_RANGE_M = 0.02
 """Distance around a magnet in which its field is measurable: about twice the height of the bar."""
-
-MAX_COLOR = 0.88
-"""End of the color scale of sensors; the yellow beyond it is invisible on white."""
 
 NOTE = (
     "Magnitude of the field at each sensor, minus the sensor's median. Above: identified tags with "
@@ -111,7 +108,8 @@ def _signals(recording: DeviceRecording[Samples], ordinate: Array, names: list[s
     median = np.zeros(field.shape[1:], np.float32)
     is_alive = np.isfinite(field).any(axis=0)
     median[is_alive] = np.nanmedian(field[:, is_alive], axis=0)
-    shades = sample_colorscale("Viridis", np.linspace(0, MAX_COLOR, max(len(names), 2)))
+    last = len(SENSOR_SHADES) - 1
+    shades = [SENSOR_SHADES[round(last * k / max(len(names) - 1, 1))] for k in range(len(names))]
     rank = np.argsort(np.argsort(ordinate, kind="stable"))
     return Signals(
         recording.seconds(recording.samples.time_ns),

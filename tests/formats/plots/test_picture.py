@@ -254,6 +254,25 @@ def test_outliers_do_not_hide_the_other_poses() -> None:
     said = texts(figure)
     assert "1 pose outside this view" in said
     assert any("1 of 120 beyond this scale (triangles)" in text for text in said)
+    assert any("1 of 120 poses beyond this scale are in the last bin" in text for text in said)
+
+
+@pytest.mark.slow
+def test_bounds_beyond_the_scale_are_open_triangles() -> None:
+    unsure = track("red", off_m=2e-3)
+    unsure.covariance[40:80, :3, :3] *= 1e6
+    figure = draw_picture(Solution("lighthouse", "bundle", (unsure,), artifact=SCENE), TRUTH)
+    over_time = next(a for a in figure.axes if a.get_ylabel() == "error [mm]")
+    assert "open triangles: the line is beyond this scale" in over_time.get_title(loc="left")
+    (marks,) = (
+        line
+        for line in over_time.lines
+        if line.get_marker() == "^" and line.get_markerfacecolor() == "none"
+    )
+    limit = over_time.get_ylim()[1]
+    assert limit < 100
+    assert 10 < len(marks.get_xdata()) < 40
+    assert (marks.get_ydata() < limit).all()
 
 
 LONG = tuple(f"robot-with-a-very-long-name-{k}" for k in range(30))

@@ -13,10 +13,12 @@ from locatk.core.geometry import Similarity, rotation_exp
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.plots.series import (
+    Series,
     axis_limit,
     error_quantile_95,
     origin_ns,
     overlap_in_time,
+    peaks_beyond,
     pose_span_ns,
     scored_covariance,
 )
@@ -88,6 +90,38 @@ def test_axes_leave_out_outliers() -> None:
     assert axis_limit(values) < 2
     assert axis_limit(np.zeros(3)) > 0
     assert axis_limit(np.full(3, np.nan)) > 0
+
+
+@pytest.mark.parametrize(
+    ("expected", "limit"),
+    [
+        ([2.0, 3.5], 3.675),  # All bounds fit.
+        ([2.0, 50.0], 1.2 * 2.1),  # The large one does not, and marks at the limit need space.
+        ([50.0, 60.0], 1.2 * 1.05),  # None fits: the values fill the axis.
+        ([2.0] * 99 + [3.9], 1.2 * 3.15),  # A peak may take half of the bounds more.
+        ([0.5, np.nan], 1.05),
+        ([], 1.05),
+    ],
+)
+def test_an_axis_holds_the_bounds_that_leave_the_values_readable(
+    expected: list[float], limit: float
+) -> None:
+    assert axis_limit(np.ones(100), np.array(expected)) == pytest.approx(limit)
+
+
+def test_an_axis_of_no_errors_holds_the_bounds() -> None:
+    assert axis_limit(np.zeros(3), np.array([0.2])) == pytest.approx(0.21)
+
+
+def test_the_largest_value_beyond_a_scale_is_marked_in_each_part_of_the_time() -> None:
+    value = np.ones(4001)
+    value[[150, 151, 152]] = 3.0, 5.0, 4.0  # One of 40 parts.
+    value[3000] = 2.5
+    series = Series(10**9 * np.arange(4001), value)
+    assert peaks_beyond(series, 2.0).tolist() == [151, 3000]
+    assert peaks_beyond(series, 5.0).tolist() == []
+    assert len(peaks_beyond(series, 0.5)) == 40
+    assert peaks_beyond(Series(np.array([7]), np.ones(1)), 0.5).tolist() == [0]
 
 
 def test_a_rotation_mixes_unknown_axes_only_with_those_it_turns_them_into() -> None:

@@ -6,7 +6,7 @@ import re
 import shutil
 import struct
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,11 @@ from locatk.core.lighthouse.calibration import IDEAL_CALIBRATION
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
+from locatk.formats.plots.shapes import COLORS
 from locatk.formats.report.report import write_report
+from locatk.formats.report.style import MAX_EAGER_FIGURES
 from locatk.formats.report.subject import Subject
+from locatk.formats.report.theme import DARK_DEVICE_COLORS, PAGE_COLORS
 
 pytestmark = pytest.mark.slow
 
@@ -45,8 +48,8 @@ class Opened:
     requests: list[str]
 
 
-def opened(browser: str, page: Path, profile: Path, *more: str) -> Opened:
-    """Open a file and wait until its figures are drawn."""
+def opened(browser: str, page: Path, profile: Path, *more: str, part: str = "") -> Opened:
+    """Open a file, at a part of the page if there is one, and wait until its figures are drawn."""
     log = profile.with_suffix(".netlog")
     done = subprocess.run(
         [
@@ -65,7 +68,7 @@ def opened(browser: str, page: Path, profile: Path, *more: str) -> Opened:
             "--window-size=1200,3000",
             *more,
             "--dump-dom",
-            page.as_uri(),
+            page.as_uri() + part,
         ],
         capture_output=True,
         text=True,
@@ -224,9 +227,61 @@ def test_the_page_is_not_blank(page: Page) -> None:
     assert struct.unpack(">II", data[16:24])[0] == 1200
     image = cv2.imread(str(page.screenshot)).reshape(-1, 3).astype(np.int16)
     blue = np.abs(image - [0xB2, 0x72, 0x00]).max(axis=1) < 12  # of the path; cv2 has b, g, r
-    grey = np.abs(image - 0xBF).max(axis=1) < 6  # of the truth
+    grey = np.abs(image - 0x8C).max(axis=1) < 6  # of the truth
     assert blue.sum() > 500
     assert grey.sum() > 20
+
+
+DARK = "--blink-settings=preferredColorScheme=0"
+"""Switch by which Chromium prefers a dark color scheme."""
+
+
+def test_dark_mode_changes_the_page_and_its_diagrams(browser: str, tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    path, picture = tmp_path / "report.html", tmp_path / "page.png"
+    write_report(path, [subject()])
+    shown = opened(browser, path, tmp_path / "profile", DARK, f"--screenshot={picture}")
+    assert shown.console == []
+    image = cv2.imread(str(picture))[:, :, ::-1].reshape(-1, 3).astype(np.int16)
+
+    def fraction(color: str) -> float:
+        channels = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+        return float(np.mean(np.abs(image - channels).max(axis=1) < 3))
+
+    for name, least in (("page", 0.05), ("card", 0.3)):
+        light, dark = PAGE_COLORS[name]
+        assert fraction(light) < 1e-3
+        assert fraction(dark) > least
+    assert fraction(DARK_DEVICE_COLORS[0]) > 1e-4
+    assert fraction(COLORS[0]) < 1e-5
+    # Text and axes of the diagrams, in the notation of plotly.
+    assert "fill: rgb(230, 235, 240)" in shown.dom
+    assert "fill: rgb(29, 39, 51)" not in shown.dom
+
+
+def test_dark_mode_prints_light_diagrams(browser: str, tmp_path: Path) -> None:
+    """A report that is printed has the light colors, and the dark ones again afterwards."""
+    path = tmp_path / "report.html"
+    write_report(path, [subject()])
+    report = _without_policy(path.read_text("utf-8"))
+    measure = """<script>
+        new MutationObserver(function () {
+          const axis = () => document.querySelector(".figure .xtick text").style.fill;
+          const figure = document.querySelector(".figure");
+          const excess = () => figure.querySelector(".main-svg").clientHeight - figure.clientHeight;
+          const colors = [axis()], excesses = [];
+          for (const name of ["beforeprint", "afterprint"]) {
+            window.dispatchEvent(new Event(name));
+            colors.push(axis());
+            excesses.push(excess());
+          }
+          document.body.append("[" + colors.join("; ") + "] [" + excesses + "]");
+        }).observe(document.documentElement, {attributeFilter: ["data-drawn"]});
+        </script>"""
+    path.write_text(report.replace("<main>", f"{measure}<main>"), "utf-8")
+    dom = opened(browser, path, tmp_path / "profile", DARK).dom
+    assert "[rgb(230, 235, 240); rgb(29, 39, 51); rgb(230, 235, 240)]" in dom
+    assert "[0,0]" in dom  # No map covers the figure below it.
 
 
 def test_a_narrow_window_shows_all(frames: Opened) -> None:
@@ -255,7 +310,37 @@ def test_the_overview_is_sorted_by_a_click(browser: str, tmp_path: Path) -> None
           document.body.append("[" + Array.from(cells).map(cell => cell.textContent) + "]");
         }
         document.body.append("[" + buttons[5].parentNode.getAttribute("aria-sort") + "]");
+        // The links are those of their rows, wherever these are now.
+        for (const link of document.querySelectorAll(".sortable tbody a")) {
+          link.click();
+          const target = document.querySelector(":target");
+          document.body.append(`[${link.textContent}: ${target.querySelector("h2").textContent}`);
+          document.body.append(` ${target.tagName}]`);
+        }
       });</script>"""
     path.write_text(_without_policy(report).replace("</body>", f"{click}</body>"), "utf-8")
     dom = opened(browser, path, tmp_path / "profile").dom
     assert "[20,40,60][60,40,20][descending]" in dom
+    for name in ("r10", "r2", "r1"):
+        assert f"[{name}: {name} ARTICLE]" in dom
+
+
+@pytest.mark.slow
+def test_a_page_of_many_figures_draws_those_in_sight(browser: str, tmp_path: Path) -> None:
+    """All together would take minutes; a link to a solution draws its figures."""
+    path = tmp_path / "report.html"
+    shown = subject(n=20)
+    write_report(path, [replace(shown, name=f"r{k}") for k in range(1, 21)])
+    report = path.read_text("utf-8")
+    total = report.count('<div class="figure"')
+    assert total > MAX_EAGER_FIGURES
+    # Without a smooth motion over the figures between the beginning and the solution.
+    jump = "--force-prefers-reduced-motion"
+    dom = opened(browser, path, tmp_path / "profile", jump, part="#s15").dom
+    drawn = {int(k) for k in re.findall(r'id="s(\d+)-\d+-figure"[^>]*class="[^"]*js-plotly', dom)}
+    drawn |= {int(k) for k in re.findall(r'class="[^"]*js-plotly[^>]*id="s(\d+)-\d+-figure"', dom)}
+    assert 15 in drawn
+    assert len(drawn) < 10
+    count = re.search(r'data-drawn="(\d+)"', dom)
+    assert count is not None
+    assert 3 <= int(count[1]) < total / 2

@@ -429,6 +429,8 @@ def test_outliers_are_at_the_upper_limit_and_counted() -> None:
     assert panel.figure.layout.yaxis.range[1] < 10
     histogram = figure(evaluated(solved), "Histogram of errors").figure
     assert sum(histogram.data[0].y) == 100
+    note = figure(evaluated(solved), "Histogram of errors").note
+    assert note == "1 of 100 poses beyond this scale are in the last bin."
     # The median and the 95 % quantile, both 1 mm.
     np.testing.assert_allclose([line.x0 for line in histogram.layout.shapes], [1.0, 1.0], rtol=0.1)
 
