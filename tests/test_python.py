@@ -7,6 +7,7 @@ import inspect
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import numpy as np
@@ -199,6 +200,7 @@ def test_wrong_options(recorded: session.Session, options: dict[str, object], me
         ("lighthouse", {"robot": {"count": 2}}, "unknown key 'robot'"),
         ("lighthouse", {"robots": {"count": -2}}, "at least 1"),
         ("lighthouse", {"robots": {"flying": True, "planar": True}}, "not both"),
+        ("landmarks", {}, "landmarks are simulated on a map"),
     ],
 )
 def test_wrong_settings(
@@ -219,17 +221,29 @@ def test_settings_are_those_of_the_file(tmp_path: Path, recorded: session.Sessio
     np.testing.assert_array_equal(by_file.sweeps.count, recorded.sweeps.count)
 
 
-@pytest.mark.parametrize("system", ["dots", "polaris"])
-def test_other_systems(tmp_path: Path, system: str) -> None:
-    recording = functions.simulate(system, tmp_path / "run.mcap", seed=1)
+@pytest.mark.parametrize(
+    ("system", "observations"),
+    [("dots", "frames"), ("polaris", "magnetometers"), ("landmarks", "halls")],
+)
+def test_other_systems(tmp_path: Path, locatk: Any, system: str, observations: str) -> None:
+    artifact = None
+    if system == "landmarks":
+        artifact = tmp_path / "map.toml"
+        locatk("map", "design", "5x6", "-o", artifact)
+    recording = functions.simulate(system, tmp_path / "run.mcap", artifact=artifact, seed=1)
     assert recording.system == system
-    observed = recording.frames if system == "dots" else recording.magnetometers
+    observed = getattr(recording, observations)
     assert len(observed) == 1
     assert len(repr(observed[0])) < MAX_REPR
     result = functions.solve(recording)
     assert result.system == system
     assert result.detections
     assert "<table>" in result._repr_html_()
+
+
+def test_an_artifact_that_is_not_used_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="dots is simulated without an artifact"):
+        functions.simulate("dots", tmp_path / "run.mcap", artifact=tmp_path / "map.toml")
 
 
 def test_devices_without_truth_are_named(

@@ -149,11 +149,16 @@ def _trajectories(source: Poses | Session, role: files.Role) -> list[Trajectory]
     return list(source.values()) if isinstance(source, Mapping) else list(source)
 
 
+SIMULATED_ARTIFACTS = ("landmarks", "polaris")
+"""Systems whose simulators take an artifact."""
+
+
 def simulate(
     system: str,
     path: Location,
     settings: Mapping[str, Mapping[str, Any]] | Location | None = None,
     *,
+    artifact: Location | None = None,
     seed: int | None = None,
     overwrite: bool = False,
 ) -> Session:
@@ -168,6 +173,9 @@ def simulate(
     settings : mapping or path, optional
         Tables and keys of the file that ``locatk simulate SYSTEM --print-config`` prints, as in
         ``{"robots": {"count": 20}}``, or such a file.
+    artifact : path, optional
+        Landmarks: the map (map.toml), which is required. Polaris: the tags (tag.toml), by default
+        one of the authors.
     seed : int, optional
         Seed of all random numbers, in place of that of the settings.
     overwrite : bool
@@ -176,7 +184,8 @@ def simulate(
     Raises
     ------
     InputError
-        The system is unknown, or a setting is unknown, out of range or contradicts another.
+        The system is unknown, or a setting is unknown, out of range or contradicts another; the
+        artifact is missing, or not one of this system.
     OutputExistsError
         ``path`` exists and ``overwrite`` is false.
     """
@@ -188,5 +197,11 @@ def simulate(
     else:
         chosen = module.CONFIG.from_tables(settings or {})
     own = {} if seed is None else {"random.seed": seed}
-    module.write_simulation(path, module.CONFIG.merge(chosen, own), overwrite=overwrite)
+    if artifact is None and system == "landmarks":
+        hint = "Write one by `locatk map design`, and give it as artifact"
+        raise InputError("landmarks are simulated on a map", hint=hint)
+    if artifact is not None and system not in SIMULATED_ARTIFACTS:
+        raise InputError(f"{system} is simulated without an artifact", hint="Use the settings")
+    artifacts = () if artifact is None else (artifact,)
+    module.write_simulation(path, module.CONFIG.merge(chosen, own), *artifacts, overwrite=overwrite)
     return Session(path)
