@@ -17,8 +17,8 @@ from locatk.core.errors import InputError, LocatkError, MissingDataError
 from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair_devices
 from locatk.core.natural_order import natural_key
 from locatk.formats.files import split_selection
-from locatk.formats.importers import trajectories as files
-from locatk.formats.importers.rosbag import is_bag_folder
+from locatk.formats.importers.poses import trajectories as files
+from locatk.formats.importers.poses.rosbag import is_bag_folder
 
 TRUTH_ENDINGS = (".mcap", ".tum", ".csv", ".txt", ".kitti", ".tsv", ".db3", ".bag")
 """Endings of files with truth in a folder, in the order in which they are looked for."""
@@ -148,7 +148,7 @@ def evaluate_file(
     Parameters
     ----------
     estimate, truth : Path
-        See :func:`locatk.formats.importers.trajectories.open_file`.
+        See :func:`locatk.formats.importers.poses.trajectories.open_file`.
     options : EvaluationOptions
     names : mapping of str to str, optional
         Device in the truth of each device of the estimate.

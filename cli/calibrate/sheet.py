@@ -225,7 +225,7 @@ def _first_image(frames: Frames) -> list[np.ndarray]:
 
 
 def _tracks(path: Path) -> list[Trajectory]:
-    from locatk.formats.importers import trajectories
+    from locatk.formats.importers.poses import trajectories
 
     return trajectories.read(path, role="truth")
 

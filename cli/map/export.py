@@ -98,12 +98,12 @@ def command(
     floor = read_map(map_file)
     with console.working("Drawing"):
         if format_name == "csv":
-            from locatk.formats.exporters.map_csv import dumps_csv
+            from locatk.formats.exporters.floors.map_csv import dumps_csv
 
             contents = [dumps_csv(floor, unique_codes).encode()]
         elif format_name == "lif":
-            from locatk.formats.exporters.layout_lif import stamp_of
-            from locatk.formats.exporters.map_lif import dumps_lif
+            from locatk.formats.exporters.floors.layout_lif import stamp_of
+            from locatk.formats.exporters.floors.map_lif import dumps_lif
 
             version = lif_version or LIF_VERSIONS[0]
             contents = [dumps_lif(floor, stamp_of(map_file), version).encode()]
@@ -134,16 +134,16 @@ def _draw(
 ) -> list[bytes]:
     """Return the content of each file of a drawing."""
     if format_name == "svg":
-        from locatk.formats.exporters.drawing_svg import dumps_svg
-        from locatk.formats.exporters.map_drawing import draw_map
+        from locatk.formats.exporters.floors.drawing_svg import dumps_svg
+        from locatk.formats.exporters.floors.map_drawing import draw_map
 
         return [dumps_svg(draw_map(floor))]
     if format_name == "dxf":
-        from locatk.formats.exporters.drawing_dxf import dumps_dxf
-        from locatk.formats.exporters.map_drawing import draw_map
+        from locatk.formats.exporters.floors.drawing_dxf import dumps_dxf
+        from locatk.formats.exporters.floors.map_drawing import draw_map
 
         return [dumps_dxf(draw_map(floor)).encode()]
-    from locatk.formats.exporters import map_ros
+    from locatk.formats.exporters.floors import map_ros
 
     pixel = resolution_mm / 1e3
     picture = map_ros.dumps_pgm(map_ros.draw_grid(floor, pixel))

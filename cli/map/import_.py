@@ -119,21 +119,21 @@ def command(
     pitch = None if pitch_mm is None else metres(pitch_mm)
     tolerance, warnings = metres(tolerance_mm), list[str]()
     if format_name == "csv":
-        from locatk.formats.importers.map_csv import loads_csv
+        from locatk.formats.importers.floors.map_csv import loads_csv
 
         text = read_text(source)
         floor = loads_csv(
             text, file=source, pitch_m=pitch, tolerance_m=tolerance, warnings=warnings
         )
     elif format_name == "dxf":
-        from locatk.formats.importers.map_dxf import read_map_drawing
+        from locatk.formats.importers.floors.map_dxf import read_map_drawing
 
         floor, content = read_map_drawing(
             source, layers or (DEFAULT_LAYER,), unit, pitch_m=pitch, tolerance_m=tolerance
         )
         drawing_options.report(source, content.unit, content.ignored)
     else:
-        from locatk.formats.importers.map_lif import loads_lif
+        from locatk.formats.importers.floors.map_lif import loads_lif
 
         floor = loads_lif(read_text(source), file=source, pitch_m=pitch, tolerance_m=tolerance)
     if like is not None:

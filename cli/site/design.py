@@ -186,7 +186,7 @@ def _points(
 
     from locatk.core.errors import error_context
     from locatk.core.polaris.design.site import grid_points, route_points
-    from locatk.formats.importers.site_csv import read_site_points
+    from locatk.formats.importers.floors.site_csv import read_site_points
 
     if grid is not None and spacing is not None:
         x, y = origin

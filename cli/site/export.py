@@ -73,22 +73,22 @@ def command(
         )
     with console.working("Drawing"):
         if format_name == "csv":
-            from locatk.formats.exporters.site_csv import dumps_csv
+            from locatk.formats.exporters.floors.site_csv import dumps_csv
 
             data = dumps_csv(tags).encode()
         elif format_name == "lif":
-            from locatk.formats.exporters.layout_lif import stamp_of
-            from locatk.formats.exporters.site_lif import dumps_lif
+            from locatk.formats.exporters.floors.layout_lif import stamp_of
+            from locatk.formats.exporters.floors.site_lif import dumps_lif
 
             data = dumps_lif(tags, stamp_of(site), lif_version or LIF_VERSIONS[0]).encode()
         elif format_name == "svg":
-            from locatk.formats.exporters.drawing_svg import dumps_svg
-            from locatk.formats.exporters.site_drawing import draw_site
+            from locatk.formats.exporters.floors.drawing_svg import dumps_svg
+            from locatk.formats.exporters.floors.site_drawing import draw_site
 
             data = dumps_svg(draw_site(tags))
         else:
-            from locatk.formats.exporters.drawing_dxf import dumps_dxf
-            from locatk.formats.exporters.site_drawing import draw_site
+            from locatk.formats.exporters.floors.drawing_dxf import dumps_dxf
+            from locatk.formats.exporters.floors.site_drawing import draw_site
 
             data = dumps_dxf(draw_site(tags)).encode()
     with atomic_write(output, overwrite=overwrite) as stream:

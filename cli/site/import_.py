@@ -108,11 +108,11 @@ def command(
     options.guard_output(output, overwrite=overwrite, inputs=[source, tag])
     tags = read_tags(tag)
     if format_name == "csv":
-        from locatk.formats.importers.site_csv import read_site_points
+        from locatk.formats.importers.floors.site_csv import read_site_points
 
         points, has_heading = read_site_points(source, columns, units or ())
     elif format_name == "dxf":
-        from locatk.formats.importers.site_dxf import read_site_drawing
+        from locatk.formats.importers.floors.site_dxf import read_site_drawing
 
         with console.working("Reading"):
             drawing = read_site_drawing(source, layers or (DEFAULT_LAYER,), (units or (None,))[0])
@@ -120,7 +120,7 @@ def command(
         drawing_options.report(source, drawing.unit, drawing.ignored)
     else:
         from locatk.formats.files import read_text
-        from locatk.formats.importers.site_lif import loads_site_points
+        from locatk.formats.importers.floors.site_lif import loads_site_points
 
         points, has_heading = loads_site_points(read_text(source), file=source)
     if not has_heading:

@@ -16,7 +16,7 @@ from locatk.core.evaluation import evaluate as evaluate_pairs
 from locatk.core.trajectory import Trajectory
 from locatk.formats.api.session import Session
 from locatk.formats.api.solution import Solution, require_poses
-from locatk.formats.importers import trajectories as files
+from locatk.formats.importers.poses import trajectories as files
 from locatk.formats.pipeline import provenance
 from locatk.formats.pipeline.systems import SYSTEMS, SolveRequest, solve_session
 from locatk.formats.sessions.reader import Session as StoredSession

@@ -11,7 +11,7 @@ import numpy as np
 from locatk.core.natural_order import natural_key
 from locatk.core.trajectory import Trajectory, has_orientation
 from locatk.formats.extras import requires_extra
-from locatk.formats.importers.trajectory_csv import (
+from locatk.formats.importers.poses.trajectory_csv import (
     POSITION_COLUMNS,
     PROBABILITY_COLUMN,
     QUATERNION_COLUMNS,

@@ -33,7 +33,7 @@ from locatk.formats.benchmarks.timing import (
     time_command,
 )
 from locatk.formats.exporters.tum import write_tum
-from locatk.formats.importers.tum import read_tum
+from locatk.formats.importers.poses.tum import read_tum
 from locatk.formats.pipeline.execution import SINGLE_THREAD_ENVIRONMENT
 
 LOCATK = (sys.executable, "-m", "locatk.cli")

@@ -2,7 +2,7 @@
 
 A line is the upper three rows of a 4 x 4 pose, row by row; an unknown orientation is the identity.
 The format has no times: two files correspond row by row. The reader is
-:mod:`locatk.formats.importers.kitti`.
+:mod:`locatk.formats.importers.poses.kitti`.
 """
 
 from __future__ import annotations

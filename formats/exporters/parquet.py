@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from locatk.core.trajectory import Trajectory, has_orientation
-from locatk.formats.importers.trajectory_csv import (
+from locatk.formats.importers.poses.trajectory_csv import (
     COLUMNS,
     PROBABILITY_COLUMN,
     SESSION_COLUMN,

@@ -1,6 +1,6 @@
 """Trajectories as CSV with uncertainties.
 
-The reader is :mod:`locatk.formats.importers.trajectory_csv`.
+The reader is :mod:`locatk.formats.importers.poses.trajectory_csv`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from locatk.core.errors import InputError
 from locatk.core.printable import spreadsheet_text
 from locatk.core.trajectory import Trajectory, has_orientation
-from locatk.formats.importers.trajectory_csv import COLUMNS, SESSION_COLUMN, SIGMA_AXES
+from locatk.formats.importers.poses.trajectory_csv import COLUMNS, SESSION_COLUMN, SIGMA_AXES
 from locatk.formats.output import atomic_write
 from locatk.formats.tables.timestamps import format_epoch_seconds
 

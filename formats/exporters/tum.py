@@ -2,7 +2,7 @@
 
 A line is ``time x y z qx qy qz qw``: epoch seconds, metres, a unit quaternion. The format has no
 empty values: an unknown orientation is the identity, 0 0 0 1.
-The reader is :mod:`locatk.formats.importers.tum`.
+The reader is :mod:`locatk.formats.importers.poses.tum`.
 """
 
 from __future__ import annotations

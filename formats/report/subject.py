@@ -13,7 +13,7 @@ from locatk.core.evaluation import Evaluation, EvaluationOptions, evaluate, pair
 from locatk.core.natural_order import natural_key
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.importers import trajectories
+from locatk.formats.importers.poses import trajectories
 from locatk.formats.plots.ground import is_unscaled, with_finite_positions
 from locatk.formats.plots.series import overlap_in_time
 from locatk.formats.sessions.reader import Session

@@ -20,8 +20,8 @@ from locatk.core.lighthouse.scene import Scene
 from locatk.core.trajectory import Trajectory
 from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.exporters import export as exports
-from locatk.formats.importers.trajectory_csv import read_csv
-from locatk.formats.importers.tum import read_tum
+from locatk.formats.importers.poses.trajectory_csv import read_csv
+from locatk.formats.importers.poses.tum import read_tum
 from locatk.formats.sessions.solutions import read_solution, write_solution
 from locatk.formats.sessions.writer import SessionWriter
 from locatk.formats.tables.timestamps import parse_decimal_time

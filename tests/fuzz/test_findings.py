@@ -21,7 +21,7 @@ from locatk.formats.artifacts.kinds import POSITIVE, InvalidValueError, Number
 from locatk.formats.capture.redecoding import decode
 from locatk.formats.devices.lines.columns import without_overflow
 from locatk.formats.importers.landmark_csv import read_landmarks
-from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.importers.poses.trajectory_csv import read_csv
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.writer import SessionWriter
 

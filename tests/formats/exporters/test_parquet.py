@@ -14,7 +14,7 @@ from locatk.core.geometry import quaternion_from_heading
 from locatk.core.trajectory import Trajectory, has_orientation
 from locatk.formats.exporters.parquet import AXES, COVARIANCE, write_parquet
 from locatk.formats.exporters.trajectory_csv import write_csv
-from locatk.formats.importers.trajectory_csv import COLUMNS, read_csv
+from locatk.formats.importers.poses.trajectory_csv import COLUMNS, read_csv
 from locatk.formats.tables.timestamps import format_epoch_seconds
 
 START_NS = 1_700_000_000_123_456_789

@@ -13,7 +13,7 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.exporters.bill_of_materials import write_bill
 from locatk.formats.exporters.export import plan_files
 from locatk.formats.exporters.trajectory_csv import write_csv
-from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.importers.poses.trajectory_csv import read_csv
 
 FORMULAS = ('=HYPERLINK("http://x","y")', "+1", "-1", "@x", "\t=1", "\r\n=1", "'=1", "plain")
 

@@ -13,7 +13,7 @@ from locatk.core.geometry import quaternion_from_heading
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory, has_orientation
 from locatk.formats.exporters.trajectory_csv import write_csv
-from locatk.formats.importers.trajectory_csv import read_csv
+from locatk.formats.importers.poses.trajectory_csv import read_csv
 from locatk.formats.sessions.solutions import write_solution
 
 TIME_NS = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(4)
