@@ -2,9 +2,9 @@
 
 A node is a tag. Nodes ``tag<id>`` (:mod:`locatk.formats.exporters.floors.site_lif`) state their
 ids, and the name (in LIF 2, the descriptor) of a node is the meaning of its tag. In other layouts
-the name is the id of the tag if all names are whole numbers; otherwise it is the meaning of the tag, and the
-id is free. The heading is the ``theta`` of the first type of vehicle that has one, or 0. Edges are
-not used.
+the name is the id of the tag if all names are whole numbers; otherwise it is the meaning of the
+tag, and the id is free. The heading is the ``theta`` of the first type of vehicle that has one, or
+0. Edges are not used.
 """
 
 from __future__ import annotations

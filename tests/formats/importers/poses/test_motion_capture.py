@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -164,6 +164,7 @@ def test_broken_exports_are_one_line(text: str, problem: str, tmp_path: Path) ->
     length=st.integers(0, 400),
     inserted=st.text('0123456789.,\t\n-eE RXTFrame;"[]', max_size=8),
 )
+@example(start=0.0, length=0, inserted='"')
 def test_damaged_exports_are_refused_or_read(
     name: str, start: float, length: int, inserted: str, tmp_path: Path
 ) -> None:
