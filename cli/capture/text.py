@@ -195,7 +195,7 @@ def sensor_test(test: Any) -> str:
 
 
 def _array_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             _figure(each.gain, 1, "{:.2f}"),
             _figure(each.offset_t, 1e6, "{:.0f}"),
@@ -208,7 +208,7 @@ def _array_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
 
 
 def _halls_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             _figure(each.zero_t, 1e3, "{:.2f}"),
             _figure(each.noise_t, 1e3, "{:.3f}"),
@@ -221,7 +221,9 @@ def _halls_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
 
 
 def _receiver_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    rows = [(str(each.sweeps), " ".join(map(str, each.channels)) or "-") for each in check.sensors]
+    rows: list[tuple[str, ...]] = [
+        (str(each.sweeps), " ".join(map(str, each.channels)) or "-") for each in check.sensors
+    ]
     return ("sweeps", "channels"), rows
 
 

@@ -16,7 +16,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.preprocessing import MAX_OFFSET_T, MIN_NOISE_T
 from locatk.core.robust import robust_sigma
-from locatk.core.sensor_fault import SensorFault
+from locatk.core.sensor_check import SensorCheck, SensorFault, by_sensor
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -64,24 +64,7 @@ class HallFigures:
     response_s: float
 
 
-@dataclass(frozen=True)
-class HallsCheck:
-    """Result of the check of hall sensors.
-
-    Attributes
-    ----------
-    sensors : tuple of HallFigures
-    faults : tuple of SensorFault
-    untested : tuple of str
-        What the recording does not show, with the remedy.
-    """
-
-    sensors: tuple[HallFigures, ...]
-    faults: tuple[SensorFault, ...]
-    untested: tuple[str, ...]
-
-
-def check_halls(samples: HallSamples) -> HallsCheck:
+def check_halls(samples: HallSamples) -> SensorCheck[HallFigures]:
     """Check a recording in which a magnet was moved below one sensor after the other.
 
     Parameters
@@ -120,8 +103,7 @@ def check_halls(samples: HallSamples) -> HallsCheck:
         untested.append(
             "order, sign and gain: move a magnet, north side up, below each sensor in turn"
         )
-    faults.sort(key=lambda fault: -1 if fault.sensor is None else fault.sensor)
-    return HallsCheck(figures, tuple(faults), tuple(untested))
+    return SensorCheck(figures, by_sensor(faults), tuple(untested))
 
 
 def _measure(time_ns: NDArray[np.int64], field_t: Array) -> HallFigures:

@@ -25,7 +25,7 @@ from locatk.core.lighthouse.devices.pnp import candidate_poses, is_lit_from_behi
 from locatk.core.lighthouse.light_planes import rays
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.sensor_fault import SensorFault
+from locatk.core.sensor_check import SensorCheck, SensorFault, by_sensor
 
 Array = NDArray[np.float64]
 
@@ -60,24 +60,9 @@ class PhotodiodeFigures:
     channels: tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class ReceiverCheck:
-    """Result of the check of the photodiodes of a device.
-
-    Attributes
-    ----------
-    sensors : tuple of PhotodiodeFigures
-    faults : tuple of SensorFault
-    untested : tuple of str
-        What the recording does not show, with the remedy.
-    """
-
-    sensors: tuple[PhotodiodeFigures, ...]
-    faults: tuple[SensorFault, ...]
-    untested: tuple[str, ...]
-
-
-def check_receiver(sweeps: Sweeps, device: int, receiver: Receiver | None) -> ReceiverCheck:
+def check_receiver(
+    sweeps: Sweeps, device: int, receiver: Receiver | None
+) -> SensorCheck[PhotodiodeFigures]:
     """Check the photodiodes of one device of a recording.
 
     Parameters
@@ -118,7 +103,7 @@ def check_receiver(sweeps: Sweeps, device: int, receiver: Receiver | None) -> Re
                 "that at least four of them receive it"
             )
         faults += order or []
-    return ReceiverCheck(figures, tuple(faults), tuple(untested))
+    return SensorCheck(figures, by_sensor(faults), tuple(untested))
 
 
 def _light_faults(numbers: NDArray[np.int64], receiver: Receiver | None) -> list[SensorFault]:

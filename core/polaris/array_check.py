@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from locatk.core.errors import InputError
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.preprocessing import estimate_noise
-from locatk.core.sensor_fault import SensorFault
+from locatk.core.sensor_check import SensorCheck, SensorFault, by_sensor
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -111,22 +111,15 @@ class MagnetometerFigures:
 
 
 @dataclass(frozen=True)
-class ArrayCheck:
+class ArrayCheck(SensorCheck[MagnetometerFigures]):
     """Result of the check of an array.
 
     Attributes
     ----------
-    sensors : tuple of MagnetometerFigures
-    faults : tuple of SensorFault
-    untested : tuple of str
-        What the recording does not show, with the remedy.
     field_t : float
         Magnitude of the turning field [T]; ``nan`` if unknown.
     """
 
-    sensors: tuple[MagnetometerFigures, ...]
-    faults: tuple[SensorFault, ...]
-    untested: tuple[str, ...]
     field_t: float
 
 
@@ -186,8 +179,7 @@ def check_array(samples: Samples) -> ArrayCheck:
     faults += _noisy_sensors(noise_t / np.maximum(gain, MIN_AXIS_FRACTION)[:, None], ~is_dead)
     figures = _figures(noise_t, is_dead, turn)
     field = float("nan") if turn is None else turn.magnitude_t
-    faults.sort(key=lambda fault: -1 if fault.sensor is None else fault.sensor)
-    return ArrayCheck(figures, tuple(faults), tuple(untested), field)
+    return ArrayCheck(figures, by_sensor(faults), tuple(untested), field)
 
 
 @dataclass(frozen=True)
@@ -378,7 +370,7 @@ def _signed_permutation(matrix: Array) -> tuple[int, ...]:
 def _axis_gains(matrix: Array, permutation: tuple[int, ...]) -> Array:
     """Return the gain (3,) of each axis of a sensor; ``nan`` for those that were not observed."""
     columns = [abs(axis) - 1 for axis in permutation]
-    is_observed = matrix.any(axis=0)
+    is_observed = np.asarray(matrix.any(axis=0))
     gains = np.linalg.norm(matrix, axis=1)
     return np.where(is_observed[columns], gains, np.nan)
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.landmarks.halls import HallSensors
-from locatk.core.landmarks.halls_check import HallsCheck, check_halls
-from locatk.core.lighthouse.receiver_check import ReceiverCheck, check_receiver
+from locatk.core.landmarks.halls_check import check_halls
+from locatk.core.lighthouse.receiver_check import check_receiver
 from locatk.core.polaris.array import SensorArray
-from locatk.core.polaris.array_check import ArrayCheck, check_array
+from locatk.core.polaris.array_check import check_array
+from locatk.core.sensor_check import SensorCheck
 from locatk.formats.sessions.field_samples import (
     HALLS,
     MAGNETOMETERS,
@@ -56,13 +58,13 @@ class DeviceTest:
     device, system : str
     names : tuple of str
         Of the sensors.
-    check : ArrayCheck, HallsCheck or ReceiverCheck
+    check : SensorCheck
     """
 
     device: str
     system: str
     names: tuple[str, ...]
-    check: ArrayCheck | HallsCheck | ReceiverCheck
+    check: SensorCheck[Any]
 
 
 def instructions(device: str) -> list[str]:
