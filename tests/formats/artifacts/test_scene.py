@@ -201,7 +201,8 @@ second.counts.1 = [48333, 88779]
 
 def test_the_example_of_the_documentation(root: Path) -> None:
     text = (root / "docs" / "formats.md").read_text("utf-8")
-    example = text.split("```toml\n")[1].split("```")[0]
+    examples = [block.split("```")[0] for block in text.split("```toml\n")[1:]]
+    (example,) = (each for each in examples if 'format = "locatk-lighthouse-scene"' in each)
     scene = loads_scene(example)
     assert [station.channel for station in scene.stations] == [1]
     assert plain(loads_scene(dumps_scene(scene))) == plain(scene)
