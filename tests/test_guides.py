@@ -254,7 +254,6 @@ FILES: Mapping[str, Callable[[Path, list[str]], None]] = {
     "logic_analyser_capture.sal": _published(
         "lighthouse/benchmarks/demodulation_code/logic_analyser_capture.sal"
     ),
-    "tracker-cal-attempt.rec.gz": _published("lighthouse/libsurvive/tracker-cal-attempt.rec.gz"),
     **{f"RawData_{k}.csv": _published(f"polaris/default/RawData_{k}.csv") for k in range(1, 11)},
 }
 """What a reader has beside what the page makes: name to what puts it into the folder."""

@@ -46,6 +46,7 @@ from locatk.core.drawing.pages import (
     table_pages,
     text_paper,
 )
+from locatk.core.drawing.placement import Obstacles
 from locatk.core.drawing.scale import axes, round_scale, scale_bar
 from locatk.core.drawing.tiles import tile_name
 from locatk.core.errors import InputError
@@ -75,6 +76,9 @@ JOG_MM = 6.0
 
 MEANING_WIDTH_MM = 32.0
 """Width to which meanings are wrapped on the plan."""
+
+LABEL_MARGIN_MM = 0.4
+"""Distance of lines from the box of a label."""
 
 LABEL_DISTANCES_MM = (0.8, 4.0, 8.0, 13.0, 19.0)
 """Distances of a label from its tag that are tried; the label has a line to its tag beyond the
@@ -446,20 +450,31 @@ class _Sheet:
             occupied.append((*low, max(point[0], tip[0]) + 0.8, max(point[1], tip[1]) + 0.8))
         if self.floor.has_datum and self._is_inside(datum := self._on_page(0.0, 0.0)):
             occupied.append((datum[0] - 2, datum[1] - 2, datum[0] + 2, datum[1] + 2))
+        obstacles = Obstacles(
+            mark
+            for index, point, tip in zip(self.block.members, self.points, self.tips, strict=True)
+            for mark in self._draw_tag(index, point, tip)
+        )
         labels = []
         for index, point in zip(self.block.members, self.points, strict=True):
-            label = self._place_label(index, point, reach, np.array(occupied))
+            label = self._place_label(index, point, reach, np.array(occupied), obstacles)
             labels.append(label)
             occupied.append(label.box)
+            obstacles.add(_draw_label(label))
         return labels
 
-    def _place_label(self, index: int, point: Point, reach: float, occupied: Array) -> _Label:
-        """Return the first label that overlaps nothing, otherwise the one that overlaps least."""
+    def _place_label(
+        self, index: int, point: Point, reach: float, occupied: Array, obstacles: Obstacles
+    ) -> _Label:
+        """Return the first label that touches nothing, otherwise the one that overlaps least.
+
+        ``occupied`` (n, 4) are boxes, and ``obstacles`` the tags, labels and leaders in them.
+        """
         best: tuple[float, _Label] | None = None
         for lines in self._label_texts(index):
             for label in _candidates(lines, point, reach):
                 overlap = _overlap(label.box, occupied, (*self.corner, *self.high))
-                if overlap == 0:
+                if overlap == 0 and _is_clear(label, obstacles):
                     # A label without its meaning is complete only if there is none.
                     self.missing += lines != self._label_texts(index)[0]
                     return label
@@ -547,9 +562,9 @@ class _Sheet:
         """Yield the parts of the line of an ordinate that are not under a label."""
         along = 1 - axis
         covered = sorted(
-            (label.box[along], label.box[along + 2])
+            (label.box[along] - LABEL_MARGIN_MM, label.box[along + 2] + LABEL_MARGIN_MM)
             for label in self.labels
-            if label.box[axis] - 0.4 < position < label.box[axis + 2] + 0.4
+            if label.box[axis] - LABEL_MARGIN_MM < position < label.box[axis + 2] + LABEL_MARGIN_MM
         )
         for low, high in (*covered, (end, end)):
             if low > start:
@@ -599,7 +614,10 @@ def _candidates(lines: tuple[str, ...], point: Point, reach: float) -> Iterator[
             )
             leader = None
             if distance > LABEL_DISTANCES_MM[0]:
-                near = (min(max(x, box[0]), box[2]), min(max(y, box[1]), box[3]))
+                near = (
+                    min(max(x, box[0] - LABEL_MARGIN_MM), box[2] + LABEL_MARGIN_MM),
+                    min(max(y, box[1] - LABEL_MARGIN_MM), box[3] + LABEL_MARGIN_MM),
+                )
                 length = math.dist(point, near)
                 start = tuple(
                     a + (b - a) * reach / length for a, b in zip(point, near, strict=True)
@@ -617,8 +635,16 @@ def _overlap(box: Box, occupied: Array, area: Box) -> float:
     return shared + 1e3 * sum(max(0.0, value) for value in excess)
 
 
-def _draw_label(label: _Label) -> list[Mark]:
-    marks: list[Mark] = [] if label.leader is None else [label.leader]
+def _is_clear(label: _Label, obstacles: Obstacles) -> bool:
+    """Return whether the texts of a label and its leader touch nothing."""
+    return not any(
+        obstacles.are_touched_by(mark) if isinstance(mark, Line) else not obstacles.is_free(mark)
+        for mark in _draw_label(label)
+    )
+
+
+def _draw_label(label: _Label) -> list[Line | Text]:
+    marks: list[Line | Text] = [] if label.leader is None else [label.leader]
     left, _, right, top = label.box
     x = {"start": left, "middle": (left + right) / 2, "end": right}[label.anchor]
     step = line_height(TEXT_POINTS)

@@ -31,7 +31,8 @@ from locatk.core.paper_sizes import PAPER_SIZES_MM, paper_size, parse_paper
 from locatk.core.polaris.codec import layout_of
 from locatk.core.polaris.codec.families import generate_family
 from locatk.core.polaris.drawing.cards import draw_tag_cards
-from locatk.core.polaris.tag import Magnet, Tags
+from locatk.core.polaris.drawing.plan import draw_site_plan
+from locatk.core.polaris.tag import Magnet, PlanarPose, Tags
 from locatk.formats.printing import pattern
 from locatk.formats.printing.drawings import render_floor, render_pages
 
@@ -312,8 +313,7 @@ def test_floors_are_legible(floor: FloorMap, paper: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("paper", PAPERS)
-@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize(("paper", "mirror"), [*((paper, False) for paper in PAPERS), ("A4", True)])
 @pytest.mark.parametrize(
     ("tags", "counts"),
     [
@@ -334,6 +334,22 @@ def test_tags_are_legible(tags: Tags, counts: tuple[int, ...], mirror: bool, pap
         assert sum(text.startswith("id ") for text in texts) == count
         angles = " ".join(texts).count("\u00b0")
         assert angles >= count * tags.magnets
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+@pytest.mark.parametrize("count", [1, 4, 60])
+def test_site_plans_are_legible(count: int, paper: str) -> None:
+    ids = generate_family(Tags(), count, 1)
+    rng = np.random.default_rng(count)
+    site = {
+        tag_id: PlanarPose(0.8 * (k % 8), 1.1 * (k // 8), rng.uniform(-np.pi, np.pi))
+        for k, tag_id in enumerate(ids)
+    }
+    meanings = {tag_id: f"station {k}" for k, tag_id in enumerate(ids) if k % 3 == 0}
+    tags = replace(Tags(), site=site, meanings=meanings)
+    plan = draw_site_plan(tags, "hall", PAPER_SIZES_MM[paper])
+    texts = check(render_pages(plan.pages, "test"))
+    assert {str(tag_id) for tag_id in ids} <= {word for text in texts for word in text.split()}
 
 
 @pytest.mark.parametrize("paper", ["A4", "Letter"])
