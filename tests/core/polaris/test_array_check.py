@@ -200,6 +200,32 @@ def test_two_sensors_that_disagree_are_both_doubtful():
     assert any("which of the two sensors is right" in text for text in check.untested)
 
 
+def test_sensors_with_few_readings_do_not_hinder_the_others():
+    field = _recording()
+    field[:540, 1] = np.nan
+    field[400:, 2] = np.nan
+    field[:, 5, 0] *= -1
+    check = _check(field)
+    assert _codes(check) == [(1, "readings_missing"), (2, "readings_missing"), (5, "axis_inverted")]
+
+
+def test_gains_are_relative_to_the_median_of_all_sensors():
+    """One of the three is not among those that agree, but its gain counts."""
+    field = _recording(3)
+    field[:, 1] = field[:, 1, [1, 0, 2]]
+    field[:, 2] *= 0.5
+    check = _check(field)
+    assert _codes(check) == [(1, "axes_exchanged"), (2, "gain")]
+    assert check.sensors[2].gain == pytest.approx(0.5, rel=0.05)
+
+
+def test_magnets_all_the_time_are_refused():
+    field = _recording(magnet_at=None)
+    field[::40, 4] += 1e-3
+    with pytest.raises(InputError, match="a magnet or iron moves near bar"):
+        _check(field)
+
+
 def test_short_recordings_are_refused():
     with pytest.raises(InputError, match="the check needs at least"):
         _check(_recording()[:20])
