@@ -15,14 +15,14 @@ from typing import TypeVar
 T = TypeVar("T")
 
 Observer = Callable[[str, int, int], None]
-"""Takes the name of the items, the number of those that are done, and their total."""
+"""Takes the name of the items (as in ``"frames"``), how many are done, and their total."""
 
 _observer: ContextVar[Observer | None] = ContextVar("observer", default=None)
 
 
 @contextlib.contextmanager
 def observed(observer: Observer) -> Iterator[None]:
-    """Call ``observer`` with the progress of computations in this context."""
+    """Return a context manager; ``observer`` is called with the progress of computations in it."""
     token = _observer.set(observer)
     try:
         yield
@@ -38,7 +38,10 @@ def report(items: str, done: int, total: int) -> None:
 
 
 def track(sequence: Sequence[T], items: str) -> Iterator[T]:
-    """Yield the elements of a sequence, and report each that is done."""
+    """Yield the elements of a sequence.
+
+    Reports how many ``items`` are done before each element, and after the last one.
+    """
     for done, element in enumerate(sequence):
         report(items, done, len(sequence))
         yield element

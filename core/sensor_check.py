@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-Figures = TypeVar("Figures")
-"""Figures of one sensor."""
+FiguresT = TypeVar("FiguresT")
+"""Class with the figures of one sensor."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class SensorFault:
 
 
 @dataclass(frozen=True)
-class SensorCheck(Generic[Figures]):
+class SensorCheck(Generic[FiguresT]):
     """Result of a check.
 
     Attributes
@@ -37,12 +37,12 @@ class SensorCheck(Generic[Figures]):
     sensors : tuple
         Figures of each sensor.
     faults : tuple of SensorFault
-        Those of all sensors first, then by sensor.
+        First those that concern all sensors, then by sensor.
     untested : tuple of str
         What the recording does not show, with the remedy.
     """
 
-    sensors: tuple[Figures, ...]
+    sensors: tuple[FiguresT, ...]
     faults: tuple[SensorFault, ...]
     untested: tuple[str, ...]
 

@@ -184,11 +184,13 @@ def sensor_test(test: Any) -> str:
     check = test.check
     header, rows = _SENSOR_TABLES[test.system](check)
     rows = [(name, *row) for name, row in zip(test.names, rows, strict=True)]
-    lines = [f"Test of {test.device}:", console.table(("sensor", *header), rows)]
+    lines = [f"Test of {test.device}:"]
+    if rows:
+        lines.append(console.table(("sensor", *header), rows))
     for fault in check.faults:
         name = "all sensors" if fault.sensor is None else test.names[fault.sensor]
         lines.append(console.wrapped(f"FAULT  {name}: {fault.message}", indent=7))
-    if not check.faults:
+    if rows and not check.faults:
         lines.append("No fault was found.")
     lines += [console.wrapped(f"not tested: {text}", indent=12) for text in check.untested]
     return "\n".join(lines)
@@ -200,7 +202,7 @@ def _array_table(check: Any) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
             _figure(each.gain, 1, "{:.2f}"),
             _figure(each.offset_t, 1e6, "{:.0f}"),
             _figure(each.noise_t, 1e6, "{:.2f}"),
-            " ".join(("-" if axis < 0 else "") + "xyz"[abs(axis) - 1] for axis in each.axes) or "-",
+            " ".join(("-" if axis < 0 else "") + "?xyz"[abs(axis)] for axis in each.axes) or "-",
         )
         for each in check.sensors
     ]

@@ -27,23 +27,24 @@ DESCENDER_EM = 0.22
 DESCENDING_LETTERS = frozenset("gjpqyQ,;()[]{}|_/@$")
 """Characters that extend below the baseline."""
 
-MAX_CAPITAL_WIDTH_EM = 0.78
+CAPITAL_WIDTH_EM = 0.78
 """Width of the capitals of bold Helvetica, except M and W, as a fraction of the font size."""
 
 TEXT_CLEARANCE_MM = 0.3
 """Smallest distance of a text from a line or from another text."""
 
-CIRCLE_CHORDS = 24
-"""Number of chords that approximate a circle."""
+MAX_CHORD_ERROR_MM = 0.05
+"""Largest distance of a circle from the chords that approximate it."""
+
+MIN_CIRCLE_CHORDS = 24
+"""Least number of chords of a circle."""
 
 
 def text_box(text: Text) -> Box:
     """Return the box around a text whose angle is a multiple of 90 degrees."""
     em = text.points * MM_PER_POINT
     # Single capitals can be wider than the mean letter of a text.
-    width = max(
-        text_width(text.text, text.points), min(2, len(text.text)) * MAX_CAPITAL_WIDTH_EM * em
-    )
+    width = max(text_width(text.text, text.points), min(2, len(text.text)) * CAPITAL_WIDTH_EM * em)
     depth = DESCENDER_EM * em if DESCENDING_LETTERS & set(text.text) else 0.0
     start = -{"start": 0.0, "middle": 0.5, "end": 1.0}[text.anchor] * width
     c, s = (round(f(math.radians(text.angle_deg))) for f in (math.cos, math.sin))
@@ -149,7 +150,9 @@ def _strokes(mark: Mark) -> list[tuple[float, float, float, float, float]]:
     if isinstance(mark, Line):
         return [(*mark.start, *mark.end, half)]
     if isinstance(mark, Circle):
-        angles = np.linspace(0, 2 * np.pi, CIRCLE_CHORDS, endpoint=False)
+        relative = min(1.0, MAX_CHORD_ERROR_MM / max(mark.radius_mm, MAX_CHORD_ERROR_MM))
+        chords = max(MIN_CIRCLE_CHORDS, math.ceil(math.pi / math.acos(1 - relative)))
+        angles = np.linspace(0, 2 * np.pi, chords, endpoint=False)
         corners = [
             (mark.centre[0] + mark.radius_mm * c, mark.centre[1] + mark.radius_mm * s)
             for c, s in zip(np.cos(angles).tolist(), np.sin(angles).tolist(), strict=True)

@@ -51,11 +51,13 @@ class HallFigures:
     zero_t : float
         Reading without a magnet [T].
     noise_t : float
-        Standard deviation of a reading [T].
+        Standard deviation of a reading, at least
+        :data:`~locatk.core.landmarks.preprocessing.MIN_NOISE_T` [T].
     response_t : float
-        Largest change below which the magnet was, with its sign [T].
+        Strongest change of the reading while the magnet passes, with its sign [T].
     response_s : float
-        Time of that change since the first sample [s].
+        Middle of the time in which the change is first near its strongest, since the first
+        sample [s].
     """
 
     zero_t: float
@@ -117,10 +119,15 @@ def _measure(time_ns: NDArray[np.int64], field_t: Array) -> HallFigures:
     # The difference of two readings has twice the variance of one.
     noise = max(robust_sigma(np.diff(valid)) / np.sqrt(2), MIN_NOISE_T)
     change = np.where(is_valid, field_t - zero, 0.0)
-    peak = np.flatnonzero(np.abs(change) >= PEAK_FRACTION * np.abs(change).max())
+    is_peak = np.abs(change) >= PEAK_FRACTION * np.abs(change).max()
+    # The magnet may pass again on its way back.
+    first = int(np.argmax(is_peak))
+    last = first + int(np.argmin(np.append(is_peak[first:], False)))
     strongest = int(np.argmax(np.abs(change)))
     elapsed_s = (time_ns - time_ns[0]) * 1e-9
-    return HallFigures(zero, noise, float(change[strongest]), float(np.median(elapsed_s[peak])))
+    return HallFigures(
+        zero, noise, float(change[strongest]), float(np.median(elapsed_s[first:last]))
+    )
 
 
 def _dead_sensor(sensor: int, field_t: Array) -> SensorFault | None:
@@ -166,6 +173,7 @@ def _response_faults(
     response_t = np.array([each.response_t for each in figures])
     typical_t = np.median(np.abs(response_t[responds]))
     is_inverted = response_t < 0
+    are_most_inverted = 2 * np.count_nonzero(is_inverted & responds) > np.count_nonzero(responds)
     for sensor in np.flatnonzero(~is_dead):
         fraction = abs(response_t[sensor]) / typical_t
         if not responds[sensor]:
@@ -174,12 +182,12 @@ def _response_faults(
         if fraction < MIN_RESPONSE_FRACTION:
             message = f"{fraction:.2f} times the response of the others: check its gain"
             faults.append(SensorFault(int(sensor), "weak", message))
-        if is_inverted[sensor] and not is_inverted[responds].all():
-            message = "inverted: the field of the magnet points down, that of others up"
+        if is_inverted[sensor] != are_most_inverted:
+            message = "inverted: its response has another sign than that of most others"
             faults.append(SensorFault(int(sensor), "inverted", message))
-    if is_inverted[responds].all():
+    if are_most_inverted:
         message = (
-            "the field points down in all of them: the north side of the magnet was down, or all "
+            "the field points down in most of them: the north side of the magnet was down, or they "
             "are inverted"
         )
         faults.append(SensorFault(None, "inverted", message))

@@ -36,13 +36,13 @@ MIN_PARALLEL_COSINE = 0.9
 """Cosine between normals of photodiodes from which they face in the same direction."""
 
 MAX_WINDOWS = 20
-"""Number of rotations at which the order of the photodiodes is tested."""
+"""Largest number of rotations of each station at which the order of the photodiodes is tested."""
 
 MAX_COMPARED_WINDOWS = 8
-"""Number of them for which other orders are tried: many photodiodes have many pairs."""
+"""Largest number of rotations for which other orders are tried: photodiodes have many pairs."""
 
 MIN_WINDOWS = 5
-"""Least number of them for a result."""
+"""Least number of rotations for a result."""
 
 MIN_MISFIT = 4e-4
 """Residual in tangents of angles above which the order may be wrong. The recorded tracker of
@@ -58,6 +58,12 @@ class PhotodiodeFigures:
 
     sweeps: int
     channels: tuple[int, ...]
+
+
+def count_photodiodes(sweeps: Sweeps, device: int, receiver: Receiver | None) -> int:
+    """Return the number of photodiodes of a receiver, or of those that have sweeps if it is more."""
+    received = int(sweeps.sensor[sweeps.device == device].max(initial=0)) + 1
+    return received if receiver is None else max(len(receiver), received)
 
 
 def check_receiver(
@@ -76,11 +82,10 @@ def check_receiver(
     Raises
     ------
     DegenerateError
-        No sweep of the device has a valid channel.
+        A receiver is given, and no sweep of the device has a valid channel.
     """
     own = sweeps.take(sweeps.device == device)
-    received = int(own.sensor.max(initial=0)) + 1
-    count = received if receiver is None else max(len(receiver), received)
+    count = count_photodiodes(sweeps, device, receiver)
     numbers = np.bincount(own.sensor[own.sensor >= 0], minlength=count)
     figures = tuple(
         PhotodiodeFigures(
@@ -89,12 +94,12 @@ def check_receiver(
         )
         for sensor in range(count)
     )
-    faults, untested = _light_faults(numbers, receiver), []
+    faults, untested = _light_faults(numbers, receiver)
     if receiver is None:
         untested.append("photodiodes without light, and their order: attach receiver.toml")
     else:
-        if received > len(receiver):
-            message = f"sweeps of {received} photodiodes, but the receiver has {len(receiver)}"
+        if count > len(receiver):
+            message = f"sweeps of {count} photodiodes, but the receiver has {len(receiver)}"
             faults.append(SensorFault(None, "unknown_photodiodes", message))
         order = _order_faults(sweeps, device, receiver)
         if order is None:
@@ -106,22 +111,29 @@ def check_receiver(
     return SensorCheck(figures, by_sensor(faults), tuple(untested))
 
 
-def _light_faults(numbers: NDArray[np.int64], receiver: Receiver | None) -> list[SensorFault]:
-    """Return the photodiodes with no sweeps, or with far fewer (k,) than the best one.
+def _light_faults(
+    numbers: NDArray[np.int64], receiver: Receiver | None
+) -> tuple[list[SensorFault], list[str]]:
+    """Return the photodiodes without sweeps or with far fewer (k,) than the best one.
 
-    Those that face in other directions than the others may receive fewer.
+    If they face in different directions, nothing is wrong with those that receive less; the second
+    result then names those without sweeps.
     """
     normal = None if receiver is None else receiver.normal
     is_parallel = normal is None or bool(np.all(normal @ normal[0] > MIN_PARALLEL_COSINE))
+    if not is_parallel:
+        dark = ", ".join(str(sensor) for sensor in np.flatnonzero(numbers == 0))
+        text = f"photodiodes without light ({dark}): turn them to a station"
+        return [], [text] if dark else []
     faults = []
     for sensor, number in enumerate(numbers.tolist()):
         fraction = number / max(int(numbers.max()), 1)
         if number == 0:
             faults.append(SensorFault(sensor, "no_sweeps", "receives no light"))
-        elif fraction < MIN_SWEEPS_FRACTION and is_parallel:
+        elif fraction < MIN_SWEEPS_FRACTION:
             message = f"receives {100 * fraction:.0f} % of the sweeps of the best one"
             faults.append(SensorFault(sensor, "few_sweeps", message))
-    return faults
+    return faults, []
 
 
 def _order_faults(sweeps: Sweeps, device: int, receiver: Receiver) -> list[SensorFault] | None:
@@ -155,13 +167,13 @@ def _order_faults(sweeps: Sweeps, device: int, receiver: Receiver) -> list[Senso
 
 
 def _rotations(sweeps: DeviceSweeps, channels: list[int], sensors: int) -> list[Array]:
-    """Return the angles (k, 2) of rotations in which four photodiodes have both planes."""
+    """Return the angles (k, 2) of rotations in which at least four photodiodes have both planes."""
     angles = []
     interval_ns = rotation_limits_ns(channels)[1]
     for station in range(len(channels)):
         own = sweeps.take(sweeps.station == station)
         windows = make_windows(own, interval_ns, interval_ns // 2)
-        step = max(1, len(windows) // MAX_WINDOWS)
+        step = -(-len(windows) // MAX_WINDOWS) or 1
         for rows in windows.sweep[::step]:
             mean = mean_angles(own.take(rows[rows >= 0]), sensors)
             if np.isfinite(mean).all(axis=1).sum() >= 4:

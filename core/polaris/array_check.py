@@ -34,7 +34,7 @@ MAX_MISSING_FRACTION = 0.05
 """Fraction of missing or saturated readings above which a sensor has a fault."""
 
 MAX_EXCLUDED_FRACTION = 0.5
-"""The same above which a sensor is not compared with the others."""
+"""Fraction of missing or saturated readings above which a sensor is not compared with others."""
 
 MAGNET_QUANTILE, MIN_MAGNET_RATIO = 0.75, 4.0
 """A magnet is near if a reading is further from the median of its sensor than this multiple of that
@@ -44,19 +44,16 @@ MIN_MAGNET_T = 1.75e-4
 """Least distance of a reading near a magnet from the median of its sensor [T]: more than twice the
 strongest field on Earth."""
 
-MIN_TURN_SIGMAS = 10.0
-"""Standard deviation of the field along an axis, in those of the noise, from which the array was
-turned about the other axes."""
+MIN_TURN_SIGMAS, MIN_TURN_T = 10.0, 5e-6
+"""Least standard deviation of the field along the axis that changes most, in standard deviations of
+the noise and in tesla (a quarter of the weakest field on Earth), of an array that was turned."""
 
 MIN_TURN_FRACTION = 0.2
-"""The same as a fraction of the axis with the largest standard deviation."""
+"""Standard deviation of the field along an axis, relative to that of the axis that changes most,
+below which the gain along it is unknown."""
 
-MIN_TURN_T = 5e-6
-"""The same in tesla: a quarter of the weakest field on Earth."""
-
-MIN_AXIS_FRACTION = 0.05
-"""Standard deviation of one axis, relative to that of the same axis of the others, below which it
-does not work."""
+MIN_AXIS_GAIN = 0.05
+"""Gain of an axis, relative to the median of all, below which it does not work."""
 
 MIN_CORRELATION = 0.9
 """Mean correlation of the axes of two sensors from which they agree."""
@@ -67,6 +64,9 @@ within a few percent; settings differ by 20 % or more (MLX90393 data sheet, tabl
 
 MAGNET_MARGIN_S = 1.0
 """Time before and after a magnet is near during which its field may disturb the comparison [s]."""
+
+MAX_MAGNET_PAUSE_S = 0.5
+"""Longest time between two samples near a magnet that belong to the same approach [s]."""
 
 MAX_TILT_RAD = np.deg2rad(10.0)
 """Rotation of a sensor, beyond exchanged axes, above which it is a fault: chips are soldered to a
@@ -101,7 +101,7 @@ class MagnetometerFigures:
         Largest standard deviation of the noise of its axes [T].
     axes : tuple of int
         Axis of the array (1, 2, 3 for x, y, z) that each axis of the sensor measures, negative if
-        it is inverted; empty if unknown.
+        it is inverted, 0 if unknown; empty if none is known.
     """
 
     gain: float
@@ -134,7 +134,7 @@ def check_array(samples: Samples) -> ArrayCheck:
     Raises
     ------
     InputError
-        There are fewer than :data:`MIN_SAMPLES` samples.
+        There are fewer than :data:`MIN_SAMPLES` samples, in total or without a magnet nearby.
     """
     field_t = samples.field_t
     n, count, _ = field_t.shape
@@ -156,28 +156,36 @@ def check_array(samples: Samples) -> ArrayCheck:
     # A magnet may saturate the sensor to which it is held.
     missing = 1 - np.isfinite(field_t[is_undisturbed]).all(axis=2).mean(axis=0)
     faults += _missing_readings(missing, ~is_dead)
-    is_dead |= missing > MAX_EXCLUDED_FRACTION
+    is_excluded = is_dead | (missing > MAX_EXCLUDED_FRACTION)
     untested: list[str] = []
-    if is_dead.all():
-        return ArrayCheck(_figures(noise_t, is_dead), tuple(faults), (), float("nan"))
+    if is_excluded.all():
+        untested.append("axes, gains and order: no sensor has enough readings")
+        figures = _figures(noise_t, is_excluded)
+        return ArrayCheck(figures, by_sensor(faults), tuple(untested), float("nan"))
     turned = field_t[is_undisturbed]
-    spread_t = np.nanstd(turned[:, ~is_dead], axis=0)
-    if not _is_turned(spread_t, noise_t[~is_dead]):
+    turned = turned[np.isfinite(turned[:, ~is_excluded]).all(axis=(1, 2))]
+    turn = None
+    if len(turned) < MIN_SAMPLES:
+        untested.append("axes and gains: too few samples have the readings of all sensors")
+    elif not _is_turned(turned[:, ~is_excluded].std(axis=0), noise_t[~is_excluded]):
         untested.append("axes and gains: the array was not turned; turn it about all its axes")
-        turn = None
     else:
-        turn = _compare(turned, is_dead)
+        turn = _compare(turned, is_excluded)
         faults += turn.faults
         untested += turn.untested
-    order = _order_fault(deviation_t, is_near, missing > MAX_MISSING_FRACTION, is_dead)
-    if order is None and count > 1:
+    approach = _first_approach(samples.time_ns, is_near)
+    if count > 1 and is_excluded[0]:
+        untested.append("order of the sensors: sensor 1 has no readings")
+    elif count > 1 and not len(approach):
         untested.append(
             "order of the sensors: no magnet was held to sensor 1 after the array was turned"
         )
-    faults += order or []
+    elif count > 1:
+        is_incomplete = missing > MAX_MISSING_FRACTION
+        faults += _order_faults(deviation_t[approach], is_incomplete, is_excluded)
     gain = np.ones(count) if turn is None else np.nan_to_num(turn.gain, nan=1.0)
-    faults += _noisy_sensors(noise_t / np.maximum(gain, MIN_AXIS_FRACTION)[:, None], ~is_dead)
-    figures = _figures(noise_t, is_dead, turn)
+    faults += _noisy_sensors(noise_t / np.maximum(gain, MIN_AXIS_GAIN)[:, None], ~is_excluded)
+    figures = _figures(noise_t, is_excluded, turn)
     field = float("nan") if turn is None else turn.magnitude_t
     return ArrayCheck(figures, by_sensor(faults), tuple(untested), field)
 
@@ -275,13 +283,18 @@ def _is_turned(spread_t: Array, noise_t: Array) -> bool:
     return bool(typical.max() > max(MIN_TURN_SIGMAS * np.median(noise_t), MIN_TURN_T))
 
 
-def _compare(turned_t: Array, is_dead: Mask) -> _Comparison:
-    """Compare the sensors of a turned array with the field that most of them agree on."""
-    is_complete = np.isfinite(turned_t[:, ~is_dead]).all(axis=(1, 2))
-    centred = turned_t[is_complete] - _nanmedian(turned_t[is_complete])
-    working = np.flatnonzero(~is_dead)
-    agreeing = _largest_agreement(centred, working)
-    reference = np.median(centred[:, agreeing], axis=1)
+def _compare(turned_t: Array, is_excluded: Mask) -> _Comparison:
+    """Compare the sensors of a turned array with the field that most of them agree on.
+
+    The samples (n, N, 3) are complete, except for excluded sensors. Two sensors that agree are not
+    averaged, which would halve their difference.
+    """
+    medians = _nanmedian(turned_t)
+    centred = turned_t - medians
+    working = np.flatnonzero(~is_excluded)
+    best, agreeing = _largest_agreement(centred, working)
+    is_averaged = len(agreeing) > 2
+    reference = np.median(centred[:, agreeing], axis=1) if is_averaged else centred[:, best]
     reference_spread = reference.std(axis=0)
     is_observed = reference_spread > MIN_TURN_FRACTION * reference_spread.max()
     count = turned_t.shape[1]
@@ -290,8 +303,9 @@ def _compare(turned_t: Array, is_dead: Mask) -> _Comparison:
     faults, untested = [], []
     matrices = {int(i): _linear_map(centred[:, i], reference, is_observed) for i in working}
     permutations = {i: _signed_permutation(matrix) for i, matrix in matrices.items()}
-    axis_gains = {i: _axis_gains(matrices[i], permutations[i]) for i in matrices}
-    median_gain = np.nanmedian(list(axis_gains.values()))
+    axis_gains = {i: _axis_gains(matrix, is_observed) for i, matrix in matrices.items()}
+    # The median of two gains is in the middle of them.
+    median_gain = np.nanmedian(list(axis_gains.values())) if len(working) > 2 else 1.0
     rms = np.sqrt(np.mean(np.sum(reference**2, axis=1)))
     disturbances = []
     for i, matrix in matrices.items():
@@ -301,8 +315,12 @@ def _compare(turned_t: Array, is_dead: Mask) -> _Comparison:
         faults += _axis_faults(i, matrix, permutations[i], gains, is_observed)
         residual = centred[:, i] - reference @ matrix.T
         disturbances.append(np.sqrt(np.mean(np.sum(residual**2, axis=1))) / rms)
-    if len(working) == 2 and len(agreeing) == 1:
-        untested.append("which of the two sensors is right: compare them with a third one")
+    is_majority = 2 * len(agreeing) > len(working) and len(working) != 2
+    if faults and len(working) > 1 and not is_majority:
+        untested.append(
+            "which sensors are right: they were compared with "
+            f"sensor {best + 1}, and no more than half of them agree"
+        )
     if np.median(disturbances) > MAX_DISTURBANCE:
         message = (
             f"their fields differ by {100 * np.median(disturbances):.0f} % while the array is "
@@ -312,10 +330,7 @@ def _compare(turned_t: Array, is_dead: Mask) -> _Comparison:
     magnitude = float("nan")
     if is_observed.all():
         centre, magnitude = _fit_sphere(reference)
-        offset[working] = [
-            np.linalg.norm(_nanmedian(turned_t[is_complete])[i] + matrices[int(i)] @ centre)
-            for i in working
-        ]
+        offset[working] = [np.linalg.norm(medians[i] + matrices[int(i)] @ centre) for i in working]
         faults += _field_fault(magnitude)
     else:
         names = " and ".join("xyz"[axis] for axis in np.flatnonzero(~is_observed))
@@ -327,8 +342,8 @@ def _compare(turned_t: Array, is_dead: Mask) -> _Comparison:
     return _Comparison(gain, offset, axes, magnitude, faults, untested)
 
 
-def _largest_agreement(centred: Array, working: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the sensors that agree with the one that agrees with most."""
+def _largest_agreement(centred: Array, working: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
+    """Return the sensor that agrees with most others, and all that agree with it."""
     scaled = centred[:, working]
     norm = np.sqrt(np.einsum("tia,tia->i", scaled, scaled))
     correlation = np.einsum("tia,tja->ij", scaled, scaled) / np.maximum(
@@ -336,7 +351,7 @@ def _largest_agreement(centred: Array, working: NDArray[np.int64]) -> NDArray[np
     )
     agrees = correlation > MIN_CORRELATION
     best = int(np.argmax(agrees.sum(axis=1)))
-    return np.asarray(working[agrees[best] | (np.arange(len(working)) == best)])
+    return int(working[best]), np.asarray(working[agrees[best]])
 
 
 def _linear_map(centred: Array, reference: Array, is_observed: Mask) -> Array:
@@ -352,27 +367,27 @@ def _linear_map(centred: Array, reference: Array, is_observed: Mask) -> Array:
 
 
 def _signed_permutation(matrix: Array) -> tuple[int, ...]:
-    """Return the axis (1, 2, 3) that each row measures, negative if inverted."""
+    """Return the axis (1, 2, 3) that each row measures, negative if inverted, 0 if unknown."""
     size = np.abs(matrix)
+    size[size < MIN_AXIS_GAIN * size.max()] = 0.0
     best = max(
         itertools.permutations(range(3)),
         # Rows without a signal keep their own axis.
-        key=lambda order: (
-            round(float(size[range(3), order].sum() / size.max()), 2),
-            order == (0, 1, 2),
-        ),
+        key=lambda order: (float(size[range(3), order].sum()), order == (0, 1, 2)),
     )
     return tuple(
-        -(axis + 1) if matrix[row, axis] < 0 else axis + 1 for row, axis in enumerate(best)
+        int(np.sign(matrix[row, axis])) * (axis + 1) if size[row, axis] else 0
+        for row, axis in enumerate(best)
     )
 
 
-def _axis_gains(matrix: Array, permutation: tuple[int, ...]) -> Array:
+def _axis_gains(matrix: Array, is_observed: Mask) -> Array:
     """Return the gain (3,) of each axis of a sensor; ``nan`` for those that were not observed."""
-    columns = [abs(axis) - 1 for axis in permutation]
-    is_observed = np.asarray(matrix.any(axis=0))
     gains = np.linalg.norm(matrix, axis=1)
-    return np.where(is_observed[columns], gains, np.nan)
+    if is_observed.all():
+        return np.asarray(gains)
+    # The axes without a signal may be those that were not observed.
+    return np.where(gains < MIN_AXIS_GAIN * gains.max(), np.nan, gains)
 
 
 def _axis_faults(
@@ -384,13 +399,13 @@ def _axis_faults(
 ) -> list[SensorFault]:
     """Return the faults of a sensor's axes and gains."""
     faults = []
-    is_weak = gains < MIN_AXIS_FRACTION
+    is_weak = gains < MIN_AXIS_GAIN
     for axis in np.flatnonzero(is_weak):
         message = f"its {'xyz'[axis]} axis does not change with the field"
         faults.append(SensorFault(sensor, "axis_dead", message))
     if is_weak.any():
         return faults
-    if permutation != (1, 2, 3):
+    if any(axis not in (0, row + 1) for row, axis in enumerate(permutation)):
         faults.append(SensorFault(sensor, *_axes_phrase(permutation)))
     elif is_observed.all():
         tilt = _tilt(matrix)
@@ -416,13 +431,13 @@ def _axis_faults(
 
 def _axes_phrase(permutation: tuple[int, ...]) -> tuple[str, str]:
     """Return the code and the phrase for exchanged or inverted axes."""
-    order = [abs(axis) - 1 for axis in permutation]
+    is_in_order = all(abs(axis) in (0, row + 1) for row, axis in enumerate(permutation))
     inverted = ["xyz"[row] for row, axis in enumerate(permutation) if axis < 0]
-    if order == [0, 1, 2]:
+    if is_in_order:
         plural = len(inverted) > 1
         names = " and ".join(filter(None, [", ".join(inverted[:-1]), inverted[-1]]))
         return "axis_inverted", f"{names} {'are' if plural else 'is'} inverted"
-    measured = ", ".join(("-" if axis < 0 else "") + "xyz"[abs(axis) - 1] for axis in permutation)
+    measured = ", ".join(("-" if axis < 0 else "") + "?xyz"[abs(axis)] for axis in permutation)
     return "axes_exchanged", f"axes exchanged: its x, y, z measure {measured} of the others"
 
 
@@ -454,34 +469,33 @@ def _field_fault(magnitude_t: float) -> list[SensorFault]:
     return [SensorFault(None, "field_implausible", message)]
 
 
-def _order_fault(
-    deviation_t: Array, is_near: Mask, is_incomplete: Mask, is_dead: Mask
-) -> list[SensorFault] | None:
-    """Return a fault if the first sensor to which a magnet was held is not sensor 0.
-
-    None if no magnet was held to the array, or sensor 0 is dead.
-    """
+def _first_approach(time_ns: NDArray[np.int64], is_near: Mask) -> NDArray[np.int64]:
+    """Return the samples of the first approach of a magnet, none if there is no approach."""
     indices = np.flatnonzero(is_near)
-    if len(indices) < 2 or is_dead[0] or len(is_dead) < 2:
-        return None
-    gaps = np.flatnonzero(np.diff(indices) > len(is_near) // 20)
-    first = indices[: gaps[0] + 1] if len(gaps) else indices
+    pauses = np.flatnonzero(np.diff(time_ns[indices]) > MAX_MAGNET_PAUSE_S * 1e9)
+    first = indices[: pauses[0] + 1] if len(pauses) else indices
+    return first if len(first) > 1 else indices[:0]
+
+
+def _order_faults(deviation_t: Array, is_incomplete: Mask, is_excluded: Mask) -> list[SensorFault]:
+    """Return a fault if a magnet was held to another sensor than the first.
+
+    ``deviation_t`` (m, N) are those of the approach of the magnet.
+    """
     # A sensor that is complete otherwise lacks its readings near the magnet if it is saturated.
     saturated = np.where(is_incomplete, 0.0, np.inf)
-    field = np.where(np.isfinite(deviation_t[first]), deviation_t[first], saturated)
-    field[:, is_dead] = 0.0
+    field = np.where(np.isfinite(deviation_t), deviation_t, saturated)
+    field[:, is_excluded] = 0.0
     nearest = int(np.argmax(field.max(axis=0)))
     if nearest == 0:
         return []
-    reversed_order = " The order is reversed." if nearest == len(is_dead) - 1 else ""
-    message = (
-        f"a magnet was held to sensor 1, but sensor {nearest + 1} was nearest.{reversed_order}"
-    )
+    reversal = " (the order may be reversed)" if nearest == len(is_excluded) - 1 else ""
+    message = f"the magnet was nearest to sensor {nearest + 1} instead of sensor 1{reversal}"
     return [SensorFault(None, "order", message)]
 
 
 def _figures(
-    noise_t: Array, is_dead: Mask, turn: _Comparison | None = None
+    noise_t: Array, is_excluded: Mask, turn: _Comparison | None = None
 ) -> tuple[MagnetometerFigures, ...]:
     """Return the figures of all sensors."""
     unknown = float("nan")
@@ -489,7 +503,7 @@ def _figures(
         MagnetometerFigures(
             unknown if turn is None else float(turn.gain[i]),
             unknown if turn is None else float(turn.offset_t[i]),
-            unknown if is_dead[i] else float(noise_t[i].max()),
+            unknown if is_excluded[i] else float(noise_t[i].max()),
             () if turn is None else turn.axes[i],
         )
         for i in range(len(noise_t))

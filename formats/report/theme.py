@@ -4,9 +4,9 @@ The page uses them as variables of CSS, which follow ``prefers-color-scheme``. D
 the light colors; in dark mode, the script of the page replaces each by its counterpart in
 :data:`DARK_COLORS` before plotly draws them. Paper and pictures are always light.
 
-Text has a contrast of at least 4.5 to 1, lines and marks at least 3 to 1 (WCAG 2.2, success
-criteria 1.4.3 and 1.4.11), in both modes; only grids, frames of boxes and shaded areas have less,
-because nothing depends on them.
+Text has a contrast of at least 4.5 to 1, lines and marks of diagrams at least 3 to 1 against the
+card that they are on (WCAG 2.2, success criteria 1.4.3 and 1.4.11), in both modes; only grids,
+rules, frames of boxes and shaded areas have less, because nothing depends on them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PAGE_COLORS = {
 CARD, INK, MUTED, CONTROL, GRID = (
     PAGE_COLORS[name][0] for name in ("card", "ink", "muted", "control", "grid")
 )
-"""Background, text, text of minor importance, axes and grid lines of diagrams, in light mode."""
+"""Background, text, text of minor importance, axes and ticks, and grid lines, in light mode."""
 
 TRANSPARENT = "rgba(0,0,0,0)"
 
@@ -44,7 +44,7 @@ UNSOLVED_DEVICE = MUTED
 """Color of a device in the evaluation that is not in the solution."""
 
 FIELD_SCALE = [[0.0, CARD], [1.0, "#000000"]]
-"""Color scale of magnitudes: none is the background of the page."""
+"""Color scale of magnitudes; zero has the background of a card."""
 
 DARK_DEVICE_COLORS = (
     "#4BA3E3", "#F07A2B", "#1DB386", "#DB8FBC", "#9AD8FB", "#F5C242", "#B06FCB",
@@ -59,13 +59,13 @@ CSS_COLORS = PAGE_COLORS | {
 }
 """Light and dark color of all variables of CSS."""
 
-MAX_SENSOR_SHADES = 32
+SENSOR_SHADE_COUNT = 32
 """Number of shades of sensors in a row; more sensors share shades."""
 
 
 def _sensor_shades(anchors: tuple[str, ...]) -> tuple[str, ...]:
     """Return shades between the anchors (``"#rrggbb"``)."""
-    positions = [k / (MAX_SENSOR_SHADES - 1) for k in range(MAX_SENSOR_SHADES)]
+    positions = [k / (SENSOR_SHADE_COUNT - 1) for k in range(SENSOR_SHADE_COUNT)]
     channels = sample_colorscale(list(anchors), positions, colortype="tuple")
     return tuple("#" + "".join(f"{round(255 * c):02x}" for c in shade) for shade in channels)
 
@@ -95,4 +95,4 @@ DARK_COLORS = {
         (shapes.WALL.color, "#b4bcc4"),
     )
 }
-"""Dark counterpart of each color of a diagram, all in small letters."""
+"""Dark counterpart of each color of a diagram, in lowercase."""

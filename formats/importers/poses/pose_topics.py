@@ -56,7 +56,7 @@ MessageSource = Callable[[Collection[Topic]], Iterator[tuple[Topic, int, bytes]]
 """Function that yields (topic, log time in ns, payload) of the messages of topics."""
 
 Decoder = Callable[[Topic], Callable[[bytes], Any]]
-"""Function that returns the decoder of the messages of a topic. It raises ValueError."""
+"""Function that returns the decoder of the messages of a topic, which raises ValueError."""
 
 
 class PoseSample(NamedTuple):
@@ -172,8 +172,6 @@ PATH_TYPE = "nav_msgs/msg/Path"
 
 SAME_TIME_TYPE = "foxglove.PosesInFrame"
 """Type of messages with several poses of a single time."""
-
-POINT_TYPE = "geometry_msgs/msg/PointStamped"
 
 
 # ---- reading
@@ -321,7 +319,7 @@ class _Series:
             np.where(is_rounded, quaternion / length, quaternion),
             unknown_covariance(len(rows)),
         )
-        if self.topic.type == POINT_TYPE or len(self.covariance) != 36 * n:
+        if len(self.covariance) != 36 * n:
             return trajectory
         covariance = np.array(self.covariance, np.float64).reshape(n, 6, 6)[rows]
         return replace(trajectory, covariance=observed_covariance(covariance))

@@ -123,6 +123,14 @@ def test_the_recording_is_kept_on_request(check: Any, tmp_path: Path) -> None:
     assert Session.open(tmp_path / "kept.mcap").topics("/halls/")
 
 
+def test_a_device_that_cannot_be_checked_is_untested(check: Any) -> None:
+    values = np.column_stack([_turned_array().reshape(600, 9), np.full((600, 4), np.nan)])
+    values[:20, 9:] = 0.1
+    result = check(ARRAY_NAMES + HALL_NAMES, values)
+    assert "No fault was found." in result.stdout
+    assert "not tested: all of it: 20 samples of robot" in result.stdout
+
+
 def test_other_values_are_refused(check: Any) -> None:
     result = check(["temperature_c"], np.ones((60, 1)))
     assert result.exit_code == 1

@@ -80,6 +80,18 @@ def test_sensors_that_are_all_inverted_may_be_a_turned_magnet():
     assert "north side of the magnet was down" in check.faults[0].message
 
 
+def test_one_sensor_differs_from_most_also_with_a_turned_magnet():
+    field = _recording(north_up=False)
+    field[:, 1] *= -1
+    assert _codes(_check(field)) == [(None, "inverted"), (1, "inverted")]
+
+
+def test_a_magnet_may_pass_again_on_its_way_back():
+    there = _recording()[:-150]
+    check = _check(np.concatenate([there, there[2200:][::-1]]))
+    assert not check.faults
+
+
 def test_dead_weak_and_noisy_sensors_are_named():
     rng = np.random.default_rng(1)
     field = _recording()

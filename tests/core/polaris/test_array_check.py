@@ -123,7 +123,9 @@ def test_dead_sensors_are_named():
     field[:, 1] = np.nan
     field[:, 4] = 0.0
     field[:, 6, 1] = field[0, 6, 1]
-    assert _codes(_check(field)) == [(1, "no_readings"), (4, "constant"), (6, "axis_dead")]
+    check = _check(field)
+    assert _codes(check) == [(1, "no_readings"), (4, "constant"), (6, "axis_dead")]
+    assert check.sensors[6].axes == (1, 0, 3)
 
 
 def test_missing_and_noisy_readings_are_named():
@@ -148,7 +150,7 @@ def test_units_that_are_wrong_in_all_sensors_are_named():
     ]
 
 
-@pytest.mark.parametrize(("nearest", "words"), [(8, "The order is reversed"), (4, "sensor 5")])
+@pytest.mark.parametrize(("nearest", "words"), [(8, "the order may be reversed"), (4, "sensor 5")])
 def test_the_order_of_the_sensors_is_tested_by_a_magnet(nearest, words):
     check = _check(_recording(magnet_at=nearest))
     assert _codes(check) == [(None, "order")]
@@ -181,6 +183,8 @@ def test_turning_about_one_axis_compares_the_other_two(seed):
     field[:, 5, :2] *= 0.5
     check = _check(field)
     assert _codes(check) == [(2, "axes_exchanged"), (5, "gain")]
+    assert check.sensors[0].axes == (1, 2, 0)
+    assert check.sensors[2].axes == (2, 1, 0)
     assert any(text.startswith("gain and sign along z") for text in check.untested)
 
 
@@ -197,7 +201,59 @@ def test_two_sensors_that_disagree_are_both_doubtful():
     field[:, 1] = field[:, 1, [1, 0, 2]]
     check = _check(field)
     assert _codes(check) == [(1, "axes_exchanged")]
-    assert any("which of the two sensors is right" in text for text in check.untested)
+    assert any(text.startswith("which sensors are right") for text in check.untested)
+
+
+@pytest.mark.parametrize("gain", [0.75, 1.25, 1.5])
+def test_the_gains_of_two_sensors_are_not_averaged(gain):
+    field = _recording(2)
+    field[:, 1] *= gain
+    check = _check(field)
+    assert _codes(check) == [(1, "gain")]
+    assert check.sensors[1].gain == pytest.approx(gain, rel=0.02)
+    assert any(text.startswith("which sensors are right") for text in check.untested)
+
+
+def test_two_rotated_sensors_are_not_averaged():
+    field = _recording(2)
+    field[:, 1] = Rotation.from_euler("x", 16, degrees=True).apply(field[:, 1])
+    assert _codes(_check(field)) == [(1, "rotated")]
+
+
+def test_without_a_majority_the_right_sensors_are_unknown():
+    field = _recording(4)
+    field[:, 2:] = field[:, 2:, [1, 0, 2]]
+    check = _check(field)
+    assert _codes(check) == [(2, "axes_exchanged"), (3, "axes_exchanged")]
+    assert any(text.startswith("which sensors are right") for text in check.untested)
+    field = _recording(5)
+    field[:, 3:] = field[:, 3:, [1, 0, 2]]
+    assert not any(text.startswith("which sensors") for text in _check(field).untested)
+
+
+def test_samples_that_no_sensor_shares_are_named():
+    field = _recording(3, magnet_at=None)
+    n = len(field)
+    for sensor in range(3):
+        field[sensor * n // 3 : (sensor + 1) * n // 3, sensor] = np.nan
+    check = _check(field)
+    assert {fault.code for fault in check.faults} == {"readings_missing"}
+    assert any("too few samples have the readings of all" in text for text in check.untested)
+
+
+def test_the_order_is_untested_without_sensor_1():
+    field = _recording()
+    field[:, 0] = np.nan
+    check = _check(field)
+    assert _codes(check) == [(0, "no_readings")]
+    assert any("sensor 1 has no readings" in text for text in check.untested)
+
+
+def test_without_any_reading_nothing_is_tested():
+    field = np.full((200, 3, 3), np.nan)
+    check = _check(field)
+    assert _codes(check) == [(k, "no_readings") for k in range(3)]
+    assert check.untested
 
 
 def test_sensors_with_few_readings_do_not_hinder_the_others():
