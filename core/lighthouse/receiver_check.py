@@ -61,7 +61,7 @@ class PhotodiodeFigures:
 
 
 def count_photodiodes(sweeps: Sweeps, device: int, receiver: Receiver | None) -> int:
-    """Return the number of photodiodes of a receiver, or of those that have sweeps if it is more."""
+    """Return the number of photodiodes of a device, by its receiver and its sweeps."""
     received = int(sweeps.sensor[sweeps.device == device].max(initial=0)) + 1
     return received if receiver is None else max(len(receiver), received)
 

@@ -212,8 +212,8 @@ def _numbers(path: Path, rows: Rows, columns: int, first_line: int) -> Array:
 
 
 def _is_rotation(quaternion: Array) -> NDArray[np.bool_]:
-    """Return the quaternions (n,) of about unit length."""
-    norm = np.linalg.norm(np.nan_to_num(quaternion), axis=1)
+    """Return which quaternions (n, 4) are complete and of about unit length."""
+    norm = np.linalg.norm(quaternion, axis=1)  # nan if a component is absent
     return (norm > MIN_QUATERNION_NORM) & (norm < MAX_QUATERNION_NORM)
 
 

@@ -165,6 +165,7 @@ def test_broken_exports_are_one_line(text: str, problem: str, tmp_path: Path) ->
     inserted=st.text('0123456789.,\t\n-eE RXTFrame;"[]', max_size=8),
 )
 @example(start=0.0, length=0, inserted='"')
+@example(start=0.108, length=71, inserted="1")  # A component of a quaternion is absent.
 def test_damaged_exports_are_refused_or_read(
     name: str, start: float, length: int, inserted: str, tmp_path: Path
 ) -> None:
