@@ -1,8 +1,10 @@
 """Keys of the columns of a table, and the usual names by which they are recognised.
 
 Names are compared without separators and units, as in ``mag0_x [uT]``, ``Bx1 (mT)``,
-``odom.pose.x_mm`` or ``accel_x (g)``; the user names those that are not recognised. Units are never
-guessed, except those of times since 1970, which differ by factors of a thousand.
+``odom.pose.x_mm`` or ``accel_x (g)``; the user names those that are not recognised. A unit that is
+neither in the name nor stated by the user is an error, except that of times since 1970 if both the
+first time and the spacing of the rows agree with it (:data:`EPOCH_RANGE_NS`,
+:data:`ROW_SPACING_RANGE_NS`).
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from locatk.formats.artifacts.kinds import MIN_KEY_SIMILARITY
 from locatk.formats.importers.landmark_csv import POSE_KEYS, TIME_KEY
 from locatk.formats.tables.clocks import Clock, check_unit, is_time_of_day, read_times
 from locatk.formats.tables.delimited import Table
+from locatk.formats.tables.numbers import parse_number
 from locatk.formats.tables.quantities import (
     TIME_NAMES,
     Column,
@@ -28,7 +31,7 @@ from locatk.formats.tables.quantities import (
     split_unit,
     units_by_quantity,
 )
-from locatk.formats.tables.timestamps import is_iso_time
+from locatk.formats.tables.timestamps import NANOSECONDS, is_iso_time
 
 DATE_KEY, DEVICE_KEY = "date", "device"
 """Keys of the date of a time of the day, and of the name of a device."""
@@ -48,8 +51,16 @@ MAX_SWEEP_DELAY_NS = 20_000_000
 """Largest step back of the times of sweeps [ns], a rotation rounded up: devices report the
 photodiodes of a passage, and stations that are received at the same time, in any order."""
 
-EPOCH_RANGES = {"s": (1e8, 1e11), "ms": (1e11, 1e14), "us": (1e14, 1e17), "ns": (1e17, 1e19)}
-"""Times since 1970 in each unit: from 1973 to the year 5138."""
+EPOCH_RANGE_NS = (1_262_304_000 * 10**9, 4_102_444_800 * 10**9)
+"""First times since 1970 that are recognised without a unit [ns]: from 2010-01-01 to before
+2100-01-01. A number is within this range in one unit at most, since units differ by factors of a
+thousand."""
+
+ROW_SPACING_RANGE_NS = (1_000, 10_000_000_000)
+"""Plausible median step between different times since 1970 without a unit [ns]: sensors are
+sampled at 0.1 Hz to 1 MHz. Most counters since power-on whose first count is like a date are too
+coarse in that unit, as steps of 20000 us that would be 20000 s. Not detected are those of 14.6 to
+47.5 days that step by 10 ms or less (5 ms would be 5 s)."""
 
 _MEASUREMENT_KEY = re.compile(
     rf"({'|'.join(MEASUREMENTS)})_?([01])?(?:_?ch(?:annel)?_?(\d{{1,2}}))?(?:_?s(?:ensor)?_?(\d{{1,3}}))?"
@@ -65,9 +76,10 @@ _MAGNETOMETERS = (
     ),
     re.compile(r"(?:magnetometer|mag|b|m)_?([xyz])_?(\d{1,3})"),
 )
-_PREFIX = r"(?:(?:odom|odometry|pose|position|pos|robot|base|wheel|orientation)_)*"
-_ODOMETRY = re.compile(rf"{_PREFIX}(x|y|heading|yaw|theta|phi|psi)")
-_HALLS = re.compile(rf"(?:hall_?|h_)?({'|'.join(HALL_NAMES)})(?:_hall)?")
+_PREFIX = r"(?:(?:odom|odometry|pose|position|pos|robot|base|wheel)_)*"
+# The x and y of an orientation are components of a quaternion.
+_ODOMETRY = re.compile(rf"{_PREFIX}(?:([xy])|(?:orientation_)?(?:heading|yaw|theta|phi|psi))")
+_HALL_PREFIX = re.compile(r"^(?:hall_?|h_)")
 _TIMES = re.compile(r"t|time|time_?stamp|stamp|seconds|secs|elapsed|elapsed_time|clock")
 _ACCELERATION = re.compile(
     r"(?:imu_)?(?:a|acc|accel|acceleration|accelerometer|linear_acceleration)_?([xyz])"
@@ -85,6 +97,8 @@ _SWEEP_NAMES = {
 _STATION_NAMES = ("station", "base_station", "basestation", "lighthouse", "bs", "lh")
 """Names of a number of a base station that may count from 0 or from 1."""
 _DEVICE_NAMES = ("device", "device_id", "robot_id", "receiver")
+_COUNTER_UNITS = {"millis": "ms", "micros": "us"}
+"""Units of times that are named like the functions of an Arduino."""
 
 
 # ---- columns
@@ -131,11 +145,13 @@ class ColumnGuess:
     Attributes
     ----------
     headers : dict of str to str
-        Header of each key: ``t`` and ``date``; ``device``; ``b0x`` to ``b8z`` of magnetometers;
-        names of hall sensors; ``x``, ``y`` and ``heading`` of odometry; :data:`SWEEP_KEYS` and
-        keys of measurements (:func:`parse_measurement`) of sweeps; :data:`IMU_KEYS`.
+        Header of each key: ``t`` and ``date``; ``device``; ``b0x``, ``b0y``, ``b0z``, ``b1x``, ...
+        of magnetometers 0 to 999; names of hall sensors; ``x``, ``y`` and ``heading`` of odometry;
+        :data:`SWEEP_KEYS` and keys of measurements (:func:`parse_measurement`) of sweeps;
+        :data:`IMU_KEYS`.
     units : dict of str to str
-        Units of times that follow from the numbers.
+        Unit of the times, by the quantity ``time``, if it follows from a name such as ``millis``
+        or from times since 1970; otherwise empty.
     ignored : tuple of str
         Headers that are not used.
     halls : tuple of str
@@ -168,7 +184,7 @@ class ColumnGuess:
 
     @property
     def max_delay_ns(self) -> int | None:
-        """Time by which rows may be late; None if times strictly ascend, without sweeps."""
+        """Time by which rows may be late; None if times must strictly ascend."""
         return MAX_SWEEP_DELAY_NS if self.measurements else None
 
     @property
@@ -203,15 +219,17 @@ def guess_columns(
     FormatError
         Two columns may be the same quantity, or a header of ``given`` does not exist.
     InputError
-        A key of ``given`` is unknown.
+        A key of ``given`` is unknown, or a time is not a number.
     """
     for key in given:
         check_key(key, halls)
     headers = {key: name.strip().lower() for key, name in given.items()}
     table.require(*headers.values())
     candidates: dict[str, list[str]] = {}
+    hall_names = {_NOT_IN_NAMES.sub("_", hall.lower()).strip("_"): hall for hall in halls}
+    hall_names |= {hall.strip().lower(): hall for hall in halls}
     for name in table.columns:
-        usual = _key_of(table, name)
+        usual = _key_of(table, name, hall_names)
         if usual is not None and name not in headers.values() and usual not in headers:
             candidates.setdefault(usual, []).append(name)
     named = {_kind_of(key, halls) for key in headers} - {None}
@@ -256,28 +274,45 @@ def check_key(key: str, halls: Iterable[str] = HALL_NAMES) -> None:
     )
 
 
-def _key_of(table: Table, name: str) -> str | None:
-    """Return the key of a header; None if it has no usual name."""
-    bare = _NOT_IN_NAMES.sub("_", split_unit(name)[0]).strip("_")
-    if bare in TIME_NAMES or _TIMES.fullmatch(bare) or bare in ("millis", "micros"):
+def _bare_name(header: str) -> str:
+    """Return a header in lower case, without its unit, with ``_`` as the only separator."""
+    return _NOT_IN_NAMES.sub("_", split_unit(header)[0]).strip("_")
+
+
+def _key_of(table: Table, name: str, halls: Mapping[str, str]) -> str | None:
+    """Return the key of a header; None if it has no usual name.
+
+    ``halls`` are the names of the hall sensors by their forms in headers.
+    """
+    bare = _bare_name(name)
+    if bare in TIME_NAMES or _TIMES.fullmatch(bare) or bare in _COUNTER_UNITS:
         return TIME_KEY
     if bare == DATE_KEY:
         return DATE_KEY
     if bare in _DEVICE_NAMES:
         return DEVICE_KEY
-    if match := _HALLS.fullmatch(bare):
-        return match[1]
+    if hall := _hall_of(name, bare, halls):
+        return hall
     if match := _MAGNETOMETERS[0].fullmatch(bare):
         return f"b{int(match[1] or 0)}{match[2]}"
     if match := _MAGNETOMETERS[1].fullmatch(bare):
         return f"b{int(match[2])}{match[1]}"
     if match := _ODOMETRY.fullmatch(bare):
-        return match[1] if match[1] in ("x", "y") else "heading"
+        return match[1] or "heading"
     if match := _ACCELERATION.fullmatch(bare):
         return f"a{match[1]}"
     if match := _ANGULAR_RATE.fullmatch(bare):
         return f"g{match[1]}"
     return _sweep_key(table, name, bare)
+
+
+def _hall_of(name: str, bare: str, halls: Mapping[str, str]) -> str | None:
+    """Return the hall sensor of a header, which may have ``hall`` before or behind its name."""
+    short = _HALL_PREFIX.sub("", bare)
+    for text in (name, bare, short, bare.removesuffix("_hall"), short.removesuffix("_hall")):
+        if text and text in halls:
+            return halls[text]
+    return None
 
 
 def _sweep_key(table: Table, name: str, bare: str) -> str | None:
@@ -299,9 +334,9 @@ def _quantity_of(match: re.Match[str]) -> str:
 def _unneeded_keys(keys: set[str], halls: Iterable[str]) -> set[str]:
     """Return the keys that mean nothing without others.
 
-    A column ``angle``, ``mode`` or ``sensor`` is only part of a sweep if the station is known. Of
-    ``count_1`` and ``count_2``, the first is the first plane and not the second. A single column
-    ``ax`` is no accelerometer.
+    A column ``angle``, ``mode`` or ``sensor`` is only part of a sweep if the station is known.
+    ``count_1`` without ``count_0`` counts from 1 and is not used. A single column ``ax`` is no
+    accelerometer.
     """
     measurements = {key: each for key in keys if (each := parse_measurement(key))}
     has_station = any(key in keys for key in STATION_KEYS)
@@ -356,19 +391,37 @@ def _check_stations(table: Table, keys: set[str], halls: Iterable[str]) -> None:
 
 
 def _time_unit(table: Table, name: str | None, units: Sequence[str]) -> dict[str, str]:
-    """Return the unit of times that have none in their name, if there is only one possibility."""
+    """Return the unit of times that is neither in their name nor stated; empty if unknown."""
     if name is None or split_unit(name)[1] or is_iso_time(table.columns[name][0]):
         return {}
     if "time" in units_by_quantity(units):
         return {}
-    if name in ("millis", "micros"):
-        return {"time": {"millis": "ms", "micros": "us"}[name]}
+    unit = _COUNTER_UNITS.get(_bare_name(name)) or _epoch_unit(table, name)
+    return {"time": unit} if unit else {}
+
+
+def _epoch_unit(table: Table, name: str) -> str | None:
+    """Return the unit of times since 1970; None if they are not certain to be such times.
+
+    Raises
+    ------
+    InputError
+        The first time may be since 1970, but another cell is not a number.
+    """
     try:
-        first = float(table.columns[name][0])
+        first = parse_number(table.columns[name][0])
     except ValueError:
-        return {}
-    fitting = [unit for unit, (low, high) in EPOCH_RANGES.items() if low <= first < high]
-    return {"time": fitting[0]} if fitting else {}
+        return None
+    low, high = EPOCH_RANGE_NS
+    fitting = [unit for unit, size in NANOSECONDS.items() if low <= first * size < high]
+    if len(fitting) != 1:
+        return None
+    # Sweeps that were received together have equal times, and devices may be interleaved.
+    steps = np.diff(np.unique(table.floats(name)))
+    if not len(steps):
+        return None
+    low, high = ROW_SPACING_RANGE_NS
+    return fitting[0] if low <= np.median(steps) * NANOSECONDS[fitting[0]] <= high else None
 
 
 def device_groups(
