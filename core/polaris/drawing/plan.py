@@ -90,6 +90,12 @@ ZOOMS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 MAX_TAGS_PER_PAGE = 150
 """Number of tags on a page above which the plan is divided without trying to place their labels."""
 
+PARTS_PER_TAG = 3
+"""Number of labels and ordinates of a tag: its label, and one ordinate along each axis."""
+
+OUTSIDE_WEIGHT_MM = 1e3
+"""Area [mm^2] of overlap that is as bad as each mm of a label beyond the edge of the plan."""
+
 MAX_DATUM_RATIO = 2.0
 """Ratio by which the plan may become larger to contain the datum."""
 
@@ -98,6 +104,10 @@ MAX_PAGES = 300
 
 SAME_ORDINATE_MM = 0.05
 """Difference of two coordinates that are one ordinate: half of the last decimal."""
+
+
+DATUM_ON_PAGE = "is the crossed circle"
+"""Words for a datum on the same page, the longest ones for its place."""
 
 
 @dataclass(frozen=True)
@@ -185,8 +195,8 @@ class _Floor:
         if self.has_datum:
             low, high = with_datum
         # A single tag, or a row of tags, has some floor around it.
-        missing = np.maximum(0.0, 2 * self.side_mm - (high - low)) / 2 + self.side_mm
-        self.low_mm, self.high_mm = low - missing, high + missing
+        padding_mm = np.maximum(0.0, 2 * self.side_mm - (high - low)) / 2 + self.side_mm
+        self.low_mm, self.high_mm = low - padding_mm, high + padding_mm
 
     def ordinates(self, index: Sequence[int], axis: int) -> Array:
         """Return the different coordinates of tags along x (0) or y (1), ascending."""
@@ -202,21 +212,39 @@ class _Block:
     high: Point
     members: tuple[int, ...]
 
+    def has_datum(self, floor: _Floor) -> bool:
+        """Return whether the page of this block draws the datum."""
+        return floor.has_datum and all(
+            low - SAME_ORDINATE_MM <= 0 <= high + SAME_ORDINATE_MM
+            for low, high in zip(self.low, self.high, strict=True)
+        )
+
 
 @dataclass(frozen=True)
 class _Division:
-    """Division of the floor over pages; ``missing`` counts labels and ordinates without space."""
+    """Division of the floor over pages.
+
+    ``unplaced`` is the number of labels and ordinates without space; None if a block has more than
+    :data:`MAX_TAGS_PER_PAGE` tags.
+    """
 
     frame: PageFrame
     blocks: tuple[_Block, ...]
     across: int
     scale: float
-    missing: float
+    unplaced: int | None
 
     @property
-    def cost(self) -> float:
-        """Number of pages and of missing labels: a page more is worth a label."""
-        return self.missing + len(self.blocks)
+    def cost(self) -> int:
+        """Number of pages and of unplaced labels and ordinates: a page more is worth a label.
+
+        With unknown labels, it is the number of all labels and ordinates at any number of pages, so
+        that the largest scale is the best one.
+        """
+        sizes = [len(block.members) for block in self.blocks if block.members]
+        if self.unplaced is None:
+            return PARTS_PER_TAG * sum(sizes)
+        return self.unplaced + len(sizes) + (len(sizes) > 1)  # and the overview
 
 
 def _frame(floor: _Floor, size_mm: Point, margin_mm: float, name: str, notes: str) -> PageFrame:
@@ -224,17 +252,23 @@ def _frame(floor: _Floor, size_mm: Point, margin_mm: float, name: str, notes: st
     return PageFrame(size_mm, margin_mm, title, (notes,), has_rulers=False)
 
 
-def _notes(floor: _Floor, scale: float) -> str:
+def _datum_state(floor: _Floor, block: _Block, is_divided: bool) -> str:
+    """Return where the datum is, in the words of the note of the page of a block."""
+    if block.has_datum(floor):
+        return DATUM_ON_PAGE
+    return "is in the overview" if floor.has_datum and is_divided else "is off the plan"
+
+
+def _notes(floor: _Floor, scale: float, datum_state: str) -> str:
     symbols = (
         "Squares are to scale"
         if floor.side_mm / scale >= MIN_SYMBOL_MM
         else "Squares are larger than the tags"
     )
-    state = "is the crossed circle" if floor.has_datum else "is off the plan"
     return (
         f"{len(floor.ids)} tags, 1 : {scale:g}. {symbols}; arrows are the tags' x axes (forward). "
         "At a tag: id, heading counter-clockwise from +x, meaning. Numbers at the edges are mm to "
-        f"the middles of the tags from {floor.datum_name}, which {state}."
+        f"the middles of the tags from {floor.datum_name}, which {datum_state}."
     )
 
 
@@ -255,12 +289,14 @@ def _plan_box(floor: _Floor, frame: PageFrame) -> Box:
 def _divide(floor: _Floor, size_mm: Point, margin_mm: float) -> _Division:
     """Divide the plan over as few pages of this size as its labels need.
 
-    If they do not fit at any scale, most of them do at that of the result.
+    If they do not fit at any scale, most of them do at that of the result. Of equal divisions, the
+    one of the largest scale is returned.
     """
     divisions: list[_Division] = []
     extent = floor.high_mm - floor.low_mm
-    # The height of the notes hardly depends on the scale.
-    frame = _frame(floor, size_mm, margin_mm, "plan of the tags", _notes(floor, 1000.0))
+    # The height of the notes hardly depends on the scale; those with the datum are the longest.
+    notes = _notes(floor, 1000.0, DATUM_ON_PAGE)
+    frame = _frame(floor, size_mm, margin_mm, "plan of the tags", notes)
     left, bottom, right, top = _plan_box(floor, frame)
     space = np.array([right - left, top - bottom])
     if not (space > 20).all():
@@ -269,19 +305,18 @@ def _divide(floor: _Floor, size_mm: Point, margin_mm: float) -> _Division:
     for zoom in ZOOMS:
         scale = round_scale(max(1.0, fit / zoom))
         count = np.ceil(extent / (space * scale) - 1e-9).astype(int)
-        frame = _frame(floor, size_mm, margin_mm, "plan of the tags", _notes(floor, scale))
+        notes = _notes(floor, scale, DATUM_ON_PAGE)
+        frame = _frame(floor, size_mm, margin_mm, "plan of the tags", notes)
         blocks = _blocks(floor, count, scale * space, scale * EDGE_SPACE_MM)
-        if divisions and len(blocks) > MAX_PAGES / 2:
-            break
-        missing = math.inf
+        unplaced = None
         if max(len(block.members) for block in blocks) <= MAX_TAGS_PER_PAGE:
             box = _plan_box(floor, frame)
             sheets = [_Sheet(floor, block, scale, box) for block in blocks if block.members]
-            missing = sum(sheet.missing for sheet in sheets)
-        divisions.append(_Division(frame, blocks, int(count[0]), scale, missing))
-        if missing == 0:
+            unplaced = sum(sheet.unplaced for sheet in sheets)
+        divisions.append(_Division(frame, blocks, int(count[0]), scale, unplaced))
+        if unplaced == 0:
             break
-    return min(divisions, key=lambda item: item.cost)
+    return min(divisions, key=lambda item: (item.cost, item.scale))
 
 
 def _blocks(
@@ -326,9 +361,8 @@ def _plan_pages(floor: _Floor, plan: _Division) -> tuple[list[UnnumberedPage], d
         for index in block.members:
             page_of[floor.ids[index]] = len(pages)
         title = f"plan of the tags, {name}" if is_divided else "plan of the tags"
-        frame = _frame(
-            floor, plan.frame.size_mm, plan.frame.margin_mm, title, _notes(floor, plan.scale)
-        )
+        notes = _notes(floor, plan.scale, _datum_state(floor, block, is_divided))
+        frame = _frame(floor, plan.frame.size_mm, plan.frame.margin_mm, title, notes)
         sheet = _Sheet(floor, block, plan.scale, _plan_box(floor, frame))
         foot = _foot(frame, plan.scale)
         pages.append(
@@ -406,8 +440,8 @@ class _Label:
 class _Sheet:
     """One page of the plan: positions on the page, labels and ordinates.
 
-    Without space, labels lose their meanings, then overlap; and ordinates are left out. ``missing``
-    counts them.
+    Without space, labels lose their meanings, then overlap; and ordinates are left out.
+    ``unplaced`` counts them. ``datum`` is the position of the datum, None if it is not on the page.
     """
 
     def __init__(self, floor: _Floor, block: _Block, scale: float, box: Box) -> None:
@@ -417,7 +451,8 @@ class _Sheet:
         self.high = (box[0] + size[0], box[3])
         half = max(floor.side_mm / scale, MIN_SYMBOL_MM) / 2
         self.half_mm = half
-        self.missing = 0
+        self.unplaced = 0
+        self.datum = self._on_page(0.0, 0.0) if block.has_datum(floor) else None
         self.points = [self._on_page(*floor.position_mm[k].tolist()) for k in block.members]
         self.tips = [
             self._rotated(point, k, half + HEADING_ARROW_MM, 0.0)
@@ -448,8 +483,9 @@ class _Sheet:
         for point, tip in zip(self.points, self.tips, strict=True):
             low = (min(point[0], tip[0]) - 0.8, min(point[1], tip[1]) - 0.8)
             occupied.append((*low, max(point[0], tip[0]) + 0.8, max(point[1], tip[1]) + 0.8))
-        if self.floor.has_datum and self._is_inside(datum := self._on_page(0.0, 0.0)):
-            occupied.append((datum[0] - 2, datum[1] - 2, datum[0] + 2, datum[1] + 2))
+        if self.datum is not None:
+            x, y = self.datum
+            occupied.append((x - 2, y - 2, x + 2, y + 2))
         obstacles = Obstacles(
             mark
             for index, point, tip in zip(self.block.members, self.points, self.tips, strict=True)
@@ -470,20 +506,18 @@ class _Sheet:
 
         ``occupied`` (n, 4) are boxes, and ``obstacles`` the tags, labels and leaders in them.
         """
-        best: tuple[float, _Label] | None = None
-        for lines in self._label_texts(index):
+        refused: list[tuple[float, _Label]] = []
+        texts = self._label_texts(index)
+        for lines in texts:
             for label in _candidates(lines, point, reach):
-                overlap = _overlap(label.box, occupied, (*self.corner, *self.high))
-                if overlap == 0 and _is_clear(label, obstacles):
+                penalty = _overlap_penalty(label.box, occupied, (*self.corner, *self.high))
+                if penalty == 0 and _is_clear(label, obstacles):
                     # A label without its meaning is complete only if there is none.
-                    self.missing += lines != self._label_texts(index)[0]
+                    self.unplaced += lines != texts[0]
                     return label
-                if best is None or overlap < best[0]:
-                    best = overlap, label
-        self.missing += 1
-        if best is None:
-            raise AssertionError("a label has candidates")
-        return best[1]
+                refused.append((penalty, label))
+        self.unplaced += 1
+        return min(refused, key=lambda item: item[0])[1]
 
     def _label_texts(self, index: int) -> list[tuple[str, ...]]:
         """Return the lines of a label with the meaning, and without it."""
@@ -494,22 +528,16 @@ class _Sheet:
 
     # ---- ordinates
 
-    def _is_inside(self, point: Point) -> bool:
-        margin = 1e-6
-        return all(
-            self.corner[axis] - margin <= point[axis] <= self.high[axis] + margin for axis in (0, 1)
-        )
-
     def _spread_ordinates(self, axis: int) -> list[tuple[float, float, float]]:
         """Return value, position on the page and position of the text of the ordinates."""
         values = self.floor.ordinates(self.block.members, axis)
-        ends = self._on_page(0.0, 0.0)[axis]
-        positions = ends + values / self.scale
+        datum_position = self._on_page(0.0, 0.0)[axis]
+        positions = datum_position + values / self.scale
         gap = line_height(TEXT_POINTS, 1.1)
         low, high = self.box[axis] + gap / 2, self.box[axis + 2] - gap / 2
         if (len(values) - 1) * gap > high - low:
             kept = np.linspace(0, len(values) - 1, max(2, int((high - low) / gap))).astype(int)
-            self.missing += len(values) - len(kept)
+            self.unplaced += len(values) - len(kept)
             values, positions = values[kept], positions[kept]
         spread = _spread(positions, gap, low, high)
         return list(zip(values.tolist(), positions.tolist(), spread.tolist(), strict=True))
@@ -520,8 +548,8 @@ class _Sheet:
         """Yield all marks of the plan."""
         yield rectangle((*self.corner, *self.high), 0.2)
         yield from self._draw_ordinates()
-        if self.floor.has_datum and self._is_inside(datum := self._on_page(0.0, 0.0)):
-            yield from _datum(datum)
+        if self.datum is not None:
+            yield from _datum(self.datum)
         for index, point, tip, label in zip(
             self.block.members, self.points, self.tips, self.labels, strict=True
         ):
@@ -626,13 +654,17 @@ def _candidates(lines: tuple[str, ...], point: Point, reach: float) -> Iterator[
             yield _Label(lines, box, _ANCHORS[side[0]], leader)
 
 
-def _overlap(box: Box, occupied: Array, area: Box) -> float:
-    """Return the area that a box shares with others or has outside of an area; 0 if none."""
+def _overlap_penalty(box: Box, occupied: Array, area: Box) -> float:
+    """Return the area in mm^2 that a box shares with others, plus a weight of its excess.
+
+    The excess is how far the box extends beyond ``area``; its weight is
+    :data:`OUTSIDE_WEIGHT_MM`.
+    """
     width = np.minimum(box[2], occupied[:, 2]) - np.maximum(box[0], occupied[:, 0])
     height = np.minimum(box[3], occupied[:, 3]) - np.maximum(box[1], occupied[:, 1])
     shared = float((np.maximum(width, 0) * np.maximum(height, 0)).sum())
     excess = (area[0] - box[0], area[1] - box[1], box[2] - area[2], box[3] - area[3])
-    return shared + 1e3 * sum(max(0.0, value) for value in excess)
+    return shared + OUTSIDE_WEIGHT_MM * sum(max(0.0, value) for value in excess)
 
 
 def _is_clear(label: _Label, obstacles: Obstacles) -> bool:

@@ -4,11 +4,12 @@ Landmark maps (:mod:`.map_dxf`) and sites of tags (:mod:`.site_dxf`) are read fr
 objects of the model space count, not those within blocks. Conventions:
 
 - the position of an insert is the base point of its block, its rotation is that of the insert
-  (counter-clockwise from x), and its scale is ignored;
+  (counter-clockwise from x), and the size of its scale is ignored;
 - the position of a closed outline (polyline, circle, ellipse) is the centroid of its area; outlines
   and points have no rotation;
+- the scale of an insert may be negative along both axes, which is a rotation by 180 degrees;
 - a text belongs to the object that is nearest to its insertion point, if it is nearer than half the
-  distance of that object to the next one.
+  distance of that object to the next one, or than :data:`MAX_TEXT_DISTANCE_M` to a single object.
 
 Z is ignored. Read with ezdxf (extra ``dxf``): DXF R12 to R2018, as text or binary, also slightly
 damaged files.
@@ -29,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.errors import FormatError, InputError
+from locatk.core.errors import FormatError
 from locatk.core.printable import escape_controls
 from locatk.formats.extras import requires_extra
 from locatk.formats.files import read_bytes
@@ -41,6 +42,9 @@ MAX_DXF_BYTES = 64 << 20
 
 MAX_COORDINATE_M = 1e4
 """10 km, larger than any floor: larger numbers are in another unit or of a map of the country."""
+
+MAX_TEXT_DISTANCE_M = 2.0
+"""Largest distance of a text from the only object: 20 mm on paper in a drawing of 1 : 100."""
 
 UNIT_M = {"mm": 1e-3, "cm": 1e-2, "dm": 0.1, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 """Length of the units in metres."""
@@ -150,7 +154,7 @@ class DxfReader:
         ------
         FormatError
             A layer is missing or there are no objects on the layers, the unit is unknown, an insert
-            is mirrored or an array of blocks, or a position is not within
+            is mirrored, tilted or an array of blocks, or a position is not within
             :data:`MAX_COORDINATE_M`.
         """
         self._check_layers(layers)
@@ -176,7 +180,10 @@ class DxfReader:
             raise self._no_objects(layers, ignored)
         return _assign_texts(objects, texts, unit, dict(ignored))
 
-    def error(self, message: str, handle: str | None = None, hint: str | None = None) -> InputError:
+    def error(
+        self, message: str, handle: str | None = None, hint: str | None = None
+    ) -> FormatError:
+        """Return an error about the drawing, or about the entity with a handle."""
         where = None if handle is None else f"handle {handle}"
         return FormatError(message, file=self._path, where=where, hint=hint)
 
@@ -202,7 +209,7 @@ class DxfReader:
             )
         return INSUNITS[code]
 
-    def _no_objects(self, layers: Sequence[str], ignored: Counter[str]) -> InputError:
+    def _no_objects(self, layers: Sequence[str], ignored: Counter[str]) -> FormatError:
         kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(ignored.items()))
         return self.error(
             f"no block insert, closed outline or point on layer {', '.join(layers)}"
@@ -235,9 +242,12 @@ class DxfReader:
         if insert.mcount > 1:
             hint = "Explode the array, so that each block is an insert of its own"
             raise self.error(f"an array of {insert.mcount} blocks", handle, hint)
-        extrusion = dxf.get("extrusion", (0, 0, 1))
-        is_upright = math.isclose(extrusion[2], 1, abs_tol=1e-6)
-        if not is_upright or min(dxf.get("xscale", 1), dxf.get("yscale", 1)) <= 0:
+        normal_x, normal_y, normal_z = dxf.get("extrusion", (0.0, 0.0, 1.0))
+        if not math.hypot(normal_x, normal_y) <= 1e-6 * abs(normal_z):  # nan too
+            hint = "Insert the block again, in the plane of the floor"
+            raise self.error("a tilted block, whose rotation is not that of a tag", handle, hint)
+        scale_x, scale_y = dxf.get("xscale", 1.0), dxf.get("yscale", 1.0)
+        if normal_z < 0 or not scale_x * scale_y > 0:
             hint = "Insert the block again, rotated instead of mirrored"
             raise self.error("a mirrored block, whose rotation is not that of a tag", handle, hint)
         rotation_deg = dxf.get("rotation", 0.0)
@@ -254,7 +264,7 @@ class DxfReader:
         }
         return replace(
             self._object(insert, dxf.insert, unit),
-            rotation_rad=math.radians(rotation_deg),
+            rotation_rad=math.radians(rotation_deg) + (math.pi if scale_x < 0 else 0.0),
             block=dxf.name,
             attributes=attributes,
             block_texts=tuple(
@@ -341,10 +351,12 @@ def _text(entity: Any) -> DxfText:
 
 
 def _text_position(entity: Any) -> Any:
-    """Return the point at which a text is placed."""
+    """Return the point at which a text is placed, in world coordinates."""
     if entity.dxftype() == "MTEXT":
         return entity.dxf.insert
-    return entity.get_placement()[1]
+    # The axes of a TEXT depend on its extrusion (Autodesk, DXF Reference, Object Coordinate Systems
+    # (OCS)).
+    return entity.ocs().to_wcs(entity.get_placement()[1])
 
 
 def _assign_texts(
@@ -353,14 +365,14 @@ def _assign_texts(
     unit: str,
     ignored: dict[str, int],
 ) -> DxfLayers:
-    """Assign each text to the object next to it."""
+    """Assign each text to the object next to it, by the rule of the module."""
     from scipy.spatial import cKDTree
 
     if not texts:
         return DxfLayers(tuple(objects), (), unit, ignored)
     position_m = np.array([(item.x_m, item.y_m) for item in objects])
     tree = cKDTree(position_m)
-    limit_m = np.full(len(objects), math.inf)
+    limit_m = np.full(len(objects), MAX_TEXT_DISTANCE_M)
     if len(objects) > 1:
         limit_m = np.asarray(tree.query(position_m, 2)[0])[:, 1] / 2
     found = tree.query(np.array([position for _, position in texts]))

@@ -13,10 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from locatk.core.drawing import Circle, Group, Line, Mark, Page, Polygon, Text, text_width
+from locatk.core.drawing.pages import PageFrame
 from locatk.core.errors import InputError
 from locatk.core.polaris.drawing.plan import (
     MIN_SYMBOL_MM,
     SitePlan,
+    _Block,
+    _Division,
     _spread,
     draw_site_plan,
 )
@@ -220,6 +223,52 @@ def test_sites_that_are_hard_to_draw() -> None:
     assert sum(len(squares(page)) for page in plan_pages(draw_site_plan(row, "row", A4))) == 60
     large = Tags(order=9, magnets=40, site={10**30 + k: PlanarPose(k, 0, 0) for k in range(3)})
     assert len(draw_site_plan(large, "long", A4).pages) >= 2
+
+
+@pytest.mark.slow
+def test_a_dense_cluster_takes_the_largest_scale() -> None:
+    """No division shows more than 150 tags in 3.5 m; the overview scale would be the worst."""
+    draw = random.Random(1)
+    site = {k: PlanarPose(draw.uniform(0, 3.5), draw.uniform(0, 3.5), 0.0) for k in range(200)}
+    alone = Tags(site=site | {500: PlanarPose(100.0, 0.0, 0.0)})
+    plan = draw_site_plan(alone, "hall", A4)
+    # 1 : 450 on one page, and eight times larger at most.
+    assert plan.scale <= 75
+    assert plan.plan_pages == 3
+    assert plan.page_of[500] != plan.page_of[0]
+
+
+def division(sizes: list[int], unplaced: int | None) -> _Division:
+    blocks = tuple(_Block((0.0, 0.0), (1.0, 1.0), tuple(range(size))) for size in sizes)
+    return _Division(PageFrame(A4, 10.0, "", ("",)), blocks, 1, 100.0, unplaced)
+
+
+def test_the_cost_counts_the_pages_that_are_drawn() -> None:
+    assert division([5], 2).cost == 2 + 1
+    assert division([5, 0, 0, 0], 2).cost == 2 + 1
+    assert division([5, 0, 4, 0], 2).cost == 2 + 2 + 1  # with the overview
+    # A label and two ordinates of each tag.
+    assert division([200, 0, 1], None).cost == 3 * 201
+
+
+@pytest.mark.slow
+def test_the_note_of_each_page_says_where_the_datum_is() -> None:
+    pairs = [(5.0, 5.0), (5.6, 5.0), (40.0, 40.0)]
+    places = [(x + 0.3 * k, y + 0.3 * k) for x, y in pairs for k in range(12)]
+    tags = Tags(site={k: PlanarPose(x, y, 0.0) for k, (x, y) in enumerate(places)})
+    states = set()
+    for datum_m in ((5.0, 5.0), (0.0, 40.0)):
+        plan = draw_site_plan(tags, "hall", A4, datum_m=datum_m)
+        assert plan.plan_pages > 2
+        assert any(
+            isinstance(m, Circle) and m.radius_mm > 1 for m in marks(plan.pages[0], "overview")
+        )
+        for page in plan_pages(plan):
+            circles = [mark for mark in marks(page) if isinstance(mark, Circle)]
+            state = "is the crossed circle" if circles else "is in the overview"
+            assert f"which {state}." in words(page)
+            states.add(state)
+    assert len(states) == 2
 
 
 def test_plans_that_are_refused() -> None:

@@ -10,6 +10,8 @@ from typing import Any
 
 import ezdxf
 import pytest
+from ezdxf.enums import TextEntityAlignment
+from ezdxf.math import Matrix44
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -19,7 +21,7 @@ from locatk.core.polaris.design.site import SitePoint
 from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.formats.exporters.floors.drawing_dxf import dumps_dxf
 from locatk.formats.exporters.floors.site_drawing import draw_site
-from locatk.formats.importers.floors.dxf import UNIT_M
+from locatk.formats.importers.floors.dxf import MAX_TEXT_DISTANCE_M, UNIT_M, DxfReader
 from locatk.formats.importers.floors.site_dxf import DrawnSite, read_site_drawing
 
 TAGS = {"layer": "TAGS"}
@@ -157,6 +159,57 @@ def test_ids_of_blocks_and_of_texts_on_another_layer(tmp_path: Path) -> None:
     assert [(point.tag_id, point.meaning) for point in both] == [(31, "bay"), (44, "")]
 
 
+def test_texts_that_are_seen_from_below_are_at_their_world_position(tmp_path: Path) -> None:
+    """The transformation of ezdxf mirrors the texts; it gives them the extrusion (0, 0, -1)."""
+
+    def draw(document: Any, space: Any) -> None:
+        del document
+        space.add_point((-1, 0), TAGS)
+        space.add_point((1, 0), TAGS)
+        for text, align in (("5", TextEntityAlignment.LEFT), ("6 dock", TextEntityAlignment.RIGHT)):
+            x = 1.1 if text == "5" else -0.9
+            entity = space.add_text(text, height=0.1, dxfattribs=TAGS)
+            entity.set_placement((x, 0.1), align=align)
+            entity.transform(Matrix44.scale(-1, 1, 1))
+            assert entity.dxf.extrusion.isclose((0, 0, -1))
+
+    left, right = read(drawing(tmp_path, draw)).points
+    assert (left.tag_id, right.tag_id, right.meaning) == (5, 6, "dock")
+
+
+def test_two_negative_scales_are_half_a_turn(tmp_path: Path) -> None:
+    def draw(document: Any, space: Any) -> None:
+        insert = marker(document, space, (2, 3), xscale=-1.0, yscale=-2.0, rotation=30.0)
+        # The x axis of the block in the drawing, as ezdxf draws it.
+        axis = insert.matrix44().transform_direction((1, 0, 0))
+        assert math.degrees(math.atan2(axis.y, axis.x)) == pytest.approx(-150)
+
+    (point,) = read(drawing(tmp_path, draw)).points
+    assert (point.x_m, point.y_m) == pytest.approx((2, 3))
+    assert math.remainder(point.heading_rad - math.radians(-150), math.tau) == pytest.approx(0)
+
+
+@pytest.mark.parametrize(("other_x", "limit"), [(None, MAX_TEXT_DISTANCE_M), (9.0, 4.5)])
+@pytest.mark.parametrize(("ratio", "tag_id"), [(0.99, 5), (1.01, None)])
+def test_distant_texts_belong_to_no_object(
+    tmp_path: Path, other_x: float | None, limit: float, ratio: float, tag_id: int | None
+) -> None:
+    """A single object has a limit of its own; otherwise it is half the distance to the next."""
+
+    def draw(document: Any, space: Any) -> None:
+        del document
+        space.add_point((0, 0), TAGS)
+        if other_x is not None:
+            space.add_point((other_x, 0), TAGS)
+        text = space.add_text("5", height=0.1, dxfattribs=TAGS)
+        text.set_placement((0, ratio * limit))
+
+    content = DxfReader(drawing(tmp_path, draw)).read(["TAGS"])
+    found = [text.text for text in content.objects[0].nearby_texts]
+    assert found == ([] if tag_id is None else [str(tag_id)])
+    assert [text.text for text in content.distant_texts] == (["5"] if tag_id is None else [])
+
+
 def test_exported_sites_come_back(tmp_path: Path) -> None:
     poses = {
         0: PlanarPose(0.0, 0.0, 0.0),
@@ -186,7 +239,9 @@ def marker(document: Any, space: Any, place: tuple[float, float], **more: Any) -
     ("draw", "words"),
     [
         (lambda d, s: marker(d, s, (0, 0), xscale=-1.0), "a mirrored block"),
+        (lambda d, s: marker(d, s, (0, 0), yscale=-2.0), "a mirrored block"),
         (lambda d, s: marker(d, s, (0, 0), extrusion=(0, 0, -1)), "a mirrored block"),
+        (lambda d, s: marker(d, s, (0, 0), extrusion=(0, 0.6, 0.8)), "a tilted block"),
         (
             lambda d, s: marker(d, s, (0, 0), column_count=3, column_spacing=1.0),
             "an array of 3 blocks",
