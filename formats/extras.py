@@ -15,12 +15,15 @@ PACKAGES = {
     "ble": "bleak",
     "dask": "distributed",
     "dxf": "ezdxf",
+    "live": "websockets",
+    "mqtt": "paho-mqtt",
     "pandas": "pandas",
     "parquet": "pyarrow",
     "pdf": "pikepdf",
     "ros": "rosbags",
     "s3": "s3fs",
     "yaml": "PyYAML",
+    "zenoh": "eclipse-zenoh",
 }
 """Package that each extra for users installs; the extra ``all`` installs all of them."""
 

@@ -53,12 +53,15 @@ MODULES_OF_EXTRAS = {
     "ble": ("bleak",),
     "dask": ("distributed",),
     "dxf": ("ezdxf",),
+    "live": ("websockets",),
+    "mqtt": ("paho",),
     "pandas": ("pandas",),
     "parquet": ("pyarrow",),
     "pdf": ("pikepdf",),
     "ros": ("rosbags",),
     "s3": ("s3fs", "fsspec"),
     "yaml": ("yaml",),
+    "zenoh": ("zenoh",),
 }
 """Names by which the packages of each extra are imported."""
 

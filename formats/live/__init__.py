@@ -1,0 +1,1 @@
+"""Live localization: ports in, estimates to sinks and into the recording."""
