@@ -119,7 +119,7 @@ class SerialIntake:
         self.device: Device | None = None
         self._port, self._options = port, options or Options()
         self._baud = baud
-        self._offset = self._fed = 0
+        self._offset = self._fed = self._stored = 0
         self._opened = True
         self._last_ns: int | None = None
         self._first_ns: int | None = None
@@ -147,7 +147,6 @@ class SerialIntake:
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
         """Return the messages of received data: first all raw ones, then the records."""
-        pieces: list[tuple[bool, list[bytes]]] = []
         for each in arrived:
             chunk = SerialChunk(
                 timestamp=messages.timestamp(each.time_ns),
@@ -158,6 +157,14 @@ class SerialIntake:
             )
             self._opened = False
             self._offset += each.size
+            self._stored += each.size
+            yield StampedMessage(self.topic, chunk, each.time_ns, each.time_ns)
+        yield from self._packed(self.decode(arrived))
+
+    def decode(self, arrived: Sequence[ReceivedData]) -> list[TimedBatch]:
+        """Return the records of received data, without messages: for a solver that runs along."""
+        pieces: list[tuple[bool, list[bytes]]] = []
+        for each in arrived:
             self._fed += each.size
             self._arrivals.add(self._fed, each.time_ns)
             pause = self._last_ns is None or each.time_ns - self._last_ns >= PAUSE_NS
@@ -166,9 +173,11 @@ class SerialIntake:
             if pause or not pieces:
                 pieces.append((pause, []))
             pieces[-1][1].append(each.data)
-            yield StampedMessage(self.topic, chunk, each.time_ns, each.time_ns)
-        for pause, data in pieces:
-            yield from self._records(partial(self._feed, b"".join(data), pause))
+        return [
+            batch
+            for pause, data in pieces
+            for batch in self._records(partial(self._feed, b"".join(data), pause))
+        ]
 
     def _feed(self, data: bytes, pause: bool) -> list[Batch]:
         if self._decoder is not None:
@@ -180,11 +189,16 @@ class SerialIntake:
         return self._identified(self._identifier.verdict())
 
     def turn(self, now_ns: int) -> Iterator[StampedMessage]:
-        """End the identification of the device after MAX_IDENTIFICATION_S."""
+        """Return the messages of :meth:`decode_identified`."""
+        yield from self._packed(self.decode_identified(now_ns))
+
+    def decode_identified(self, now_ns: int) -> list[TimedBatch]:
+        """End the identification of the device after MAX_IDENTIFICATION_S; return its records."""
         if self._identifier is None or self._first_ns is None:
-            return
-        if now_ns - self._first_ns > MAX_IDENTIFICATION_S * 1e9:
-            yield from self._records(self._settle)
+            return []
+        if now_ns - self._first_ns <= MAX_IDENTIFICATION_S * 1e9:
+            return []
+        return self._records(self._settle)
 
     def _settle(self) -> list[Batch]:
         return [] if self._identifier is None else self._identified(self._identifier.settle())
@@ -209,9 +223,14 @@ class SerialIntake:
         missing from an incomplete recording instead.
         """
         self._opened = opened
-        yield from self._records(self._restart_decoder)
+        yield from self._packed(self.decode_restart())
+
+    def decode_restart(self) -> list[TimedBatch]:
+        """Return the records that were held back, and discard a partial frame."""
+        records = self._records(self._restart_decoder)
         # After what was held back, which was received before the reconnect.
         self._encoder.restart()
+        return records
 
     def _restart_decoder(self) -> list[Batch]:
         if self._decoder is not None:
@@ -228,19 +247,33 @@ class SerialIntake:
         self._offset = offset
 
     def finish(self) -> Iterator[StampedMessage]:
-        """Return the records that the decoder held back."""
-        yield from self._records(self._settle)
-        if self._decoder is not None:
-            yield from self._records(self._decoder.finish)
+        """Return the messages of the records that the decoder held back."""
+        yield from self._packed(self.decode_finish())
 
-    def _records(self, decode: Callable[[], list[Batch]]) -> list[StampedMessage]:
-        """Return the messages of the batches of ``decode``.
+    def decode_finish(self) -> list[TimedBatch]:
+        """Return the records that the decoder held back, at the end."""
+        records = self._records(self._settle)
+        if self._decoder is not None:
+            records += self._records(self._decoder.finish)
+        return records
+
+    def _packed(self, records: Sequence[TimedBatch]) -> Iterator[StampedMessage]:
+        for batch in records:
+            try:
+                packed = list(pack_records(batch))
+            except Exception as error:  # The decoder may be of another package.
+                self._stop_decoding(error)
+                return
+            yield from packed
+
+    def _records(self, decode: Callable[[], list[Batch]]) -> list[TimedBatch]:
+        """Return the batches of ``decode`` with their times.
 
         An exception ends the decoding, but not the recording of the bytes.
         """
         try:
             batches = decode()
-            stamped = list(self._encoder.messages(batches, self._arrivals, self._last_ns or 0))
+            stamped = list(self._encoder.timed(batches, self._arrivals, self._last_ns or 0))
         except Exception as error:  # The decoder may be of another package.
             self._stop_decoding(error)
             return []
@@ -265,7 +298,8 @@ class SerialIntake:
 
     def count(self, totals: CaptureStatistics) -> None:
         """Write the counts of the decoder, and the records per topic, into ``totals``."""
-        totals.bytes = self._fed
+        # A full disk can end the storage between the raw bytes and their records.
+        totals.bytes = max(self._fed, self._stored)
         if self._decoder is not None:
             self._counts = self._decoder.counts
         counts = self._counts
@@ -409,6 +443,32 @@ class StampedMessage:
     publish_ns: int
 
 
+@dataclass(frozen=True)
+class TimedBatch:
+    """Records of one stream with times of the host's clock.
+
+    Attributes
+    ----------
+    stream : Stream
+    device : str
+        Name of the device in the session.
+    topic : str
+    time_ns : (n,) int64 ndarray
+        Time of each measurement, strictly ascending in a topic.
+    completed_ns : int
+        Time at which the last of them was received.
+    columns : dict of str to ndarray
+        As :attr:`.interface.Batch.columns`, and ``device_ticks``, ``sequence`` as received.
+    """
+
+    stream: Stream
+    device: str
+    topic: str
+    time_ns: NDArray[np.int64]
+    completed_ns: int
+    columns: dict[str, NDArray[Any]]
+
+
 class MessageEncoder:
     """Converts batches of a decoder to messages with times of the host's clock.
 
@@ -462,7 +522,14 @@ class MessageEncoder:
     def messages(
         self, batches: Sequence[Batch], arrivals: ArrivalTimes, now_ns: int
     ) -> Iterator[StampedMessage]:
-        """Yield the messages of ``batches``, which were all complete at ``now_ns``.
+        """Yield the messages of ``batches``; see :meth:`timed`."""
+        for records in self.timed(batches, arrivals, now_ns):
+            yield from pack_records(records)
+
+    def timed(
+        self, batches: Sequence[Batch], arrivals: ArrivalTimes, now_ns: int
+    ) -> Iterator[TimedBatch]:
+        """Yield ``batches``, which were all complete at ``now_ns``, with their times.
 
         Times of measurements are those of the device's ticks, if it sends any, or else the arrival
         times of their last bytes.
@@ -470,30 +537,25 @@ class MessageEncoder:
         for batch in batches:
             if len(batch) == 0:
                 continue
+            device = self.device(batch.stream)
             if batch.stream.kind == "log":
-                yield from self._log(batch, arrivals.read_ns(batch.end), now_ns)
-            else:
-                yield from self._records(batch, self._times(batch, arrivals), now_ns)
-
-    def _records(
-        self, batch: Batch, time_ns: NDArray[np.int64], now_ns: int
-    ) -> Iterator[StampedMessage]:
-        stream, device = batch.stream, self.device(batch.stream)
-        topic, layout, once = _stream_layout(stream, device)
-        time_ns = self._ascending(topic, time_ns)
-        self._first.setdefault(topic, int(time_ns[0]))
-        self.samples[topic] += len(batch)
-        columns: dict[str, NDArray[Any]] = {"time_ns": time_ns, **batch.columns}
-        if stream.kind == "halls":
-            columns["b_tesla"] = self._in_order(stream.names, columns["b_tesla"])
-        if batch.tick is not None:
-            columns["device_ticks"] = batch.tick
-        if batch.sequence is not None:
-            columns["sequence"] = batch.sequence
-        for start in range(0, len(batch), MAX_BATCH_SAMPLES):
-            part = slice(start, start + MAX_BATCH_SAMPLES)
-            message = layout.pack(once, {key: column[part] for key, column in columns.items()})
-            yield StampedMessage(topic, message, now_ns, int(time_ns[start]))
+                read_ns = arrivals.read_ns(batch.end)
+                yield TimedBatch(batch.stream, device, "/log", read_ns, now_ns, batch.columns)
+                continue
+            if batch.stream.kind not in TOPIC_PREFIXES:
+                raise ValueError(f"unknown kind of records: {batch.stream.kind}")
+            topic = TOPIC_PREFIXES[batch.stream.kind] + device
+            time_ns = self._ascending(topic, self._times(batch, arrivals))
+            self._first.setdefault(topic, int(time_ns[0]))
+            self.samples[topic] += len(batch)
+            columns: dict[str, NDArray[Any]] = dict(batch.columns)
+            if batch.stream.kind == "halls":
+                columns["b_tesla"] = self._in_order(batch.stream.names, columns["b_tesla"])
+            if batch.tick is not None:
+                columns["device_ticks"] = batch.tick
+            if batch.sequence is not None:
+                columns["sequence"] = batch.sequence
+            yield TimedBatch(batch.stream, device, topic, time_ns, now_ns, columns)
 
     def _in_order(self, names: tuple[str, ...], field: NDArray[Any]) -> NDArray[Any]:
         """Return fields (n, N) in the order of ``halls.toml``, by the names that a device sends."""
@@ -534,37 +596,61 @@ class MessageEncoder:
         self._last[topic] = int(rising[-1])
         return rising
 
-    def _log(
-        self, batch: Batch, read_ns: NDArray[np.int64], now_ns: int
-    ) -> Iterator[StampedMessage]:
-        name = self.device(batch.stream)
-        rows = zip(batch.columns["level"], batch.columns["text"], read_ns.tolist(), strict=True)
+
+TOPIC_PREFIXES = {
+    "magnetometers": "/magnetometers/",
+    "halls": "/halls/",
+    "lighthouse": "/lighthouse/",
+    "captures": "/captures/",
+    "odometry": "/odometry/",
+    "imu": IMU_TOPIC_PREFIX,
+    "poses": "/onboard_track/",
+    "readings": "/readings/",
+}
+"""Topic of each kind of records, without the name of the device."""
+
+
+def pack_records(records: TimedBatch) -> Iterator[StampedMessage]:
+    """Yield the messages of records with their times."""
+    stream = records.stream
+    if stream.kind == "log":
+        columns = records.columns
+        rows = zip(columns["level"], columns["text"], records.time_ns.tolist(), strict=True)
         for level, text, time_ns in rows:
-            stamp = messages.timestamp(time_ns)
-            line = Log(timestamp=stamp, level=LEVELS[int(level)], message=str(text), name=name)
-            yield StampedMessage("/log", line, now_ns, time_ns)
+            line = Log(
+                timestamp=messages.timestamp(time_ns),
+                level=LEVELS[int(level)],
+                message=str(text),
+                name=records.device,
+            )
+            yield StampedMessage("/log", line, records.completed_ns, time_ns)
+        return
+    layout, fields = _stream_layout(stream, records.device)
+    columns = {"time_ns": records.time_ns, **records.columns}
+    for start in range(0, len(records.time_ns), MAX_BATCH_SAMPLES):
+        part = slice(start, start + MAX_BATCH_SAMPLES)
+        message = layout.pack(fields, {key: column[part] for key, column in columns.items()})
+        yield StampedMessage(
+            records.topic, message, records.completed_ns, int(records.time_ns[start])
+        )
 
 
-def _stream_layout(stream: Stream, device: str) -> tuple[str, Layout, dict[str, Any]]:
-    """Return topic, layout and constant fields of a stream of a device."""
+def _stream_layout(stream: Stream, device: str) -> tuple[Layout, dict[str, Any]]:
+    """Return layout and constant fields of a stream of a device."""
     field: dict[str, Any] = {"device": device, "frame_id": device, "sensors": stream.sensors}
     if stream.kind == "magnetometers":
-        return f"/magnetometers/{device}", messages.magnetometers(stream.sensors), field
+        return messages.magnetometers(stream.sensors), field
     if stream.kind == "halls":
-        return f"/halls/{device}", messages.halls(stream.sensors), field
+        return messages.halls(stream.sensors), field
     if stream.kind == "lighthouse":
-        return f"/lighthouse/{device}", messages.SWEEPS, {"device": device}
+        return messages.SWEEPS, {"device": device}
     if stream.kind == "captures":
-        return f"/captures/{device}", messages.CAPTURES, {"device": device}
+        return messages.CAPTURES, {"device": device}
     if stream.kind == "odometry":
-        once: dict[str, Any] = {"device": device, "frame_id": "odometry"}
-        return f"/odometry/{device}", messages.ODOMETRY, once
+        return messages.ODOMETRY, {"device": device, "frame_id": "odometry"}
     if stream.kind == "imu":
-        return IMU_TOPIC_PREFIX + device, messages.IMU, {"device": device}
+        return messages.IMU, {"device": device}
     if stream.kind == "poses":
-        once = {"device": device, "frame_id": "onboard"}
-        return f"/onboard_track/{device}", messages.POSES, once
-    if stream.kind == "readings":
-        once = {"device": device, "names": stream.names}
-        return f"/readings/{device}", messages.readings(len(stream.names)), once
-    raise ValueError(f"unknown kind of records: {stream.kind}")
+        return messages.POSES, {"device": device, "frame_id": "onboard"}
+    assert stream.kind == "readings"
+    return messages.readings(len(stream.names)), {"device": device, "names": stream.names}
