@@ -68,7 +68,12 @@ _KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
 
 
 def port_of(
-    name: str, *, baud: int, speed: float = 1.0, stop: threading.Event | None = None
+    name: str,
+    *,
+    baud: int,
+    speed: float = 1.0,
+    keeps_time: bool = False,
+    stop: threading.Event | None = None,
 ) -> Port:
     """Return the port of this name, not yet opened.
 
@@ -80,6 +85,8 @@ def port_of(
         Baud rate of a serial port, local or behind ``rfc2217://``.
     speed : float
         Factor on the speed of ``replay:``; 0 is as fast as possible.
+    keeps_time : bool
+        See :class:`.replay.ReplayPort`.
     stop : threading.Event, optional
         Ends the search for a Bluetooth device.
 
@@ -93,7 +100,7 @@ def port_of(
     kind, colon, rest = name.partition(":")
     kind = kind.lower()
     if kind == "replay" and colon:
-        return ReplayPort(name, speed=speed)
+        return ReplayPort(name, speed=speed, keeps_time=keeps_time)
     if kind == "ble" and colon:
         return bluetooth.BluetoothPort(name, stop=stop)
     if kind == "camera" and colon:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,14 +78,25 @@ class PortReader:
     max_waiting_bytes : int
         When so many bytes wait to be written, reading stops until there is space: then the buffers
         of the system fill up, and count their losses.
+    deliver : callable, optional
+        Takes each event in the thread of the reader, as soon as it is there and before
+        :meth:`take` returns it. It must not raise; reading waits for it.
     """
 
     def __init__(
-        self, port: Port, link: Link, clock: HostClock, *, max_waiting_bytes: int = 64 << 20
+        self,
+        port: Port,
+        link: Link,
+        clock: HostClock,
+        *,
+        max_waiting_bytes: int = 64 << 20,
+        deliver: Callable[[Event], None] | None = None,
     ) -> None:
         self._port, self._clock = port, clock
         self._link: Link | None = link
         self._max_waiting = max_waiting_bytes
+        self._deliver = deliver
+        self._is_kept = True
         self._events: deque[Event] = deque()
         self._stop = threading.Event()
         self._attempts = 0
@@ -127,6 +138,19 @@ class PortReader:
         self._taken += sum(event.size for event in events if isinstance(event, ReceivedData))
         return events
 
+    def discard(self) -> None:
+        """Keep no more events for :meth:`take`, because they are only delivered."""
+        self._is_kept = False
+        self.take()
+
+    def _add(self, event: Event) -> None:
+        if self._deliver is not None:
+            self._deliver(event)
+        if self._is_kept:
+            self._events.append(event)
+        elif isinstance(event, ReceivedData):
+            self._taken += event.size
+
     @property
     def overruns(self) -> Overruns:
         """Error counters of the kernel, summed over all links."""
@@ -147,7 +171,7 @@ class PortReader:
         try:
             self._receive()
         except Exception as error:  # Any error of a driver must be reported.
-            self._events.append(SourceEnded(self._clock.now(), f"{type(error).__name__}: {error}"))
+            self._add(SourceEnded(self._clock.now(), f"{type(error).__name__}: {error}"))
         finally:
             self._close()
 
@@ -158,18 +182,18 @@ class PortReader:
             try:
                 self._read(READ_TIMEOUT_S)
             except LinkEnded:
-                self._events.append(SourceEnded(self._clock.now()))
+                self._add(SourceEnded(self._clock.now()))
                 return
             except LinkLost as lost:
                 self._close()
                 if not self._port.can_reconnect:
-                    self._events.append(SourceEnded(self._clock.now(), str(lost)))
+                    self._add(SourceEnded(self._clock.now(), str(lost)))
                     return
-                self._events.append(ConnectionLost(self._clock.now(), str(lost)))
+                self._add(ConnectionLost(self._clock.now(), str(lost)))
                 if not self._reopen():
                     return
                 path = self._port.describe().get("resolved", self._port.name)
-                self._events.append(Reconnected(self._clock.now(), path))
+                self._add(Reconnected(self._clock.now(), path))
                 continue
             while self.received - self._taken > self._max_waiting and not self._stop.is_set():
                 self.pauses += 1
@@ -189,9 +213,10 @@ class PortReader:
             return 0
         self._attempts = 0
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
-        self.last_data_ns = self._clock.now()
-        self._events.append(ReceivedData(self.last_data_ns, data, size))
+        recorded_ns: int | None = getattr(self._link, "time_ns", None)
+        self.last_data_ns = self._clock.now() if recorded_ns is None else recorded_ns
         self.received += size
+        self._add(ReceivedData(self.last_data_ns, data, size))
         self.high_water = max(self.high_water, self.received - self._taken)
         return size
 

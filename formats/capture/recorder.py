@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import Intake, StampedMessage
+from locatk.formats.capture.links import Overruns
 from locatk.formats.capture.reader_thread import (
     ConnectionLost,
     Event,
-    PortReader,
     ReceivedData,
     Reconnected,
     SourceEnded,
@@ -88,12 +89,41 @@ def _split_events(events: Sequence[Event]) -> Iterator[list[Event]]:
     yield piece
 
 
+class EventSource(Protocol):
+    """Source of the events of a recording: a :class:`.reader_thread.PortReader`, or a part of one.
+
+    Attributes are those of the reader.
+    """
+
+    received: int
+    last_data_ns: int
+    high_water: int
+    pauses: int
+
+    @property
+    def overruns(self) -> Overruns:
+        """Error counters of the kernel."""
+
+    @property
+    def dropped(self) -> int:
+        """Frames of a camera that were dropped."""
+
+    def start(self) -> None:
+        """Start reading."""
+
+    def stop(self) -> bool:
+        """End reading; return False if a driver hangs."""
+
+    def take(self) -> Sequence[Event]:
+        """Return all events since the last call."""
+
+
 class Recorder:
     """Records one port.
 
     Parameters
     ----------
-    reader : PortReader
+    reader : EventSource
         Not yet started.
     intake : Intake
     files : RecordingFiles
@@ -105,11 +135,13 @@ class Recorder:
         Takes a :class:`CaptureStatus` once per second.
     observe : callable
         Takes each message of the recording before it is written.
+    further : callable
+        Returns further messages to write, such as poses that were solved meanwhile.
     """
 
     def __init__(
         self,
-        reader: PortReader,
+        reader: EventSource,
         intake: Intake,
         files: RecordingFiles,
         clock: HostClock,
@@ -118,7 +150,9 @@ class Recorder:
         tell: Callable[[str], None],
         show: Callable[[CaptureStatus], None],
         observe: Callable[[StampedMessage], None] | None = None,
+        further: Callable[[], Iterable[StampedMessage]] = tuple,
     ) -> None:
+        self._further = further
         self._reader, self._intake, self._files = reader, intake, files
         self._clock, self._limits = clock, limits
         self._tell, self._show, self._observe = tell, show, observe
@@ -262,6 +296,7 @@ class Recorder:
                 ended = event
         self._take(received)
         self._files.write(self._observed(self._intake.turn(self._clock.now())))
+        self._files.write(self._further())
         self._files.system(self._intake.system)
         self._files.attach(self._intake.artifacts())
         for remark in self._intake.remarks():
@@ -296,6 +331,7 @@ class Recorder:
         if self._disconnected_ns is not None:
             self._totals.gap_s += (self._clock.now() - self._disconnected_ns) * 1e-9
         self._files.write(self._intake.finish())
+        self._files.write(self._further())
         for remark in self._intake.remarks():
             self._report(remark)
 

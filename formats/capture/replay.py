@@ -31,6 +31,8 @@ class ReplayPort:
         ``replay:FILE.mcap``, also with a topic as above, also ``replay://``.
     speed : float
         Factor on the speed of the recording; 0 is as fast as possible.
+    keeps_time : bool
+        Its bytes have the times at which they were recorded, instead of those of the replay.
 
     Raises
     ------
@@ -40,13 +42,13 @@ class ReplayPort:
 
     can_reconnect = False
 
-    def __init__(self, name: str, *, speed: float = 1.0) -> None:
+    def __init__(self, name: str, *, speed: float = 1.0, keeps_time: bool = False) -> None:
         if not (math.isfinite(speed) and speed >= 0):
             raise SourceError(
                 f"{speed} is not a valid speed", hint="Give 1, 10, or 0 for the fastest"
             )
         self.name = name
-        self._speed = speed
+        self._speed, self._keeps_time = speed, keeps_time
         source = name[len(PREFIX) :].removeprefix("//")
         self._file, self._topic = source, ""
         if "#" in source and not os.path.exists(source):
@@ -65,7 +67,7 @@ class ReplayPort:
             ) from None
         self._topic = self._choose_topic(session)
         self._damage = session.damage
-        return ReplayLink(session, self._topic, self._speed)
+        return ReplayLink(session, self._topic, self._speed, keeps_time=self._keeps_time)
 
     def describe(self) -> dict[str, str]:
         """Return ``port``, ``resolved`` (the file), ``speed``; once it was open, ``topic``, and
@@ -99,9 +101,19 @@ class ReplayPort:
 
 
 class ReplayLink:
-    """Chunks of one topic, one per read, each when it is due."""
+    """Chunks of one topic, one per read, each when it is due.
 
-    def __init__(self, session: Session, topic: str, speed: float) -> None:
+    Attributes
+    ----------
+    time_ns : int or None
+        When the bytes of the last read were recorded; None unless ``keeps_time``.
+    """
+
+    def __init__(
+        self, session: Session, topic: str, speed: float, *, keeps_time: bool = False
+    ) -> None:
+        self.time_ns: int | None = None
+        self._keeps_time = keeps_time
         self._chunks = _chunks(session, topic)
         self._speed = speed
         self._next: tuple[int, bytes] | None = None
@@ -122,6 +134,8 @@ class ReplayLink:
             if remaining > wait_s:
                 return b""
         self._next = None
+        if self._keeps_time:
+            self.time_ns = time_ns
         return data
 
     def _next_chunk(self) -> tuple[int, bytes]:

@@ -42,11 +42,19 @@ NAME, CAMERA_NAME = "robot", "camera"
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """Options of ``locatk capture``."""
+    """Options of ``locatk capture``, and of an input of ``locatk live``.
+
+    Attributes
+    ----------
+    output : Path or None
+        None if nothing is recorded.
+    keeps_time : bool
+        A replayed session has the times of its recording, instead of those of the replay.
+    """
 
     port: str
     device: str
-    output: Path
+    output: Path | None
     artifacts: tuple[Path, ...] = ()
     note: str | None = None
     meta: Mapping[str, str] = field(default_factory=dict)
@@ -58,6 +66,7 @@ class CaptureRequest:
     image: str = "jpeg"
     wait_s: float = 0.0
     overwrite: bool = False
+    keeps_time: bool = False
 
     @property
     def is_camera(self) -> bool:
@@ -103,36 +112,85 @@ def record(
     LocatkError
         The request, an artifact, the output or the port is invalid; no file was written.
     """
-    _check_name(request.device_name)
-    content = _artifacts(request)
-    check_outputs(
-        request.output,
-        numbered=request.numbered,
-        overwrite=request.overwrite,
-        inputs=[*request.artifacts, *_replayed_paths(request.port)],
-    )
-    _check_disk(request.output.parent, request.limits.reserve_bytes)
     clock = HostClock()
-    intake = _intake(request, content)
-    port = _port(request, clock, stop)
-    link = _open_port(port, request.wait_s, stop, waiting)
+    source = open_source(request, clock, stop, waiting=waiting)
     try:
-        ready(port.name)
-        facts = _facts(request, port, clock)
-        files = RecordingFiles(
-            request.output,
-            FileContent(facts, content, intake.declared),
-            numbered=request.numbered,
-            overwrite=request.overwrite,
-        )
+        ready(source.port.name)
+        files = create_files(request, source, clock)
     except BaseException:
-        link.close()
+        source.link.close()
         raise
-    reader = PortReader(port, link, clock)
+    reader = PortReader(source.port, source.link, clock)
     recorder = Recorder(
-        reader, intake, files, clock, request.limits, tell=tell, show=show, observe=observe
+        reader, source.intake, files, clock, request.limits, tell=tell, show=show, observe=observe
     )
     return recorder.run(stop)
+
+
+@dataclass(frozen=True)
+class OpenSource:
+    """Open port of a request, before its first byte.
+
+    Attributes
+    ----------
+    port : Port
+    link : Link
+        To be closed, or given to a reader.
+    intake : Intake
+    artifacts : dict of str to str
+        Attachments, name to text.
+    """
+
+    port: Port
+    link: Link
+    intake: Intake
+    artifacts: dict[str, str]
+
+
+def open_source(
+    request: CaptureRequest,
+    clock: HostClock,
+    stop: threading.Event,
+    *,
+    waiting: Callable[[str], None] = lambda port: None,
+) -> OpenSource:
+    """Check a request and open its port.
+
+    Raises
+    ------
+    LocatkError
+        As :func:`record`.
+    """
+    _check_name(request.device_name)
+    content = _artifacts(request)
+    if request.output is not None:
+        check_outputs(
+            request.output,
+            numbered=request.numbered,
+            overwrite=request.overwrite,
+            inputs=[*request.artifacts, *_replayed_paths(request.port)],
+        )
+        _check_disk(request.output.parent, request.limits.reserve_bytes)
+    intake = create_intake(request, content)
+    port = _port(request, clock, stop)
+    return OpenSource(port, _open_port(port, request.wait_s, stop, waiting), intake, content)
+
+
+def create_files(request: CaptureRequest, source: OpenSource, clock: HostClock) -> RecordingFiles:
+    """Create the file of a recording; ``request`` has an output.
+
+    Raises
+    ------
+    LocatkError
+        See :class:`.recording_files.LiveFile`.
+    """
+    assert request.output is not None
+    return RecordingFiles(
+        request.output,
+        FileContent(_facts(request, source.port, clock), source.artifacts, source.intake.declared),
+        numbered=request.numbered,
+        overwrite=request.overwrite,
+    )
 
 
 def _artifacts(request: CaptureRequest) -> dict[str, str]:
@@ -199,7 +257,14 @@ def _check_disk(folder: Path, reserve: int) -> None:
         )
 
 
-def _intake(request: CaptureRequest, content: Mapping[str, str]) -> Intake:
+def create_intake(request: CaptureRequest, content: Mapping[str, str]) -> Intake:
+    """Return the conversion of received data to messages.
+
+    Raises
+    ------
+    InputError
+        There is no such device.
+    """
     if request.is_camera:
         if request.device != AUTO:
             raise InputError(
@@ -229,7 +294,13 @@ def _port(request: CaptureRequest, clock: HostClock, stop: threading.Event) -> P
         )
     known = None if request.device == AUTO else find_device(request.device)
     baud = request.baud or (known.baud if known else 115_200)
-    return ports.port_of(request.port, baud=baud, speed=request.speed, stop=stop)
+    return ports.port_of(
+        request.port,
+        baud=baud,
+        speed=request.speed,
+        keeps_time=request.keeps_time,
+        stop=stop,
+    )
 
 
 def _facts(request: CaptureRequest, port: Port, clock: HostClock) -> dict[str, str]:
