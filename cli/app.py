@@ -32,6 +32,10 @@ COMMANDS = {
         "locatk.cli.capture.command",
         "Record a serial device or a camera into a session.",
     ),
+    "live": (
+        "locatk.cli.live.command",
+        "Localize devices while they move, and publish the poses.",
+    ),
     "emulate": ("locatk.cli.emulate", "Emulate a serial device on a pseudo-terminal."),
     "import": ("locatk.cli.import_.command", "Import recordings of other tools as a session."),
     "simulate": ("locatk.cli.simulate", "Simulate a session with ground truth."),

@@ -95,10 +95,21 @@ class EventSource(Protocol):
     Attributes are those of the reader.
     """
 
-    received: int
-    last_data_ns: int
-    high_water: int
-    pauses: int
+    @property
+    def received(self) -> int:
+        """Bytes so far."""
+
+    @property
+    def last_data_ns(self) -> int:
+        """When the last of them were read."""
+
+    @property
+    def high_water(self) -> int:
+        """Most bytes that waited to be taken."""
+
+    @property
+    def pauses(self) -> int:
+        """How often reading stopped because too much was waiting."""
 
     @property
     def overruns(self) -> Overruns:

@@ -11,9 +11,11 @@ import math
 import os
 import time
 from collections.abc import Generator
+from typing import Any
 
 from locatk.core.errors import InputError, LocatkError
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
+from locatk.formats.emulation.sources import select_source
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 
@@ -32,7 +34,8 @@ class ReplayPort:
     speed : float
         Factor on the speed of the recording; 0 is as fast as possible.
     keeps_time : bool
-        Its bytes have the times at which they were recorded, instead of those of the replay.
+        Its bytes have the times at which they were recorded, instead of those of the replay. A
+        session without raw bytes is encoded as a device would send it.
 
     Raises
     ------
@@ -48,7 +51,7 @@ class ReplayPort:
                 f"{speed} is not a valid speed", hint="Give 1, 10, or 0 for the fastest"
             )
         self.name = name
-        self._speed, self._keeps_time = speed, keeps_time
+        self._speed, self.keeps_time = speed, keeps_time
         source = name[len(PREFIX) :].removeprefix("//")
         self._file, self._topic = source, ""
         if "#" in source and not os.path.exists(source):
@@ -67,7 +70,8 @@ class ReplayPort:
             ) from None
         self._topic = self._choose_topic(session)
         self._damage = session.damage
-        return ReplayLink(session, self._topic, self._speed, keeps_time=self._keeps_time)
+        chunks = _chunks(session, self._topic) if self._topic else _encoded(session)
+        return ReplayLink(chunks, self._speed, keeps_time=self.keeps_time)
 
     def describe(self) -> dict[str, str]:
         """Return ``port``, ``resolved`` (the file), ``speed``; once it was open, ``topic``, and
@@ -86,6 +90,8 @@ class ReplayPort:
         topics = session.topics("", SCHEMA)
         if self._topic in topics:
             return self._topic
+        if not topics and self.keeps_time and not self._topic:
+            return ""
         if len(topics) == 1 and not self._topic:
             return topics[0]
         if topics:
@@ -101,7 +107,15 @@ class ReplayPort:
 
 
 class ReplayLink:
-    """Chunks of one topic, one per read, each when it is due.
+    """Chunks of a recording, one per read, each when it is due.
+
+    Parameters
+    ----------
+    chunks : generator
+        Yields (time in ns, result of a read).
+    speed : float
+    keeps_time : bool
+        See :class:`ReplayPort`.
 
     Attributes
     ----------
@@ -110,17 +124,21 @@ class ReplayLink:
     """
 
     def __init__(
-        self, session: Session, topic: str, speed: float, *, keeps_time: bool = False
+        self,
+        chunks: Generator[tuple[int, Any], None, None],
+        speed: float,
+        *,
+        keeps_time: bool = False,
     ) -> None:
         self.time_ns: int | None = None
         self._keeps_time = keeps_time
-        self._chunks = _chunks(session, topic)
+        self._chunks = chunks
         self._speed = speed
-        self._next: tuple[int, bytes] | None = None
+        self._next: tuple[int, Any] | None = None
         self._start: tuple[float, int] | None = None
         self._end: LinkEnded | LinkLost | None = None
 
-    def read(self, wait_s: float) -> bytes:
+    def read(self, wait_s: float) -> Any:
         """Return the next chunk when it is due; see :class:`.links.Link`."""
         time_ns, data = self._next_chunk()
         if self._speed:
@@ -138,7 +156,7 @@ class ReplayLink:
             self.time_ns = time_ns
         return data
 
-    def _next_chunk(self) -> tuple[int, bytes]:
+    def _next_chunk(self) -> tuple[int, Any]:
         if self._end is not None:
             raise self._end
         if self._next is None:
@@ -178,3 +196,11 @@ def _chunks(session: Session, topic: str) -> Generator[tuple[int, bytes], None, 
         raise LinkLost(f"{error}; `locatk recover` saves the rest") from error
     if session.damage is not None:
         raise LinkLost(f"{session.path}: {session.damage}")
+
+
+def _encoded(session: Session) -> Generator[tuple[int, bytes], None, None]:
+    """Yield the bytes of observations as a device would send them."""
+    try:
+        yield from select_source(session).packets()
+    except InputError as error:
+        raise LinkLost(str(error)) from error

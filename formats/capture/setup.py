@@ -224,9 +224,11 @@ def _open_port(
 
 def _replayed_paths(port: str) -> list[Path]:
     """Return the possible paths of a replayed file, with and without a topic."""
-    if not port.startswith(replay.PREFIX):
+    prefix = next((each for each in (replay.PREFIX, CAMERA) if port.startswith(each)), None)
+    source = port.removeprefix(prefix or "").removeprefix("//")
+    is_session = ".mcap" in source.lower()
+    if prefix is None or (prefix == CAMERA and not is_session):
         return []
-    source = port.removeprefix(replay.PREFIX).removeprefix("//")
     return [Path(source), Path(source.rpartition("#")[0] or source)]
 
 
@@ -285,9 +287,15 @@ def _port(request: CaptureRequest, clock: HostClock, stop: threading.Event) -> P
     if request.is_camera:
         # OpenCV is slow to import, and not needed for bytes.
         from locatk.formats.capture.camera import camera_port
+        from locatk.formats.capture.session_frames import SessionFramesPort
 
+        address = request.port.removeprefix(CAMERA)
+        if address.rpartition("#/")[0].lower().endswith(".mcap") or (
+            address.lower().endswith(".mcap")
+        ):
+            return SessionFramesPort(address, speed=request.speed)
         return camera_port(
-            request.port.removeprefix(CAMERA),
+            address,
             clock=clock.now,
             speed=request.speed,
             format=request.image,

@@ -273,13 +273,13 @@ def read_halls(
             each.device,
             each.geometry,
             each.time_ns,
-            _restore_saturation(each.field_t[:, :, 0], each.geometry.range_t),
+            restore_saturation(each.field_t[:, :, 0], each.geometry.range_t),
         )
         for each in _read(session, HALLS, fallback)
     ]
 
 
-def _restore_saturation(field_t: NDArray[np.float64], range_t: float) -> NDArray[np.float64]:
+def restore_saturation(field_t: NDArray[np.float64], range_t: float) -> NDArray[np.float64]:
     """Raise fields to the range that were at the range before they were rounded to float32."""
     is_saturated = np.abs(field_t) >= np.float32(range_t)
     saturated = np.copysign(np.maximum(np.abs(field_t), range_t), field_t)

@@ -1,0 +1,434 @@
+"""Inputs of a live session: an open port, its reader thread, and a decoder for the solver."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from locatk.core.errors import LocatkError
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.ingestion import (
+    AUTO,
+    CameraIntake,
+    SerialIntake,
+    StampedMessage,
+    TimedBatch,
+)
+from locatk.formats.capture.links import Overruns
+from locatk.formats.capture.reader_thread import (
+    ConnectionLost,
+    Event,
+    PortReader,
+    ReceivedData,
+    Reconnected,
+    SourceEnded,
+)
+from locatk.formats.capture.recorder import Recorder
+from locatk.formats.capture.replay import PREFIX as REPLAY
+from locatk.formats.capture.setup import (
+    CAMERA,
+    CaptureRequest,
+    OpenSource,
+    create_files,
+    create_intake,
+    open_source,
+)
+from locatk.formats.capture.status import RecordingResult
+from locatk.formats.emulation.sources import select_source
+from locatk.formats.live.observations import (
+    AttachedArtifacts,
+    Observations,
+    RecordConverter,
+    frame_observations,
+)
+from locatk.formats.sessions.capture_statistics import CaptureStatistics
+from locatk.formats.sessions.frames import SCHEMAS, TOPIC
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
+from locatk.formats.sessions.reader import Session
+
+MAX_WAITING_BYTES = 8 << 20
+"""Received bytes that wait for the solver, beyond which those of a device are left out: more than
+two seconds of the fastest serial ports. A replayed file waits instead."""
+
+WAIT_S = 0.002
+"""Interval at which a replayed file checks whether the solver has caught up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """Event of an input for the solver.
+
+    Attributes
+    ----------
+    source : int
+        Number of the input.
+    event : Event
+    received_s : float
+        ``time.monotonic()`` when it came.
+    """
+
+    source: int
+    event: Event
+    received_s: float
+
+
+class ArrivalQueue:
+    """Queue from the readers to the solver; bounded, without locks held while a reader waits."""
+
+    def __init__(self) -> None:
+        self._arrivals: deque[Arrival] = deque()
+        self._is_filled = threading.Event()
+
+    def put(self, arrival: Arrival) -> None:
+        """Add an event and wake up the solver."""
+        self._arrivals.append(arrival)
+        self._is_filled.set()
+
+    def take(self, wait_s: float) -> list[Arrival]:
+        """Return all events; wait for the first one, at most ``wait_s``."""
+        if not self._arrivals and not self._is_filled.wait(wait_s):
+            return []
+        self._is_filled.clear()
+        return [self._arrivals.popleft() for _ in range(len(self._arrivals))]
+
+
+@dataclass(frozen=True)
+class InputNotice:
+    """Change of an input that its users must know.
+
+    Attributes
+    ----------
+    text : str
+    is_connected : bool
+    """
+
+    text: str
+    is_connected: bool
+
+
+class LiveInput:
+    """One input of a live session.
+
+    Parameters
+    ----------
+    number : int
+        Its index among the inputs.
+    request : CaptureRequest
+        With ``output`` if it is recorded.
+    source : OpenSource
+    clock : HostClock
+    queue : ArrivalQueue
+        Takes its events.
+
+    Attributes
+    ----------
+    name : str
+        Name of the device in topics.
+    is_paced : bool
+        Its bytes come in real time; otherwise it waits for the solver.
+    keeps_time : bool
+        Its bytes have the times of a recording.
+    is_connected, is_ended : bool
+    dropped_bytes : int
+        Bytes that the solver did not take because it was late.
+    recording : RecordingResult or None
+        Result of the recorder, once it has ended.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        request: CaptureRequest,
+        source: OpenSource,
+        clock: HostClock,
+        queue: ArrivalQueue,
+    ) -> None:
+        self.number, self.request = number, request
+        self.name = request.device_name
+        self.port = source.port.name
+        self.is_paced = source.port.can_reconnect
+        self.keeps_time = getattr(source.port, "keeps_time", False)
+        self.is_connected, self.is_ended = True, False
+        self.dropped_bytes = 0
+        self.recording: RecordingResult | None = None
+        self.artifacts = AttachedArtifacts(source.artifacts)
+        self._clock, self._queue = clock, queue
+        # Each is written by one thread only.
+        self._delivered_bytes = self._taken_bytes = 0
+        self._is_dropping = self._is_stopping = False
+        self._frames = 0
+        self._decoder = create_intake(request, source.artifacts)
+        self._converter = RecordConverter(self.artifacts)
+        self._reader = PortReader(source.port, source.link, clock, deliver=self._deliver)
+        self._stop_recorder = threading.Event()
+        self._source = source
+        self._thread: threading.Thread | None = None
+
+    # ---- reader and recorder
+
+    def start(
+        self,
+        *,
+        tell: Callable[[str], None],
+        further: Callable[[], Sequence[StampedMessage]],
+    ) -> None:
+        """Start reading, and recording if the request has an output.
+
+        Parameters
+        ----------
+        tell : callable
+            Takes messages of the recorder.
+        further : callable
+            Returns messages to record besides those of the input.
+        """
+        if self.request.output is None:
+            self._reader.discard()
+        else:
+            files = create_files(self.request, self._source, self._clock)
+            shared = SharedReader(self._reader)
+            recorder = Recorder(
+                shared,
+                self._source.intake,
+                files,
+                self._clock,
+                self.request.limits,
+                tell=tell,
+                show=lambda status: None,
+                further=further,
+            )
+            self._thread = threading.Thread(
+                target=self._record,
+                args=(recorder, shared, tell),
+                name="locatk-recorder",
+                daemon=True,
+            )
+            self._thread.start()
+        self._reader.start()
+
+    def _record(
+        self, recorder: Recorder, shared: SharedReader, tell: Callable[[str], None]
+    ) -> None:
+        try:
+            self.recording = recorder.run(self._stop_recorder)
+        except Exception as error:  # A fault of the recorder must not end the solver.
+            tell(f"the recording failed: {type(error).__name__}: {error}")
+            return
+        finally:
+            shared.detach()
+        if self.recording.failed and not self.is_ended:
+            tell(f"the recording ended: {self.recording.ended}")
+
+    def stop_reading(self) -> None:
+        """End reading; what has arrived is delivered."""
+        self._is_stopping = True
+        self._reader.stop()
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that wait for the solver."""
+        return self._delivered_bytes - self._taken_bytes
+
+    def stop_recording(self, timeout_s: float) -> None:
+        """End the recording, and finish its files."""
+        self._stop_recorder.set()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    @property
+    def is_recording(self) -> bool:
+        """Return whether its bytes are being recorded."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def _deliver(self, event: Event) -> None:
+        """Queue an event for the solver; runs in the thread of the reader."""
+        received_s = time.monotonic()
+        if isinstance(event, ReceivedData):
+            while not self.is_paced and self.waiting_bytes > MAX_WAITING_BYTES:
+                if self._is_stopping:
+                    break
+                time.sleep(WAIT_S)
+            if self.is_paced and self.waiting_bytes + event.size > MAX_WAITING_BYTES:
+                self.dropped_bytes += event.size
+                self._is_dropping = True
+                return
+            if self._is_dropping:
+                self._is_dropping = False
+                text = "the solver was late: bytes were left out"
+                self._queue.put(Arrival(self.number, ConnectionLost(event.time_ns, text), 0.0))
+                self._queue.put(Arrival(self.number, Reconnected(event.time_ns, ""), received_s))
+            self._delivered_bytes += event.size
+        self._queue.put(Arrival(self.number, event, received_s))
+
+    # ---- decoder, in the thread of the solver
+
+    def decode(self, events: Sequence[Event]) -> Iterator[Observations | InputNotice]:
+        """Yield the observations and notices of successive events.
+
+        Raises
+        ------
+        LocatkError
+            An artifact that the records need is missing.
+        """
+        received: list[ReceivedData] = []
+        for event in events:
+            if isinstance(event, ReceivedData):
+                received.append(event)
+                self._taken_bytes += event.size
+                continue
+            yield from self._observations(received)
+            received = []
+            if isinstance(event, ConnectionLost):
+                self.is_connected = False
+                yield InputNotice(f"connection lost: {event.why}", is_connected=False)
+            elif isinstance(event, Reconnected):
+                self.is_connected = True
+                if isinstance(self._decoder, SerialIntake):
+                    yield from self._converted(self._decoder.decode_restart())
+                yield InputNotice(f"reconnected to {event.path}", is_connected=True)
+            elif isinstance(event, SourceEnded):
+                self.is_connected, self.is_ended = False, True
+                if isinstance(self._decoder, SerialIntake):
+                    yield from self._converted(self._decoder.decode_finish())
+                if event.error is not None:
+                    yield InputNotice(event.error, is_connected=False)
+        yield from self._observations(received)
+
+    def identify(self, now_ns: int) -> Iterator[Observations | InputNotice]:
+        """Yield the observations of a device that is identified by the time that has passed."""
+        if isinstance(self._decoder, SerialIntake):
+            yield from self._converted(self._decoder.decode_identified(now_ns))
+
+    def _observations(
+        self, received: Sequence[ReceivedData]
+    ) -> Iterator[Observations | InputNotice]:
+        if not received:
+            return
+        if isinstance(self._decoder, CameraIntake):
+            for each in received:
+                yield from frame_observations(self.name, each.data, self._frames)
+                self._frames += len(each.data)
+            return
+        assert isinstance(self._decoder, SerialIntake)
+        yield from self._converted(self._decoder.decode(received))
+
+    def _converted(self, records: Sequence[TimedBatch]) -> Iterator[Observations | InputNotice]:
+        self.artifacts.add(self._decoder.artifacts())
+        yield from self._converter.observations(records)
+        for remark in self._decoder.remarks():
+            yield InputNotice(remark, is_connected=self.is_connected)
+
+    def totals(self) -> CaptureStatistics:
+        """Return the counts of the decoder."""
+        totals = CaptureStatistics()
+        self._decoder.count(totals)
+        totals.bytes = self._reader.received
+        totals.dropped = self._reader.dropped
+        return totals
+
+
+class SharedReader:
+    """Reader for a recorder that neither starts nor stops it, because the solver uses it as well.
+
+    Attributes are those of :class:`.reader_thread.PortReader`.
+    """
+
+    def __init__(self, reader: PortReader) -> None:
+        self._reader = reader
+
+    @property
+    def received(self) -> int:
+        """Bytes so far."""
+        return self._reader.received
+
+    @property
+    def last_data_ns(self) -> int:
+        """When the last of them were read."""
+        return self._reader.last_data_ns
+
+    @property
+    def high_water(self) -> int:
+        """Most bytes that waited for the recorder."""
+        return self._reader.high_water
+
+    @property
+    def pauses(self) -> int:
+        """How often reading stopped because too much was waiting."""
+        return self._reader.pauses
+
+    @property
+    def overruns(self) -> Overruns:
+        """Error counters of the kernel."""
+        return self._reader.overruns
+
+    @property
+    def dropped(self) -> int:
+        """Frames of a camera that arrived faster than they were taken."""
+        return self._reader.dropped
+
+    def start(self) -> None:
+        """Do nothing: the session starts the reader."""
+
+    def stop(self) -> bool:
+        """Do nothing: the session stops the reader."""
+        return True
+
+    def detach(self) -> None:
+        """Keep no more events for a recorder that has ended."""
+        self._reader.discard()
+
+    def take(self) -> Sequence[Event]:
+        """Return all events since the last call."""
+        return self._reader.take()
+
+
+def open_inputs(
+    requests: Sequence[CaptureRequest],
+    clock: HostClock,
+    stop: threading.Event,
+    queue: ArrivalQueue,
+    *,
+    waiting: Callable[[str], None],
+) -> list[LiveInput]:
+    """Open all inputs, or none.
+
+    Raises
+    ------
+    LocatkError
+        See :func:`.setup.open_source`.
+    """
+    inputs: list[LiveInput] = []
+    try:
+        for number, request in enumerate(requests):
+            # The recorder has an intake of its own: it goes on if the solver fails.
+            request = _as_source(request)
+            source = open_source(request, clock, stop, waiting=waiting)
+            inputs.append(LiveInput(number, request, source, clock, queue))
+    except LocatkError:
+        for each in inputs:
+            each.stop_reading()
+        raise
+    return inputs
+
+
+def _as_source(request: CaptureRequest) -> CaptureRequest:
+    """Return the request of a replay with the kind of its data: frames, or bytes of a device."""
+    if not (request.port.lower().startswith(REPLAY) and request.keeps_time):
+        return request
+    file = request.port[len(REPLAY) :].removeprefix("//")
+    if not os.path.exists(file):
+        return request
+    session = Session.open(file, damaged_ok=True)
+    if any(session.topics("/serial/")):
+        recorded_by = session.metadata().get(CAPTURE_RECORD, {}).get("device")
+        return (
+            replace(request, device=recorded_by)
+            if recorded_by and request.device == AUTO
+            else request
+        )
+    if any(session.topics(TOPIC, schema) for schema in SCHEMAS):
+        return replace(request, port=f"{CAMERA}{file}")
+    return replace(request, device=select_source(session).device)

@@ -1,0 +1,496 @@
+"""Live session: inputs to a stream, its estimates to sinks and into the recording.
+
+There is one thread per input that only reads; one per recording; this one, which decodes and
+solves; and those of the sinks. A sink, a recorder or a background computation never delays the
+solver (docs/live.md).
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Any
+
+from locatk.core.errors import LocatkError
+from locatk.core.solution import SolverWarning
+from locatk.core.streaming.events import (
+    ArtifactUpdate,
+    LiveEvent,
+    PoseEstimate,
+    StateChange,
+    TrackingState,
+    WarningEvent,
+)
+from locatk.core.streaming.localizer import LiveLocalizer
+from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.setup import CaptureRequest
+from locatk.formats.capture.status import RecordingResult
+from locatk.formats.live.background import BackgroundWorker
+from locatk.formats.live.inputs import (
+    Arrival,
+    ArrivalQueue,
+    InputNotice,
+    LiveInput,
+    open_inputs,
+)
+from locatk.formats.live.observations import Observations, system_of
+from locatk.formats.live.recorded_events import RecordedEvents
+from locatk.formats.live.streams import StreamOptions, create_stream, system_of_artifacts
+from locatk.formats.sinks.interface import LiveMessage, Sink, SinkContext
+
+TICK_S = 0.05
+"""Longest wait for data, and interval at which the stream learns how much time has passed."""
+
+ARRIVAL_DELAY_NS = 200_000_000
+"""Age from which an observation that has not arrived is missing: buffers of USB and Bluetooth."""
+
+MAX_LATENESS_S = 0.2
+"""Time by which the solver may be behind the last received byte before that is reported."""
+
+CLOSE_TIMEOUT_S = 2.0
+"""Time for each sink to send what is waiting at the end."""
+
+RECORDING_TIMEOUT_S = 30.0
+"""Time for a recording to finish its files; a slow disk may have a backlog."""
+
+
+@dataclass
+class DeviceStatus:
+    """State of one device.
+
+    Attributes
+    ----------
+    state : TrackingState
+    reason : str
+    pose : PoseEstimate or None
+        The newest one.
+    poses : int
+        Number of poses.
+    rate_hz : float
+        Poses per second in the last seconds.
+    latency_s : float
+        From the last byte to the newest pose at the sinks.
+    """
+
+    state: TrackingState = TrackingState.LOST
+    reason: str = ""
+    pose: PoseEstimate | None = None
+    poses: int = 0
+    rate_hz: float = 0.0
+    latency_s: float = 0.0
+    _counted: tuple[float, int] = (0.0, 0)
+
+    def count(self, now_s: float) -> None:
+        """Update the rate once a second."""
+        start_s, poses = self._counted
+        if now_s - start_s >= 1.0:
+            self.rate_hz = (self.poses - poses) / (now_s - start_s) if start_s else 0.0
+            self._counted = (now_s, self.poses)
+
+
+@dataclass
+class LiveResult:
+    """Result of a live session.
+
+    Attributes
+    ----------
+    ended : str
+        Reason of the end: ``"stopped"``, ``"duration"``, ``"end of the source"``, or an error.
+    failed : bool
+    system : str
+    poses : dict of str to int
+        Number of poses by device.
+    recordings : list of RecordingResult
+    status : dict
+        As :meth:`LiveSession.status` at the end.
+    """
+
+    ended: str
+    failed: bool
+    system: str
+    poses: dict[str, int]
+    recordings: list[RecordingResult]
+    status: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """Options of ``locatk live``.
+
+    Attributes
+    ----------
+    inputs : tuple of CaptureRequest
+        With ``output`` if they are recorded.
+    stream : StreamOptions
+    duration_s : float or None
+    token : str or None
+        Secret for clients of servers that do not listen on the loopback address.
+    """
+
+    inputs: tuple[CaptureRequest, ...]
+    stream: StreamOptions = field(default_factory=StreamOptions)
+    duration_s: float | None = None
+    token: str | None = None
+
+
+class LiveSession:
+    """Runs a live session.
+
+    Parameters
+    ----------
+    request : LiveRequest
+    sinks : sequence of Sink
+        Not yet open.
+    tell : callable
+        Takes messages for the user.
+    """
+
+    def __init__(
+        self, request: LiveRequest, sinks: Sequence[Sink], *, tell: Callable[[str], None]
+    ) -> None:
+        self._request, self._sinks, self._tell = request, sinks, tell
+        self._clock = HostClock()
+        self._queue = ArrivalQueue()
+        self._inputs: list[LiveInput] = []
+        self._recorded: list[RecordedEvents] = []
+        self._localizer: LiveLocalizer | None = None
+        self._worker = BackgroundWorker()
+        self._artifacts: dict[str, Any] = {}
+        self._devices: dict[str, DeviceStatus] = {}
+        self._warnings: Counter[str] = Counter()
+        self._lateness_s = 0.0
+        self._is_late = False
+        self._is_sink_open = False
+        self._started_s = 0.0
+        self._newest_ns = 0
+        self._scene_version = 0
+        self.system = ""
+
+    # ---- life
+
+    def run(
+        self,
+        stop: threading.Event,
+        *,
+        ready: Callable[[], None] = lambda: None,
+        waiting: Callable[[str], None] = lambda port: None,
+    ) -> LiveResult:
+        """Run until ``stop`` is set, the time is over, or all inputs have ended.
+
+        Parameters
+        ----------
+        stop : threading.Event
+        ready : callable
+            Called once inputs and sinks are open.
+        waiting : callable
+            Takes the error of a port that is not yet available.
+
+        Raises
+        ------
+        LocatkError
+            An input, an artifact or a sink is invalid, or an artifact that the data require is
+            missing.
+        """
+        inputs = open_inputs(self._request.inputs, self._clock, stop, self._queue, waiting=waiting)
+        self._inputs = inputs
+        ended, is_failed = "stopped", False
+        try:
+            self._prepare()
+            self._open_sinks()
+            self._start()
+            ready()
+            ended = self._work(stop)
+        except LocatkError:
+            is_failed = True
+            raise
+        finally:
+            self._close(solve_rest=not is_failed)
+        recordings = [each.recording for each in inputs if each.recording is not None]
+        return LiveResult(
+            ended,
+            any(each.failed for each in recordings),
+            self.system,
+            {name: device.poses for name, device in self._devices.items()},
+            recordings,
+            self.status(),
+        )
+
+    def _prepare(self) -> None:
+        texts: dict[str, str] = {}
+        for each in self._inputs:
+            texts |= each.artifacts.texts
+        system = system_of_artifacts(texts)
+        if system:
+            self._create_localizer(system)
+        self._worker = BackgroundWorker(is_synchronous=self._is_replay)
+
+    def _create_localizer(self, system: str) -> None:
+        stream, self._artifacts = create_stream(
+            system, [each.artifacts for each in self._inputs], self._request.stream
+        )
+        self.system = system
+        self._localizer = LiveLocalizer(stream)
+
+    def _open_sinks(self) -> None:
+        context = SinkContext(
+            self.system,
+            self._artifacts,
+            tuple(dict.fromkeys(each.name for each in self._inputs)),
+            self._request.token,
+            self.status,
+        )
+        opened: list[Sink] = []
+        try:
+            for sink in self._sinks:
+                sink.open(context)
+                opened.append(sink)
+        except LocatkError:
+            for sink in opened:
+                sink.close(0.0)
+            raise
+        self._is_sink_open = True
+
+    def _start(self) -> None:
+        # Objects of the imports are no garbage: a search through them takes 13 ms.
+        gc.collect()
+        gc.freeze()
+        self._started_s = time.monotonic()
+        for each in self._inputs:
+            recorded = RecordedEvents()
+            self._recorded.append(recorded)
+            each.start(tell=self._tell, further=recorded.take)
+
+    def _close(self, *, solve_rest: bool) -> None:
+        for each in self._inputs:
+            each.stop_reading()
+        if solve_rest:
+            self._take(self._queue.take(0.0))
+            if self._localizer is not None:
+                self._publish(self._localizer.finish(), time.monotonic())
+        self._worker.close()
+        for each in self._inputs:
+            each.stop_recording(RECORDING_TIMEOUT_S)
+        if self._is_sink_open:
+            closing = [
+                threading.Thread(target=sink.close, args=(CLOSE_TIMEOUT_S,), daemon=True)
+                for sink in self._sinks
+            ]
+            for thread in closing:
+                thread.start()
+            for thread in closing:
+                thread.join(CLOSE_TIMEOUT_S + 0.5)
+        gc.unfreeze()
+
+    # ---- solver
+
+    def _work(self, stop: threading.Event) -> str:
+        advanced_s = time.monotonic()
+        while True:
+            arrivals = self._queue.take(TICK_S)
+            self._take(arrivals)
+            now_s = time.monotonic()
+            if now_s - advanced_s >= TICK_S:
+                advanced_s = now_s
+                self._advance(now_s)
+            self._serve_background()
+            if stop.is_set():
+                return "stopped"
+            duration_s = self._request.duration_s
+            if duration_s is not None and now_s - self._started_s >= duration_s:
+                return "duration"
+            if not arrivals and all(each.is_ended for each in self._inputs):
+                return "end of the source"
+
+    def _take(self, arrivals: Sequence[Arrival]) -> None:
+        """Decode and solve what has arrived."""
+        for number, group in groupby(arrivals, key=lambda arrival: arrival.source):
+            batch = list(group)
+            received_s = batch[-1].received_s
+            self._check_lateness(batch[0].received_s)
+            source = self._inputs[number]
+            self._solve(source, source.decode([each.event for each in batch]), received_s)
+
+    def _solve(
+        self,
+        source: LiveInput,
+        observations: Iterable[Observations | InputNotice],
+        received_s: float,
+    ) -> None:
+        for each in observations:
+            if isinstance(each, InputNotice):
+                self._report(source.name, "input", each.text, received_s)
+                continue
+            if self._localizer is None:
+                system = system_of(each)
+                if not system:
+                    continue  # Odometry before the first sample of a sensor.
+                self._create_localizer(system)
+            assert self._localizer is not None
+            system = system_of(each)
+            if system and system != self.system:
+                self._report_once("other_system", f"data of {system} are not used", received_s)
+                continue
+            self._newest_ns = max(self._newest_ns, _last_ns(each))
+            self._publish(self._localizer.push(each), received_s)
+
+    def _advance(self, now_s: float) -> None:
+        """Tell the stream that time has passed."""
+        for source in self._inputs:
+            self._solve(source, source.identify(self._clock.now()), now_s)
+        for device in self._devices.values():
+            device.count(now_s)
+        if self._localizer is None:
+            return
+        time_ns = self._newest_ns if self._is_replay else self._clock.now()
+        if time_ns > ARRIVAL_DELAY_NS:
+            self._publish(self._localizer.advance(time_ns - ARRIVAL_DELAY_NS), now_s)
+
+    @property
+    def _is_replay(self) -> bool:
+        """Return whether time is that of recordings, and stands still while the solver works."""
+        return all(each.keeps_time for each in self._inputs)
+
+    def _serve_background(self) -> None:
+        if self._localizer is None:
+            return
+        finished = self._worker.result()
+        if finished is not None:
+            self._publish(self._localizer.complete(*finished), time.monotonic())
+        if self._worker.is_idle:
+            task = self._localizer.background_task()
+            if task is not None:
+                self._worker.start(task)
+
+    def _check_lateness(self, received_s: float) -> None:
+        """Report that the solver is behind, once until it has caught up."""
+        if not received_s:
+            return
+        self._lateness_s = time.monotonic() - received_s
+        is_late = self._lateness_s > MAX_LATENESS_S and any(each.is_paced for each in self._inputs)
+        if is_late and not self._is_late:
+            text = f"the solver is {self._lateness_s:.1f} s behind: this computer is too slow"
+            self._report("", "solver_late", text, time.monotonic())
+        self._is_late = is_late
+
+    # ---- results
+
+    def _publish(self, events: Iterable[LiveEvent], received_s: float) -> None:
+        for event in events:
+            if isinstance(event, PoseEstimate):
+                device = self._devices.setdefault(event.device, DeviceStatus())
+                device.pose, device.state, device.reason = event, event.state, event.reason
+                device.poses += 1
+                device.latency_s = time.monotonic() - received_s
+            elif isinstance(event, StateChange):
+                device = self._devices.setdefault(event.device, DeviceStatus())
+                device.state, device.reason = event.state, event.reason
+            elif isinstance(event, ArtifactUpdate):
+                self._scene_version = event.version
+            elif isinstance(event, WarningEvent):
+                self._warnings[event.warning.message] += 1
+            message = LiveMessage(event, received_s)
+            for sink in self._sinks:
+                sink.offer(message)
+            for number in self._recorders_of(event):
+                self._recorded[number].add(event)
+
+    def _recorders_of(self, event: LiveEvent) -> list[int]:
+        """Return the inputs in whose recording an event belongs."""
+        recording = [each.number for each in self._inputs if each.is_recording]
+        name = getattr(event, "device", "")
+        own = [
+            number
+            for number in recording
+            if name == self._inputs[number].name or name.startswith(f"{self._inputs[number].name}-")
+        ]
+        return own[:1] or recording[:1]
+
+    def _report(self, device: str, code: str, text: str, received_s: float) -> None:
+        self._tell(f"{device}: {text}" if device else text)
+        event = WarningEvent(device, self._clock.now(), SolverWarning(code, text))
+        self._publish([event], received_s)
+
+    def _report_once(self, code: str, text: str, received_s: float) -> None:
+        if not self._warnings[text]:
+            self._report("", code, text, received_s)
+
+    def status(self) -> dict[str, Any]:
+        """Return the health of the session for JSON.
+
+        ``ok`` is false if an input is disconnected, a recording has failed, the solver is late, or
+        a sink does not work; lost devices do not count.
+        """
+        sinks = [sink.status() for sink in self._sinks]
+        inputs: list[dict[str, Any]] = [
+            {
+                "name": each.name,
+                "port": each.port,
+                "connected": each.is_connected,
+                "bytes": each.totals().bytes,
+                "bad_frames": each.totals().bad,
+                "lost_frames": each.totals().lost,
+                "dropped_bytes": each.dropped_bytes,
+                "recording": None
+                if each.request.output is None
+                else {
+                    "file": str(each.request.output),
+                    "running": each.is_recording,
+                    "error": each.recording.ended
+                    if each.recording is not None and each.recording.failed
+                    else "",
+                },
+            }
+            for each in self._inputs
+        ]
+        is_ok = (
+            not self._is_late
+            and all(each["connected"] for each in inputs)
+            and all(each["recording"] is None or each["recording"]["running"] for each in inputs)
+            and not any(each.error for each in sinks)
+        )
+        return {
+            "version": 1,
+            "ok": is_ok,
+            "system": self.system,
+            "uptime_s": round(time.monotonic() - self._started_s, 3) if self._started_s else 0.0,
+            "lateness_s": round(self._lateness_s, 4),
+            "artifact_version": self._scene_version,
+            "devices": {
+                name: {
+                    "state": str(each.state),
+                    "reason": each.reason,
+                    "poses": each.poses,
+                    "rate_hz": round(each.rate_hz, 2),
+                    "latency_s": round(each.latency_s, 4),
+                }
+                for name, each in self._devices.items()
+            },
+            "inputs": inputs,
+            "sinks": [
+                {
+                    "address": each.address,
+                    "sent": each.sent,
+                    "dropped": each.dropped,
+                    "clients": each.clients,
+                    "error": each.error,
+                }
+                for each in sinks
+            ],
+            "rejected": {} if self._localizer is None else self._localizer.rejected,
+            "warnings": list(self._warnings),
+        }
+
+    @property
+    def devices(self) -> dict[str, DeviceStatus]:
+        """State of each device."""
+        return dict(self._devices)
+
+
+def _last_ns(observations: Observations) -> int:
+    """Return the time of the newest observation."""
+    return int(observations.time_ns[-1]) if len(observations.time_ns) else 0
