@@ -95,8 +95,15 @@ def _parse_area(
     ),
     click.option(
         "--onboard",
-        is_flag=True,
+        "role",
+        flag_value="onboard",
         help="Export the poses that the devices estimated themselves; SOLUTION is a session.",
+    ),
+    click.option(
+        "--live",
+        "role",
+        flag_value="live",
+        help="Export the poses of `locatk live`; SOLUTION is the session that it recorded.",
     ),
     click.option("--covariance", is_flag=True, help="ros2: also write poses with covariance."),
     click.option(
@@ -119,7 +126,7 @@ def command(
     format_name: str | None,
     output: Path,
     devices: tuple[str, ...],
-    onboard: bool,
+    role: str | None,
     covariance: bool,
     frame: str | None,
     area: tuple[float, ...] | None,
@@ -189,16 +196,17 @@ def command(
             )
         options.check_ending(output, ENDINGS[format_name])
         options.guard_output(output, overwrite=overwrite, inputs=found)
-        role = "onboard" if onboard else "auto"
-        entry = export_table(found, format_name, output, devices, role, overwrite=overwrite)
+        entry = export_table(
+            found, format_name, output, devices, role or "auto", overwrite=overwrite
+        )
         if as_json:
             console.emit_json({"version": 1, "inputs": found, "format": format_name, **entry})
         return
     solution = found[0]
     if format_name in STATION_FORMATS:
         options.check_ending(output, ENDINGS[format_name])
-        if devices or onboard:
-            option = "--device" if devices else "--onboard"
+        if devices or role:
+            option = "--device" if devices else f"--{role}"
             raise click.UsageError(f"{option} is for poses; {format_name} contains stations.")
         options.guard_output(output, overwrite=overwrite, inputs=[solution])
         if format_name == CONFIG:
@@ -210,9 +218,7 @@ def command(
                 {"version": 1, "input": solution, "format": format_name, "files": [entry]}
             )
         return
-    tracks = select_devices(
-        read_trajectories(solution, "onboard" if onboard else "auto"), devices, solution
-    )
+    tracks = select_devices(read_trajectories(solution, role or "auto"), devices, solution)
     poses = sum(map(len, tracks))
     if format_name != "parquet":  # Parquet has null for values that are not numbers.
         tracks = [exports.with_finite_poses(track) for track in tracks]

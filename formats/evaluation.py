@@ -141,7 +141,7 @@ def evaluate_file(
     *,
     names: Mapping[str, str] | None = None,
     match: str = "auto",
-    onboard: bool = False,
+    role: files.Role = "estimate",
 ) -> EvaluatedFile:
     """Compare the poses of a file with those of another one.
 
@@ -155,8 +155,8 @@ def evaluate_file(
     match : str
         As in the options, or ``"auto"``: ``"nearest"`` if both files are TUM or KITTI, else
         ``"interpolate"``.
-    onboard : bool
-        Compare the poses that the devices of a session estimated themselves.
+    role : str
+        Poses of ``estimate`` to compare: ``"estimate"``, ``"onboard"`` or ``"live"``.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def evaluate_file(
     LocatkError
         See the readers and :func:`locatk.core.evaluation.evaluate`.
     """
-    estimated = files.open_file(estimate, role="onboard" if onboard else "estimate")
+    estimated = files.open_file(estimate, role=role)
     true = files.open_file(truth, role="truth")
     files.check_kinds(estimated, true)
     notes, warnings = [*estimated.notes, *true.notes], []

@@ -87,9 +87,16 @@ offset_option = click.option(
 )
 @click.option(
     "--onboard",
-    is_flag=True,
+    "role",
+    flag_value="onboard",
     help="Compare the poses that the device estimated itself, such as a Crazyflie; ESTIMATE is a "
     "session.",
+)
+@click.option(
+    "--live",
+    "role",
+    flag_value="live",
+    help="Compare the poses of `locatk live`; ESTIMATE is the session that it recorded.",
 )
 @section("Alignment", align_option, offset_option)
 @section(
@@ -163,7 +170,7 @@ def command(
     full: bool,
     table: Path | None,
     overwrite: bool,
-    onboard: bool,
+    role: str | None,
     as_json: bool,
 ) -> None:
     """Compare the poses of ESTIMATE with a reference, for each device.
@@ -187,6 +194,7 @@ def command(
       locatk eval solved.mcap --truth camera.tum --offset auto
       locatk eval solved.mcap --truth take.csv --align se3 --offset auto
       locatk eval flight.mcap --onboard --truth solved.mcap --align se3
+      locatk eval run.mcap --live --truth solved.mcap
       locatk eval slam.tum --truth mocap.tum --align se3 --delta 1m
       locatk eval solved.mcap --truth mocap.csv --pair 785b=red --pair dffa=blue
       locatk eval drive.db3#/odom --truth drive.db3#/tf:map.base_link
@@ -208,7 +216,12 @@ def command(
 
     def evaluated(file: Path) -> EvaluatedFile:
         return evaluate_file(
-            file, find_truth(file, truth), chosen, names=true_names, match=match, onboard=onboard
+            file,
+            find_truth(file, truth),
+            chosen,
+            names=true_names,
+            match=match,
+            role=role or "estimate",  # type: ignore[arg-type]
         )
 
     found, is_several = find_estimates(estimates)

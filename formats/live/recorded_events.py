@@ -14,10 +14,8 @@ from locatk.core.streaming.events import LiveEvent, PoseEstimate
 from locatk.formats.capture.ingestion import StampedMessage
 from locatk.formats.sessions import messages
 from locatk.formats.sessions.messages import POSES, triangle
+from locatk.formats.sessions.trajectories import LIVE_TRACK
 from locatk.formats.sinks.json_messages import event_to_json
-
-TRACK_PREFIX = "/live_track/"
-"""Topic of the live poses of a device, without its name; batches as on ``/solution/``."""
 
 SENDER = "locatk live"
 """Sender of the messages on ``/log``."""
@@ -66,7 +64,7 @@ def _track(device: str, frame: str, poses: list[PoseEstimate]) -> StampedMessage
     }
     message = POSES.pack({"device": device, "frame_id": frame}, columns)
     first_ns, last_ns = int(columns["time_ns"][0]), int(columns["time_ns"][-1])
-    return StampedMessage(TRACK_PREFIX + device, message, last_ns, first_ns)
+    return StampedMessage(LIVE_TRACK + device, message, last_ns, first_ns)
 
 
 def _log(event: LiveEvent) -> StampedMessage:

@@ -32,6 +32,7 @@ from locatk.formats.sessions import foxglove
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.trajectories import (
     check_devices,
+    read_live,
     read_onboard,
     read_poses,
     read_tracks,
@@ -252,22 +253,25 @@ def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[
     ----------
     path : path
         An MCAP file.
-    kind : {"auto", "solution", "truth", "onboard"}
+    kind : {"auto", "solution", "truth", "onboard", "live"}
         Solved poses (``/solution/``, else ``PoseInFrame`` on ``/pose/``), reference
         poses (``/truth``), or the first of them that exists; or the poses that the devices
-        estimated themselves (``/onboard_track/``).
+        estimated themselves (``/onboard_track/``), or those of ``locatk live``
+        (``/live_track/``).
 
     Raises
     ------
     FormatError
         There are none of this kind.
     """
-    if kind not in ("auto", "solution", "truth", "onboard"):
+    if kind not in ("auto", "solution", "truth", "onboard", "live"):
         raise ValueError(f"kind is {kind!r}")
     session = Session.open(path)
     found: list[Trajectory] = []
     if kind == "onboard":
         found = read_onboard(session)
+    elif kind == "live":
+        found = read_live(session)
     elif kind != "truth":
         found = read_tracks(session, "/solution/") or read_poses(session, "/pose/")
     if not found and kind in ("auto", "truth"):
@@ -278,12 +282,14 @@ def read_trajectories(path: str | os.PathLike[str], kind: str = "auto") -> list[
             "solution": "Solve it first: `locatk solve`",
             "truth": "Import it with its reference: `locatk import ... --truth`",
             "onboard": "Log stateEstimate on the device, and import the log",
+            "live": "Record it with `locatk live --record`",
         }
         what = {
             "auto": "poses",
             "solution": "solved poses",
             "truth": "reference poses",
             "onboard": "on-board poses",
+            "live": "live poses",
         }[kind]
         raise FormatError(f"no {what}", file=path, hint=hints[kind])
     return sorted(found, key=lambda trajectory: trajectory.device)

@@ -33,6 +33,9 @@ MAX_BUFFERED_BYTES = 8 << 20
 """Size of the messages that are taken from streams before they are sorted and written: large
 compared with the overhead of sorting, small compared with the memory of a computer."""
 
+LIVE_TRACK = "/live_track/"
+"""Topic of the poses of ``locatk live``, without the name of the device."""
+
 # ---- writing
 
 
@@ -186,6 +189,11 @@ def read_truth(session: Session) -> list[Trajectory]:
 def read_onboard(session: Session) -> list[Trajectory]:
     """Read the poses that the devices of a session estimated themselves; may be empty."""
     return read_tracks(session, "/onboard_track/")
+
+
+def read_live(session: Session) -> list[Trajectory]:
+    """Read the poses that ``locatk live`` published while it recorded; may be empty."""
+    return read_tracks(session, LIVE_TRACK)
 
 
 def read_odometry(session: Session) -> list[Trajectory]:

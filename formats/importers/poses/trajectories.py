@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 ToolKind = Literal["motive", "vicon", "qualisys", "euroc", "crazyflie"]
 Kind = Literal["solution", "session", "tum", "kitti", "csv", "bag", "mcap"] | ToolKind
-Role = Literal["estimate", "truth", "onboard"]
+Role = Literal["estimate", "truth", "onboard", "live"]
 
 EVO_KINDS = ("tum", "kitti")
 """Formats that evo reads too; poses of two such files are associated as in evo."""
@@ -150,7 +150,8 @@ def open_file(path: Path, *, role: Role = "estimate") -> TrajectoryFile:
         ``FILE#NAME`` selects the trajectory of this name.
     role : str
         For a file with solved poses and truth: ``"estimate"`` reads the poses, ``"truth"`` the
-        truth. ``"onboard"`` reads the poses of a session that its devices estimated themselves.
+        truth. ``"onboard"`` reads the poses of a session that its devices estimated themselves,
+        ``"live"`` those of ``locatk live``.
 
     Raises
     ------
@@ -184,23 +185,29 @@ def _select(file: TrajectoryFile, name: str) -> TrajectoryFile:
 
 
 def _read_bag(path: Path, role: Role, name: str) -> TrajectoryFile:
-    _refuse_onboard(path, role)
+    _refuse_parts_of_sessions(path, role)
     trajectories, notes = read_bag(path, name)
     return TrajectoryFile(path, "bag", trajectories, True, notes)
 
 
-def _refuse_onboard(path: Path, role: Role) -> None:
-    """Raise InputError if on-board poses are required: the file is no session."""
+def _refuse_parts_of_sessions(path: Path, role: Role) -> None:
+    """Raise InputError if on-board or live poses are required: the file is no session."""
     if role == "onboard":
         raise InputError(
             "not a session: only sessions have on-board poses",
             file=path,
             hint="Give a session of `locatk import crazyflie-usd`, or omit --onboard",
         )
+    if role == "live":
+        raise InputError(
+            "not a session: only sessions have live poses",
+            file=path,
+            hint="Give a session of `locatk live --record`, or omit --live",
+        )
 
 
 def _read_text(path: Path, head: bytes, role: Role) -> TrajectoryFile:
-    _refuse_onboard(path, role)
+    _refuse_parts_of_sessions(path, role)
     lines = _lines_of(path, head)
     for each in FORMATS:
         if each.is_format(lines):
@@ -272,8 +279,8 @@ def _read_mcap(path: Path, role: Role, name: str) -> TrajectoryFile:
     has_poses = session.topics("/solution/", "locatk.PoseTrack") or session.topics(
         "/pose/", "foxglove.PoseInFrame"
     )
-    if role == "onboard":
-        return _select(TrajectoryFile(path, kind, read_trajectories(path, "onboard"), True), name)
+    if role in ("onboard", "live"):
+        return _select(TrajectoryFile(path, kind, read_trajectories(path, role), True), name)
     if _is_foreign(session) and (name or not _has_topics_as_locatk(session, role)):
         from locatk.formats.importers.poses.mcap_topics import read_mcap_topics
 
