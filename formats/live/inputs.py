@@ -160,6 +160,7 @@ class LiveInput:
         # Each is written by one thread only.
         self._delivered_bytes = self._taken_bytes = 0
         self._is_dropping = self._is_stopping = False
+        self._end_error: str | None = None
         self._frames = 0
         self._decoder = create_intake(request, source.artifacts)
         self._converter = RecordConverter(self.artifacts)
@@ -219,7 +220,7 @@ class LiveInput:
             return
         finally:
             shared.detach()
-        if self.recording.failed and not self.is_ended:
+        if self.recording.failed and self.recording.ended != self._end_error:
             tell(f"the recording ended: {self.recording.ended}")
 
     def stop_reading(self) -> None:
@@ -246,6 +247,8 @@ class LiveInput:
     def _deliver(self, event: Event) -> None:
         """Queue an event for the solver; runs in the thread of the reader."""
         received_s = time.monotonic()
+        if isinstance(event, SourceEnded):
+            self._end_error = event.error
         if isinstance(event, ReceivedData):
             while not self.is_paced and self.waiting_bytes > MAX_WAITING_BYTES:
                 if self._is_stopping:

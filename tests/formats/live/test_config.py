@@ -44,7 +44,8 @@ def test_all_keys_are_read_and_files_are_relative_to_the_configuration(tmp_path:
     assert (first.port, first.device, first.name) == ("/dev/ttyACM0", "locatk", "red")
     assert second.columns == ("x_m", "y_m", "heading_rad")
     assert second.speed == 0
-    assert second.keeps_time and not first.keeps_time
+    assert second.keeps_time
+    assert not first.keeps_time
     assert read_config.artifacts == (str(tmp_path / "maps/floor.toml"),)
     assert read_config.record == str(tmp_path / "runs/%Y%m%d-%H%M%S.mcap")
     assert read_config.token_file == str(tmp_path / "token.txt")
