@@ -9,8 +9,8 @@ What a reader has and a test machine has not:
 
 - A serial port ``/dev/tty...`` is a pseudo-terminal, on which an emulator is the device of the
   line's ``--device``; ``camera:0`` is a video of the sheet of the line's ``--artifact``.
-- A recording takes at most :data:`MAX_RECORDING_S`, and without ``--duration``
-  :data:`RECORDING_S`, as if it were ended by Ctrl-C.
+- A recording, and ``locatk live`` of a port, take at most :data:`MAX_RECORDING_S`, and without
+  ``--duration`` :data:`RECORDING_S`, as if they were ended by Ctrl-C.
 - ``locatk emulate``, ``dask scheduler`` and ``dask worker`` are other terminals, which run to the
   page's end.
 - ``s3://`` is a server of moto on this machine; a bucket holds the sessions that are in the
@@ -395,8 +395,15 @@ class Reader:
 
 
 def shortened(words: list[str]) -> list[str]:
-    """The words of a command, where those of a recording end it soon."""
-    if words[0] != "capture" or "--list" in words:
+    """The words of a command, where those of a recording end it soon.
+
+    Servers get any port that is free, because pages run side by side.
+    """
+    if words[0] == "live":
+        words = [re.sub(r"^(web|foxglove)://:\d+$", r"\1://:0", word) for word in words]
+    is_endless = words[0] == "capture" and "--list" not in words
+    is_endless |= words[0] == "live" and not any(word.startswith("replay:") for word in words)
+    if not is_endless:
         return words
     if "--duration" not in words:
         return [*words, "--duration", f"{RECORDING_S}s"]
