@@ -19,8 +19,10 @@ from locatk.core.lighthouse.channels import period_ticks
 from locatk.core.lighthouse.epochs import Epochs, rotor_angles
 from locatk.core.lighthouse.localization.positions import (
     PositionEstimates,
+    correct_angles,
     estimate_floor_positions,
     estimate_positions,
+    intersect_planes,
 )
 from locatk.core.lighthouse.noise import (
     ANGLE_SIGMA_RAD,
@@ -137,9 +139,8 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
         estimates = estimate_positions(rotor_angles(epochs), *stations, floor_z=floor_z)
         epochs, estimates, restored = restore_swapped_sweeps(epochs, estimates, stations, floor_z)
         gate = inlier_gate(estimates)
-        estimates, repaired = leave_out_worst_station(
-            rotor_angles(epochs), estimates, stations, floor_z, gate
-        )
+        ideal = correct_angles(rotor_angles(epochs), stations[2])
+        estimates, repaired = leave_out_worst_station(ideal, estimates, stations, floor_z, gate)
         rejected["station_contradicts_others"] += repaired
 
     is_unsolved = ~np.isfinite(estimates.position[:, 0])
@@ -415,7 +416,7 @@ def restore_swapped_sweeps(
 
 
 def leave_out_worst_station(
-    angles: Array,
+    ideal: Array,
     estimates: PositionEstimates,
     stations: StationArrays,
     floor_z: float | None,
@@ -425,7 +426,8 @@ def leave_out_worst_station(
 
     Parameters
     ----------
-    angles : (m, s, 2) ndarray
+    ideal : (m, s, 2) ndarray
+        Angles of ideal planes (:func:`.positions.correct_angles`).
     estimates : PositionEstimates
     stations : StationArrays
     floor_z : float, optional
@@ -437,15 +439,15 @@ def leave_out_worst_station(
     estimates, count
         Consistent estimates replace the others if leaving out one station yields any; their number.
     """
-    if angles.shape[1] < 3:
+    if ideal.shape[1] < 3:
         return estimates, 0
     wrong = np.flatnonzero((estimates.max_residual > gate) & (estimates.redundancy > 2))
     best = estimates.max_residual[wrong].copy()
     is_repaired = np.zeros(len(wrong), bool)
-    for column in range(angles.shape[1]):
-        trial_angles = angles[wrong].copy()
-        trial_angles[:, column] = np.nan
-        trial = estimate_positions(trial_angles, *stations, floor_z=floor_z)
+    for column in range(ideal.shape[1]):
+        without_station = ideal[wrong]
+        without_station[:, column] = np.nan
+        trial = intersect_planes(without_station, *stations, floor_z=floor_z)
         is_better = (
             np.isfinite(trial.position[:, 0])
             & (trial.max_residual < np.minimum(best, gate))

@@ -284,7 +284,13 @@ def estimate_floor_positions(
     PositionEstimates
         The redundancy is 0 or less: nothing checks these positions.
     """
-    corrected = ideal_angles(angles[:, 0], calibration)
+    return project_on_floor(ideal_angles(angles[:, 0], calibration), calibration, floor_map, floor_z)
+
+
+def project_on_floor(
+    corrected: Array, calibration: Calibration, floor_map: Array, floor_z: float
+) -> PositionEstimates:
+    """Estimate positions as :func:`estimate_floor_positions`, from corrected angles (m, 2)."""
     normals = plane_normals(corrected, calibration.tilts)
     rays = np.cross(normals[:, 0], normals[:, 1])
     # The rotor rotates the normal of a plane about the vertical axis of the station.
@@ -305,14 +311,15 @@ def estimate_floor_positions(
         :, :1, None
     ]
 
-    m = len(angles)
+    m = len(corrected)
     is_solved = np.all(np.isfinite(point), axis=1)
     information = np.zeros((m, 3, 3))
     covariance = np.tile(np.eye(2), (m, 1, 1))
     covariance[is_solved] = jacobian[is_solved] @ jacobian[is_solved].transpose(0, 2, 1)
     information[:, :2, :2] = np.linalg.inv(covariance)
-    redundancy = np.count_nonzero(np.isfinite(angles), axis=(1, 2)) - 2
+    is_observed = np.isfinite(corrected)
+    redundancy = np.count_nonzero(is_observed, axis=1) - 2
     position = np.where(is_solved[:, None], np.c_[point, np.full(m, floor_z)], np.nan)
     return PositionEstimates(
-        position, information, np.where(np.isfinite(angles), 0.0, np.nan), redundancy
+        position, information, np.where(is_observed, 0.0, np.nan)[:, None], redundancy
     )

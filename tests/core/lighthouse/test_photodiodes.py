@@ -22,7 +22,11 @@ from locatk.core.lighthouse.localization.photodiodes import (
     restore_swapped_sweeps,
     track_photodiodes,
 )
-from locatk.core.lighthouse.localization.positions import PositionEstimates, estimate_positions
+from locatk.core.lighthouse.localization.positions import (
+    PositionEstimates,
+    correct_angles,
+    estimate_positions,
+)
 from locatk.core.lighthouse.noise import (
     ANGLE_SIGMA_RAD,
     INLIER_GATE_RAD,
@@ -175,7 +179,8 @@ def test_the_station_that_contradicts_is_left_out(world: Any) -> None:
     angles[20, 1:3] += 0.05  # Two wrong stations: no single one explains it.
     stations = stack(factory_stations(world, lamps))
     estimates = estimate_positions(angles, *stations)
-    repaired, count = leave_out_worst_station(angles, estimates, stations, None, 2e-3)
+    ideal = correct_angles(angles, stations[2])
+    repaired, count = leave_out_worst_station(ideal, estimates, stations, None, 2e-3)
     assert count == 1
     np.testing.assert_allclose(repaired.position[10], points[10], atol=1e-4)
     assert np.isnan(repaired.residual[10, 2]).all()
@@ -192,7 +197,11 @@ def test_a_repair_that_nothing_checks_is_none(world: Any) -> None:
     angles[2, 1] += 0.05
     stations = stack(factory_stations(world, lamps))
     whole = leave_out_worst_station(
-        angles, estimate_positions(angles, *stations), stations, None, 2e-3
+        correct_angles(angles, stations[2]),
+        estimate_positions(angles, *stations),
+        stations,
+        None,
+        2e-3,
     )
     assert whole[1] == 1
     # Six planes: redundancy 3. With the second plane of two stations missing, four are left after
@@ -200,7 +209,8 @@ def test_a_repair_that_nothing_checks_is_none(world: Any) -> None:
     angles[2, 2, 1] = np.nan
     estimates = estimate_positions(angles, *stations)
     forced = replace(estimates, redundancy=estimates.redundancy + 1)
-    _, count = leave_out_worst_station(angles, forced, stations, None, 2e-3)
+    ideal = correct_angles(angles, stations[2])
+    _, count = leave_out_worst_station(ideal, forced, stations, None, 2e-3)
     assert count == 0
 
 
@@ -210,7 +220,8 @@ def test_two_stations_cannot_outvote_each_other(world: Any) -> None:
     angles[2, 0] += 0.05
     stations = stack(factory_stations(world, lamps))
     estimates = estimate_positions(angles, *stations, floor_z=0.0)
-    assert leave_out_worst_station(angles, estimates, stations, 0.0, 2e-3)[1] == 0
+    ideal = correct_angles(angles, stations[2])
+    assert leave_out_worst_station(ideal, estimates, stations, 0.0, 2e-3)[1] == 0
 
 
 @pytest.mark.parametrize("labelled", [True, False])

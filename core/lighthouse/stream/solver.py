@@ -1,0 +1,390 @@
+"""Stream of Lighthouse: fixes of photodiodes and rigid devices, in a known or an estimated scene."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from locatk.core.errors import LocatkError
+from locatk.core.lighthouse.channels import CHANNELS, period_counts
+from locatk.core.lighthouse.devices.device_sweeps import MIN_SENSORS
+from locatk.core.lighthouse.receiver import Receiver
+from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
+from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.estimation import direction_only_warning
+from locatk.core.lighthouse.solver import SolveOptions
+from locatk.core.lighthouse.stream.known_scene import KnownScene
+from locatk.core.lighthouse.stream.photodiodes import PhotodiodeFixes
+from locatk.core.lighthouse.stream.rigid import RigidFixes
+from locatk.core.lighthouse.stream.scene_search import (
+    FIRST_ATTEMPT_NS,
+    INTERVAL_GROWTH,
+    LAST_ATTEMPT_NS,
+    MAX_INTERVAL_NS,
+    OdometryStore,
+    Row,
+    SceneResult,
+    SweepStore,
+    align_scene,
+    estimate_live_scene,
+    is_better,
+    make_sweeps,
+)
+from locatk.core.lighthouse.stream.supervision import (
+    StationSupervision,
+    doubled_channel_warnings,
+)
+from locatk.core.solution import SolverWarning
+from locatk.core.streaming.events import (
+    ArtifactUpdate,
+    BackgroundTask,
+    DetectionEvent,
+    StreamEvent,
+    WarningEvent,
+)
+from locatk.core.trajectory import Trajectory
+
+TICK_NS = 500_000_000
+"""Time of data between updates of noise and gates, and checks of hidden stations [ns]."""
+
+MOVED_CHECK_TICKS = 4
+"""Ticks between verifications of the stations: every two seconds."""
+
+DETECTION_TICKS = 20
+"""Ticks between detections of the stations: every ten seconds."""
+
+RECENT_SWEEPS = 4_000
+"""Largest number of sweeps in which channels with several stations are looked for: two seconds of
+ten robots under two stations."""
+
+FORGET_NS = 60_000_000_000
+"""Time after which the state of a silent device is dropped [ns]."""
+
+MAX_TIME_STEP_NS = 60_000_000_000
+"""Time by which a sweep may be later than the one before without being taken for a clock that was
+set [ns]; ticks in between are skipped."""
+
+SCENE_TASK = "scene"
+
+
+class LighthouseStream:
+    """Causal solver of Lighthouse for any number of devices.
+
+    Devices with three or more photodiodes of known position get poses, all other photodiodes
+    positions, with the names of the offline solver: that of the device, or ``device/sensor`` if it
+    has several.
+
+    Parameters
+    ----------
+    scene : Scene, optional
+        With stations: they are used as they are. Without, they are estimated in the background;
+        markers, distances and calibrations of the scene are used for it.
+    receivers : mapping of str to Receiver
+        By device.
+    options : SolveOptions, optional
+        ``scene`` and ``seed`` for the estimation of the scene.
+
+    Attributes
+    ----------
+    system : str
+    rejected : Counter of str
+        Number of sweeps or epochs that were not used, by reason, as those of
+        :class:`~locatk.core.solution.Solution`.
+    version : int
+        Of the scene that was estimated; 0 without.
+    """
+
+    system = "lighthouse"
+
+    def __init__(
+        self,
+        scene: Scene | None,
+        receivers: Mapping[str, Receiver],
+        options: SolveOptions | None = None,
+    ) -> None:
+        self.rejected: Counter[str] = Counter()
+        self.version = 0
+        self._options = options or SolveOptions()
+        self._receivers = {
+            name: receiver for name, receiver in receivers.items() if len(receiver) >= MIN_SENSORS
+        }
+        self._multiple = {name for name, receiver in receivers.items() if len(receiver) > 1}
+        self._prior = scene or Scene()
+        self._known: KnownScene | None = None
+        self._events: list[StreamEvent] = []
+        self._now_ns: int | None = None
+        self._start_ns = self._next_tick_ns = self._ticks = 0
+        self._period = np.zeros(CHANNELS.stop)
+        self._period[CHANNELS.start :] = period_counts(np.arange(CHANNELS.start, CHANNELS.stop))
+        self._devices: dict[str, int] = {}
+        self._recent: deque[Row] = deque(maxlen=RECENT_SWEEPS)
+        self._doubled: set[int] = set()
+        self._warned: set[tuple[str, str]] = set()
+        self._store: SweepStore | None = None
+        self._odometry = OdometryStore()
+        self._next_attempt_ns = FIRST_ATTEMPT_NS
+        self._is_task_due = self._is_task_running = False
+        if self._prior.stations:
+            self._use_scene(self._prior)
+            for note in self._prior.notes:
+                self._warn(SolverWarning("scene_assumption", note))
+        else:
+            self._store = SweepStore()
+
+    @property
+    def scene(self) -> Scene | None:
+        """Scene with stations that fixes refer to; None as long as there is none."""
+        return None if self._known is None else self._known.scene
+
+    # ---- observations
+
+    def push(self, observations: Any) -> Sequence[StreamEvent]:
+        """Return the fixes and other results that the next sweeps make known.
+
+        Parameters
+        ----------
+        observations : Sweeps or Trajectory or object
+            Odometry determines the scale of a scene that is estimated. Other observations are not
+            used here.
+        """
+        if isinstance(observations, Trajectory):
+            if self._store is not None:
+                self._odometry.add(observations)
+        elif isinstance(observations, Sweeps):
+            self._push_sweeps(observations)
+            self._flush()
+        return self._take_events()
+
+    def advance(self, time_ns: int) -> Sequence[StreamEvent]:
+        """Return the results that follow from the time alone: fixes without a hidden station."""
+        if self._now_ns is not None and time_ns > self._now_ns:
+            self._advance_ticks(time_ns)
+            if self._known is not None:
+                self._photodiodes.advance(time_ns, self._flush)
+                self._flush()
+        return self._take_events()
+
+    def finish(self) -> Sequence[StreamEvent]:
+        """Return the fixes that wait for another station, and the last detections."""
+        if self._now_ns is not None and self._known is not None:
+            self._photodiodes.advance(self._now_ns + TICK_NS, self._flush)
+            self._flush()
+            self._detect(self._now_ns)
+        return self._take_events()
+
+    def _take_events(self) -> Sequence[StreamEvent]:
+        events, self._events = self._events, []
+        return events
+
+    def _push_sweeps(self, sweeps: Sweeps) -> None:
+        """Take sweeps one by one, so that results do not depend on how they are cut."""
+        channel = np.where(np.isin(sweeps.channel, CHANNELS), sweeps.channel, 0)
+        with np.errstate(invalid="ignore"):
+            is_in_period = (sweeps.count >= 0) & (sweeps.count < self._period[channel])
+        for name, *row, usable in zip(
+            [sweeps.devices[k] for k in sweeps.device.tolist()],
+            sweeps.time_ns.tolist(),
+            sweeps.sensor.tolist(),
+            channel.tolist(),
+            sweeps.polynomial.tolist(),
+            sweeps.sweep.tolist(),
+            sweeps.count.tolist(),
+            is_in_period.tolist(),
+            strict=True,
+        ):
+            if not usable:
+                reason = "count_above_period" if row[2] else "unknown_channel"
+                self.rejected[reason] += 1
+                continue
+            self._push_sweep(name, *row)
+
+    def _push_sweep(
+        self,
+        name: str,
+        time_ns: int,
+        sensor: int,
+        channel: int,
+        polynomial: int,
+        plane: int,
+        count: float,
+    ) -> None:
+        if self._now_ns is None:
+            self._now_ns = self._start_ns = time_ns
+            self._next_tick_ns = time_ns + TICK_NS
+        self._advance_ticks(time_ns)
+        if sensor > 0:
+            self._multiple.add(name)
+        device = self._devices.setdefault(name, len(self._devices))
+        row = (time_ns, device, sensor, channel, polynomial, plane, count)
+        self._recent.append(row)
+        if channel in self._doubled:
+            self.rejected["sweep_of_doubled_channel"] += 1
+            return
+        if self._store is not None:
+            self._store.add(row)
+        if self._known is None:
+            return
+        station = self._known.column.get(channel)
+        if station is None:
+            self.rejected["station_not_in_scene"] += 1
+            return
+        self._supervision.last_ns[station] = time_ns
+        if name in self._receivers:
+            fixes = self._rigid.push(name, time_ns, sensor, station, plane, count)
+            if fixes:
+                self._flush()
+                self._events.extend(fixes)
+            return
+        photodiode = f"{name}/{sensor}" if name in self._multiple else name
+        is_labelled = polynomial != UNKNOWN
+        self._photodiodes.push(
+            photodiode, time_ns, station, plane, count, is_labelled, self._flush
+        )
+
+    def _flush(self) -> None:
+        """Estimate the positions that are due, before any later event."""
+        if self._known is not None and self._photodiodes.due:
+            self._events.extend(f for f in self._photodiodes.solve_due() if f is not None)
+
+    # ---- time
+
+    def _advance_ticks(self, time_ns: int) -> None:
+        """Do the regular work up to a time."""
+        assert self._now_ns is not None
+        if time_ns <= self._now_ns:
+            return
+        if time_ns - self._now_ns > MAX_TIME_STEP_NS:
+            self._next_tick_ns = time_ns
+        self._now_ns = time_ns
+        while time_ns >= self._next_tick_ns:
+            self._flush()
+            self._ticks += 1
+            self._tick(self._next_tick_ns)
+            self._next_tick_ns += TICK_NS
+
+    def _tick(self, now_ns: int) -> None:
+        if self._store is not None:
+            elapsed_ns = now_ns - self._start_ns
+            if elapsed_ns >= self._next_attempt_ns and len(self._store):
+                self._is_task_due = True
+        if self._ticks % DETECTION_TICKS == 1:
+            self._check_channels()
+        if self._known is None:
+            return
+        self._photodiodes.update_noise()
+        self._rigid.update_noise()
+        for warning in self._supervision.check_hidden(now_ns):
+            self._events.append(WarningEvent("", now_ns, warning))
+        if self._ticks % MOVED_CHECK_TICKS == 0:
+            warnings = self._supervision.check_moved(self._photodiodes, self._rigid)
+            self._events.extend(WarningEvent("", now_ns, warning) for warning in warnings)
+        if self._ticks % DETECTION_TICKS == 0:
+            self._detect(now_ns)
+            self._photodiodes.forget(now_ns - FORGET_NS)
+            self._rigid.forget(now_ns - FORGET_NS)
+
+    def _detect(self, now_ns: int) -> None:
+        self._events.extend(
+            DetectionEvent("", now_ns, detection)
+            for detection in self._supervision.detections(self._photodiodes, self._rigid)
+        )
+
+    def _check_channels(self) -> None:
+        """Look for channels with several stations in the last sweeps."""
+        proven, warnings = doubled_channel_warnings(
+            make_sweeps(tuple(self._devices), list(self._recent))
+        )
+        self._doubled |= set(proven)
+        for warning in warnings:
+            self._warn(warning)
+
+    def _warn(self, warning: SolverWarning) -> None:
+        """Report a warning once."""
+        key = (warning.code, warning.message)
+        if key not in self._warned and len(self._warned) < 1000:
+            self._warned.add(key)
+            self._events.append(WarningEvent("", self._now_ns or 0, warning))
+
+    # ---- scene
+
+    def _use_scene(self, scene: Scene) -> None:
+        """Locate devices in another scene from now on."""
+        old = self._known
+        known = self._known = KnownScene.of(scene)
+        self._supervision = StationSupervision(known)
+        if old is None:
+            self._photodiodes = PhotodiodeFixes(known, self._reject, self._observe)
+            self._rigid = RigidFixes(known, self._receivers, self._reject)
+        else:
+            self._photodiodes = self._photodiodes.moved_to(known)
+            self._rigid = self._rigid.moved_to(known)
+        if len(known.stations) < known.min_stations:
+            self._warn(direction_only_warning(known.stations[0].channel))
+
+    def _reject(self, reason: str, number: int) -> None:
+        self.rejected[reason] += number
+
+    def _observe(self, angles: Any, is_solved: bool, is_inconsistent: bool) -> None:
+        self._supervision.observe(angles, is_solved, is_inconsistent)
+
+    def background_task(self) -> BackgroundTask | None:
+        """Return the estimation of the scene when it is time for an attempt."""
+        if not self._is_task_due or self._is_task_running or self._store is None:
+            return None
+        self._is_task_due, self._is_task_running = False, True
+        self._store.devices = list(self._devices)
+        sweeps = self._store.sweeps()
+        sweeps = sweeps.take(~np.isin(sweeps.channel, list(self._doubled)))
+        arguments = (
+            sweeps, self._prior, self._options, self._odometry.tracks(), self._receivers
+        )  # fmt: skip
+        return BackgroundTask(SCENE_TASK, estimate_live_scene, arguments)
+
+    def complete(self, task: BackgroundTask, result: Any) -> Sequence[StreamEvent]:
+        """Use the scene of a task if it is the first or better than the one in use.
+
+        Raises
+        ------
+        Exception
+            ``result`` is an error of the program, not of the data.
+        """
+        self._is_task_running = False
+        now_ns = self._now_ns or 0
+        self._next_attempt_ns = self._following_attempt(now_ns - self._start_ns)
+        if isinstance(result, LocatkError):
+            hint = f" ({result.hint})" if result.hint else ""
+            self._warn(
+                SolverWarning("scene_not_estimated", f"no scene yet: {result.message}{hint}")
+            )
+        elif isinstance(result, BaseException):
+            raise result
+        else:
+            self._adopt(result, now_ns)
+        if self._known is not None and now_ns - self._start_ns > LAST_ATTEMPT_NS:
+            self._store = None
+        return self._take_events()
+
+    def _following_attempt(self, elapsed_ns: int) -> int:
+        """Return the time since the start of the next attempt."""
+        interval_ns = max(FIRST_ATTEMPT_NS, round((INTERVAL_GROWTH - 1.0) * elapsed_ns))
+        if self._known is None:
+            interval_ns = min(interval_ns, MAX_INTERVAL_NS)
+        return elapsed_ns + interval_ns
+
+    def _adopt(self, result: SceneResult, now_ns: int) -> None:
+        """Use the scene of a result, in the frame of the one before, if it is better."""
+        scene, old = result.scene, self.scene
+        if old is not None:
+            if not is_better(scene, old):
+                return
+            scene = align_scene(scene, old)
+        self._flush()
+        self.version += 1
+        self._use_scene(scene)
+        reason = "estimated from the first sweeps" if old is None else "refined with later sweeps"
+        self._events.append(ArtifactUpdate(now_ns, self.version, scene, reason))
+        for warning in result.warnings:
+            self._warn(warning)
