@@ -89,20 +89,20 @@ def localize(
         if frame != "site" and is_first:
             site_pose = PlanarPose(0.0, 0.0, 0.0)
         if site_pose is not None:
-            poses_over_tag = _poses_over_tag(samples, observation, site_pose)
-            if len(poses_over_tag.time_ns):
-                parts.append(poses_over_tag)
+            poses = poses_over_tag(samples, observation, site_pose)
+            if len(poses.time_ns):
+                parts.append(poses)
         else:
             location = "on the site" if frame == "site" else f"in the frame of {frame}"
             message = f"tag {observation.tag_id} has no position {location}"
             warnings.append(SolverWarning("tag_not_on_site", message).about(samples.device))
     if not parts:
         return Localization(warnings=tuple(warnings))
-    poses = _concatenate(samples.device, frame, parts)
+    trajectory = _concatenate(samples.device, frame, parts)
     if odometry is not None:
-        poses = _fill_gaps(poses, odometry)
+        trajectory = _fill_gaps(trajectory, odometry)
     corrections = _heading_corrections(samples, observations)
-    return Localization((poses,), corrections, tuple(warnings))
+    return Localization((trajectory,), corrections, tuple(warnings))
 
 
 def distance_along(odometry: Trajectory, time_ns: NDArray[np.int64]) -> Array:
@@ -121,7 +121,7 @@ def distance_along(odometry: Trajectory, time_ns: NDArray[np.int64]) -> Array:
 
 
 @dataclass(frozen=True)
-class _PlanarPoses:
+class PlanarPoses:
     """Times (n,), positions (n, 3), headings (n,) and covariances (n, 6, 6)."""
 
     time_ns: NDArray[np.int64]
@@ -129,10 +129,16 @@ class _PlanarPoses:
     heading: Array
     covariance: Array
 
+    def select(self, rows: slice) -> PlanarPoses:
+        """Return some of the poses."""
+        return PlanarPoses(
+            self.time_ns[rows], self.position[rows], self.heading[rows], self.covariance[rows]
+        )
 
-def _poses_over_tag(
+
+def poses_over_tag(
     samples: Samples, observation: TagObservation, tag_pose: PlanarPose
-) -> _PlanarPoses:
+) -> PlanarPoses:
     """Return the poses of an array over one tag, with the covariance of match, path and tag."""
     magnets, match = observation.magnets, observation.match
     if match is None:
@@ -185,7 +191,7 @@ def _poses_over_tag(
     scale_sigma_m = HEIGHT_SCALE_SIGMA * magnets.height_m
     covariance[:, 2, 2] = magnets.height_sigma_m**2 + scale_sigma_m**2
     time = samples.time_ns[magnets.first : magnets.stop][is_over]
-    return _PlanarPoses(time, position, heading + rotated[is_over], covariance)
+    return PlanarPoses(time, position, heading + rotated[is_over], covariance)
 
 
 def _path_sigma(magnets: DetectedMagnets, first_m: float, last_m: float) -> Array:
@@ -219,7 +225,7 @@ def _path_sigma(magnets: DetectedMagnets, first_m: float, last_m: float) -> Arra
     return np.asarray(sigma)
 
 
-def _concatenate(device: str, frame: str, parts: Sequence[_PlanarPoses]) -> Trajectory:
+def _concatenate(device: str, frame: str, parts: Sequence[PlanarPoses]) -> Trajectory:
     """Join the poses over all tags in order of time; of equal times the first pose is kept."""
     time_ns = np.concatenate([part.time_ns for part in parts])
     _, first = np.unique(time_ns, return_index=True)  # The passes of two tags may overlap.
@@ -239,7 +245,7 @@ def _fill_gaps(poses: Trajectory, odometry: Trajectory) -> Trajectory:
     interval = np.median(np.diff(poses.time_ns)) if len(poses) > 1 else 0
     gaps = np.flatnonzero(np.diff(poses.time_ns) > MIN_GAP_PERIODS * interval)
     heading = heading_from_quaternion(poses.quaternion)
-    parts = [_PlanarPoses(poses.time_ns, poses.position, heading, poses.covariance)]
+    parts = [PlanarPoses(poses.time_ns, poses.position, heading, poses.covariance)]
     for gap in gaps:
         start_ns, end_ns = poses.time_ns[[gap, gap + 1]]
         if odometry.time_ns[0] <= start_ns and end_ns <= odometry.time_ns[-1]:
@@ -247,9 +253,7 @@ def _fill_gaps(poses: Trajectory, odometry: Trajectory) -> Trajectory:
     return _concatenate(poses.device, poses.frame, parts)
 
 
-def _poses_in_gap(
-    poses: Trajectory, heading: Array, gap: int, odometry: Trajectory
-) -> _PlanarPoses:
+def _poses_in_gap(poses: Trajectory, heading: Array, gap: int, odometry: Trajectory) -> PlanarPoses:
     """Return the poses of odometry between the poses ``gap`` and ``gap + 1``.
 
     Odometry continues from the pose before the gap. Its error at the pose after the gap is
@@ -285,7 +289,7 @@ def _poses_in_gap(
     covariance[:, 0, 0] += spread * (position_error @ position_error)
     covariance[:, 1, 1] += spread * (position_error @ position_error)
     covariance[:, 5, 5] += spread * heading_error**2
-    return _PlanarPoses(
+    return PlanarPoses(
         time[inside],
         np.column_stack([planar + fraction[:, None] * position_error, height])[inside],
         (propagated_heading + fraction * heading_error)[inside],
@@ -310,26 +314,50 @@ def _heading_corrections(
     for (observation, from_tag, tag_pose), (_, to_tag, target) in itertools.pairwise(on_site):
         if tag_pose == target:
             continue
-        poses = _poses_over_tag(samples, observation, tag_pose)
+        poses = poses_over_tag(samples, observation, tag_pose)
         if not len(poses.time_ns):
             continue
-        offset = np.array([target.x_m, target.y_m]) - poses.position[-1, :2]
-        distance = float(np.hypot(*offset))
-        if distance == 0:
-            continue
-        rotation = np.arctan2(offset[1], offset[0]) - poses.heading[-1]
-        # Derivative of the rotation by position and heading.
-        gradient = np.array([offset[1], -offset[0], -(distance**2)]) / distance**2
-        covariance = poses.covariance[-1][np.ix_(PLANAR_COMPONENTS, PLANAR_COMPONENTS)]
-        corrections.append(
-            HeadingCorrection(
-                device=samples.device,
-                time_s=float(poses.time_ns[-1]) * 1e-9,
-                from_tag=from_tag,
-                to_tag=to_tag,
-                rotation_rad=float(wrap_angle(rotation)),
-                sigma_rotation_rad=float(np.sqrt(gradient @ covariance @ gradient)),
-                distance_m=distance,
-            )
-        )
+        last = poses.select(slice(-1, None))
+        correction = heading_correction(samples.device, from_tag, last, to_tag, target)
+        if correction is not None:
+            corrections.append(correction)
     return tuple(corrections)
+
+
+def heading_correction(
+    device: str, from_tag: int, last: PlanarPoses, to_tag: int, target: PlanarPose
+) -> HeadingCorrection | None:
+    """Return the rotation that points the robot from a tag to another one.
+
+    Parameters
+    ----------
+    device : str
+    from_tag, to_tag : int
+        Ids of the tags.
+    last : PlanarPoses
+        Last pose of the array over the first tag.
+    target : PlanarPose
+        Pose of the second tag.
+
+    Returns
+    -------
+    HeadingCorrection or None
+        None if the robot is at the second tag already.
+    """
+    offset = np.array([target.x_m, target.y_m]) - last.position[0, :2]
+    distance = float(np.hypot(*offset))
+    if distance == 0:
+        return None
+    rotation = np.arctan2(offset[1], offset[0]) - last.heading[0]
+    # Derivative of the rotation by position and heading.
+    gradient = np.array([offset[1], -offset[0], -(distance**2)]) / distance**2
+    covariance = last.covariance[0][np.ix_(PLANAR_COMPONENTS, PLANAR_COMPONENTS)]
+    return HeadingCorrection(
+        device=device,
+        time_s=float(last.time_ns[0]) * 1e-9,
+        from_tag=from_tag,
+        to_tag=to_tag,
+        rotation_rad=float(wrap_angle(rotation)),
+        sigma_rotation_rad=float(np.sqrt(gradient @ covariance @ gradient)),
+        distance_m=distance,
+    )

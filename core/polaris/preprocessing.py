@@ -263,7 +263,7 @@ def estimate_noise(samples: Samples) -> Array:
 
 def find_passes(samples: Samples, noise_t: Array) -> list[PassRange]:
     """Return the passes over magnets in order of time; none if the field never changes."""
-    changing = np.flatnonzero(_field_change(samples, noise_t) > MIN_CHANGE_SIGMAS)
+    changing = np.flatnonzero(field_change(samples, noise_t) > MIN_CHANGE_SIGMAS)
     if len(changing) == 0:
         return []
     passes: list[PassRange] = []
@@ -279,7 +279,7 @@ def find_passes(samples: Samples, noise_t: Array) -> list[PassRange]:
     return passes
 
 
-def _field_change(samples: Samples, noise_t: Array) -> Array:
+def field_change(samples: Samples, noise_t: Array) -> Array:
     """Return the change of the bar's field around each sample (n,), in sigmas of pure noise.
 
     A field that all sensors share (the Earth's, while the robot rotates) does not count, and
@@ -304,6 +304,19 @@ def _field_change(samples: Samples, noise_t: Array) -> Array:
         middle = slice(lag // 2, lag // 2 + n - lag)
         largest[middle] = np.maximum(largest[middle], change)
     return largest
+
+
+def bar_energy(field_t: Array, level_t: Array, noise_t: Array) -> float:
+    """Return the sum of squares of one sample (N, 3) relative to a level, in units of the noise.
+
+    A field that all sensors share does not count, and neither does a sensor without a value.
+    """
+    scaled = ((field_t - level_t) / noise_t)[None]
+    is_finite = np.isfinite(scaled)
+    scaled = np.where(is_finite, scaled, 0.0)
+    if scaled.shape[1] > 2:
+        scaled = _subtract_shared(scaled, is_finite)
+    return float((scaled**2).sum())
 
 
 def _subtract_shared(values: Array, is_finite: NDArray[np.bool_]) -> Array:

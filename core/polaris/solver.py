@@ -118,7 +118,7 @@ def solve(
         one design.
     """
     options = options or SolveOptions()
-    designs = _name_designs(tags)
+    designs = name_designs(tags)
     if options.method == "paper" and len(designs) > 1:
         raise InputError(
             "the published algorithm supports only one design of tags",
@@ -142,7 +142,7 @@ def solve(
     )
 
 
-def _name_designs(tags: Tags | Mapping[str, Tags] | None) -> Mapping[str | None, Tags]:
+def name_designs(tags: Tags | Mapping[str, Tags] | None) -> Mapping[str | None, Tags]:
     """Return the designs by name; a single design has none."""
     if tags is None:
         return {}
@@ -248,52 +248,84 @@ def _identify_passes(
         Changes of the field without a detection: ``no_magnets`` explain them, or ``no_pass`` over a
         tag caused them.
     """
-
-    def identify(part: PassRange) -> IdentifiedPass | None:
-        path_m = known_path(given_m, part)
-        result = identify_with(part, path_m)
-        if path_m is None or result is None or result.magnets.is_path_estimated:
-            return result
-        scale = scale_to_apply(result.observations[0])
-        if scale is None:
-            return result
-        rescaled = identify_with(part, scale * path_m)
-        return rescaled if rescaled is not None and rescaled.is_identified else result
-
-    def identify_with(part: PassRange, path_m: Array | None) -> IdentifiedPass | None:
-        # The magnets of each design are expected in turn, until a tag of any design is read. A
-        # design of few magnets limits the number of sources.
-        expected = sorted(designs, key=lambda tags: -tags.magnets)
-        hypotheses = chain.from_iterable(
-            detect_magnets(preprocessed, part, tags, path_m) for tags in expected or (None,)
-        )
-        return identify_pass(hypotheses, preprocessed.samples, designs)
-
     passes: list[IdentifiedPass] = []
     rejected: Counter[str] = Counter(no_magnets=0)
     samples, noise_t = preprocessed.samples, preprocessed.noise_t
-    fields_t = [
-        least_magnet_field(samples, tags.magnet.moment, tags.clearance_m) for tags in designs
-    ]
-    magnet_field_t = min(fields_t, default=None)
     for part in track(find_passes(samples, noise_t), "passes"):
-        current = identify(part)
-        if (current is None or not current.is_identified) and (
-            (current is not None and _is_at_rest(current))
-            or is_no_pass(samples, part, noise_t, known_path(given_m, part), magnet_field_t)
-        ):
+        current = identify_range(preprocessed, designs, part, given_m)
+        if has_no_tag(preprocessed, designs, part, given_m, current):
             rejected["no_pass"] += 1
             continue
         if current is None:
             rejected["no_magnets"] += 1
             continue
         if passes and any(may_be_one_tag(passes[-1], current, tags) for tags in designs):
-            merged = identify(PassRange(passes[-1].magnets.first, current.magnets.stop))
+            whole = PassRange(passes[-1].magnets.first, current.magnets.stop)
+            merged = identify_range(preprocessed, designs, whole, given_m)
             if merged is not None and merged.is_identified:
                 passes[-1] = merged
                 continue
         passes.append(current)
     return passes, rejected
+
+
+def identify_range(
+    preprocessed: PreprocessedSamples,
+    designs: Sequence[Tags],
+    part: PassRange,
+    given_m: Array | None,
+) -> IdentifiedPass | None:
+    """Detect the magnets of one pass, and identify the tags; None if no magnets explain it.
+
+    ``given_m`` (n,) is the distance moved at each sample of the recording; nan if unknown.
+    """
+
+    def identify_with(path_m: Array | None) -> IdentifiedPass | None:
+        # The magnets of each design are expected in turn, until a tag of any design is read. A
+        # design of few magnets limits the number of sources.
+        hypotheses = chain.from_iterable(
+            detect_magnets(preprocessed, part, tags, path_m)
+            for tags in by_magnets(designs) or (None,)
+        )
+        return identify_pass(hypotheses, preprocessed.samples, designs)
+
+    path_m = known_path(given_m, part)
+    result = identify_with(path_m)
+    if path_m is None or result is None or result.magnets.is_path_estimated:
+        return result
+    scale = scale_to_apply(result.observations[0])
+    if scale is None:
+        return result
+    rescaled = identify_with(scale * path_m)
+    return rescaled if rescaled is not None and rescaled.is_identified else result
+
+
+def by_magnets(designs: Sequence[Tags]) -> list[Tags]:
+    """Return the designs in the order in which they are expected: most magnets first."""
+    return sorted(designs, key=lambda tags: -tags.magnets)
+
+
+def has_no_tag(
+    preprocessed: PreprocessedSamples,
+    designs: Sequence[Tags],
+    part: PassRange,
+    given_m: Array | None,
+    current: IdentifiedPass | None,
+) -> bool:
+    """Return whether the field of an unidentified pass changed without a motion over a tag.
+
+    ``current`` is the explanation of the pass by magnets, if there is one.
+    """
+    if current is not None and current.is_identified:
+        return False
+    if current is not None and _is_at_rest(current):
+        return True
+    samples = preprocessed.samples
+    fields_t = [
+        least_magnet_field(samples, tags.magnet.moment, tags.clearance_m) for tags in designs
+    ]
+    path_m = known_path(given_m, part)
+    return is_no_pass(samples, part, preprocessed.noise_t, path_m, min(fields_t, default=None))
 
 
 def _is_at_rest(current: IdentifiedPass) -> bool:

@@ -286,6 +286,49 @@ def fit_pass(
         return _result(problem, equations.projected, weight, converged, tests)
 
 
+def further_moments(
+    window: PassWindow, fit: PassFit, priors: PassPriors, position_m: Array
+) -> tuple[Array, Array]:
+    """Estimate the moments of further magnets at given positions from the residual of a fit.
+
+    Each is estimated as if there was no other one.
+
+    Parameters
+    ----------
+    window, fit, priors
+    position_m : (K, 2) ndarray
+        In the frame of the fit.
+
+    Returns
+    -------
+    moment_am2, sigma_am2 : (K,) ndarray
+        Magnitude of the horizontal moment, and its standard deviation along the direction that the
+        samples determine worst; ``inf`` if they do not determine it.
+    """
+    state = fit.state
+    problem = PassProblem(window, priors, sample_weights(window), state)
+    poses = state.bar_poses
+    fields = problem.magnet_offsets(replace(state, position_m=position_m), poses).unit_fields()
+    if poses is not None:
+        fields = fields @ poses.rotation.transpose(0, 2, 1)[None, None]
+    horizontal = fields[..., :2].reshape(*problem.shape, -1)
+    rows = problem.whiten(horizontal)
+    # Backgrounds explain a part of them.
+    levels = problem.background_inverse @ (problem.background.transpose(0, 2, 1) @ rows)
+    rows = (rows - problem.background @ levels).reshape(-1, len(position_m), 2).swapaxes(0, 1)
+    residual = np.nan_to_num(fit.residual).reshape(len(fit.residual), -1).T.ravel()
+    information = rows.swapaxes(1, 2) @ rows
+    least = np.linalg.eigvalsh(information)[:, 0]
+    sigma = 1 / np.sqrt(np.maximum(least, 1e-300))
+    is_determined = least > 0
+    moment = np.full(len(position_m), np.inf)
+    right = rows[is_determined].swapaxes(1, 2) @ residual
+    moment[is_determined] = np.linalg.norm(
+        np.linalg.solve(information[is_determined], right[..., None])[..., 0], axis=1
+    )
+    return moment, np.where(is_determined, sigma, np.inf)
+
+
 def _reweight(
     problem: PassProblem, equations: PassEquations, weight: Array
 ) -> tuple[PassProblem, PassEquations, bool]:

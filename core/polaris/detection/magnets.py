@@ -34,6 +34,7 @@ from locatk.core.polaris.detection.window import (
     PassPriors,
     PassWindow,
     PreparedPass,
+    begin_at_level,
     prepare_pass,
     time_hypotheses,
     trend_basis,
@@ -162,6 +163,9 @@ MIN_RADIUS_M, MAX_ATTITUDE_RAD = 0.08, np.radians(5.0)
 """Least radius of the path, and largest attitude of the array, at which simulated tags of five
 magnets and a spacing of 40 mm are read: none at 70 mm, and few from 6 degrees on."""
 
+RECENT_GROUPS = 6
+"""Number of averaged samples whose speed the array is assumed to keep after them."""
+
 DEFAULT_SKEW_PERIODS = 0.2
 """Initial skew if the expected one is half a sample period or more."""
 
@@ -181,6 +185,28 @@ class MagnetHypothesis:
     prepared: PreparedPass
     fit: PassFit
     magnets: DetectedMagnets
+
+
+@dataclass(frozen=True)
+class RunningPass:
+    """Coarse fit of a pass that has not ended yet.
+
+    Attributes
+    ----------
+    prepared : PreparedPass
+    priors : PassPriors
+    coarse : PassFit
+    """
+
+    prepared: PreparedPass
+    priors: PassPriors
+    coarse: PassFit
+
+    @property
+    def magnet_count(self) -> int:
+        """Number of sources of the array's path that are as strong as magnets of one kind."""
+        moment = _horizontal_moments(self.coarse.state)
+        return int(np.count_nonzero(moment > MIN_MOMENT_RATIO * np.median(moment)))
 
 
 def detect_magnets(
@@ -213,6 +239,91 @@ def detect_magnets(
             yield MagnetHypothesis(prepared, fit, magnets)
 
 
+def detect_running_pass(
+    preprocessed: PreprocessedSamples, part: PassRange, tags: Tags, path_m: Array | None = None
+) -> RunningPass | None:
+    """Detect the magnets of a pass that has not ended yet, coarsely.
+
+    The pass must begin before the first magnet. Only the most promising initial guess is tried.
+
+    Parameters
+    ----------
+    preprocessed, part, tags, path_m
+        As of :func:`detect_magnets`.
+
+    Returns
+    -------
+    RunningPass or None
+        None if the samples hold no magnet yet, or do not determine it.
+    """
+    prepared = begin_at_level(
+        prepare_pass(preprocessed.samples, part, preprocessed.noise_t, tags, path_m)
+    )
+    # A slope would be taken from the field of magnets ahead.
+    level = replace(prepared, window=replace(prepared.window, trend_terms=1))
+    guesses = _timed_guesses(level)
+    if not guesses:
+        return None
+    timed, guess = guesses[0]
+    try:
+        fit = _grow_coarse_fit(timed, guess)
+    except DegenerateError:
+        return None
+    window = replace(timed.window, trend_terms=prepared.window.trend_terms)
+    return RunningPass(replace(timed, window=window), guess.priors, fit)
+
+
+def extend_running_pass(
+    preprocessed: PreprocessedSamples,
+    part: PassRange,
+    tags: Tags,
+    before: MagnetHypothesis,
+    path_m: Array | None = None,
+) -> RunningPass | None:
+    """Fit the magnets of a hypothesis, coarsely, to more samples of its pass.
+
+    Parameters
+    ----------
+    preprocessed, part, tags, path_m
+        As of :func:`detect_magnets`; the pass has the same first sample as before.
+    before : MagnetHypothesis
+
+    Returns
+    -------
+    RunningPass or None
+        None if the samples do not determine the magnets any more.
+    """
+    prepared = prepare_pass(preprocessed.samples, part, preprocessed.noise_t, tags, path_m)
+    old, state, index = before.prepared, before.fit.state, prepared.group_index
+    if prepared.window.path_m is not None and old.window.path_m is not None:
+        path = prepared.window.path_m + (state.path_m[0] - old.window.path_m[0])
+    else:
+        path = np.interp(index, old.group_index, state.path_m)
+        last = min(RECENT_GROUPS, len(state.path_m) - 1)
+        step = state.path_m[-1] - state.path_m[-1 - last]
+        step /= old.group_index[-1] - old.group_index[-1 - last]
+        path += np.maximum(index - old.group_index[-1], 0.0) * step
+    priors = prepared.priors[0]
+    try:
+        fit = fit_coarse(prepared.window, replace(state, path_m=path), priors)
+    except DegenerateError:
+        return None
+    return RunningPass(prepared, priors, fit)
+
+
+def refine_running_pass(samples: Samples, running: RunningPass) -> MagnetHypothesis:
+    """Return the final fit of a pass as far as it has been recorded.
+
+    Raises
+    ------
+    DegenerateError
+        The samples do not determine the magnets.
+    """
+    fit = _refine_fit(running.prepared, running.priors, running.coarse)
+    magnets = _to_array_frame(samples, running.prepared, fit)
+    return MagnetHypothesis(running.prepared, fit, magnets)
+
+
 def detect_magnets_at(
     samples: Samples, hypothesis: MagnetHypothesis, positions_m: Array
 ) -> MagnetHypothesis:
@@ -238,7 +349,7 @@ def detect_magnets_at(
     # Nuisances of a fit without some of the magnets may have replaced them.
     state = replace(
         hypothesis.fit.state,
-        position_m=positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m,
+        position_m=to_fit_frame(magnets, positions_m),
         moment_am2=np.zeros((len(positions_m), 3)),
         crab_rad=0.0,
         motion=None,
@@ -251,6 +362,20 @@ def detect_magnets_at(
     fit = fit_pass(window, _without_spurious_sources(state, prepared), priors)
     again = replace(_to_array_frame(samples, prepared, fit), warnings=magnets.warnings)
     return MagnetHypothesis(prepared, fit, again)
+
+
+def bar_in_frame(magnets: DetectedMagnets, state: PassState) -> float:
+    """Return the x of the bar [m] at the last sample of a fit, in the frame of the magnets."""
+    poses = (state.motion or Motion.straight(state.path_m, 0.0, state.height_m)).poses(
+        state.path_m[-1:], state.crab_rad
+    )
+    offset = poses.position_m[0, :2] - magnets.origin_m
+    return float((offset @ _rotation(magnets.origin_heading_rad))[0])
+
+
+def to_fit_frame(magnets: DetectedMagnets, positions_m: Array) -> Array:
+    """Return positions (K, 2) in the frame of the fit from those in the frame of the magnets."""
+    return np.asarray(positions_m @ _rotation(-magnets.origin_heading_rad) + magnets.origin_m)
 
 
 # ---- matched filter
@@ -495,27 +620,50 @@ def _timed_guesses(prepared: PreparedPass) -> list[tuple[PreparedPass, _InitialG
 
 def _grow_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
     """Fit from one initial guess; magnets are added until the residual holds no more."""
-    window, priors, state = prepared.window, guess.priors, guess.state
-    has_shared_field = len(window.sensors_m) >= MIN_SENSORS_WITH_SHARED_FIELD
-    coarse = replace(window, common_t=SEARCH_SHARED_FIELD_T if has_shared_field else 0.0)
+    return _refine_fit(prepared, guess.priors, _grow_coarse_fit(prepared, guess))
+
+
+def _grow_coarse_fit(prepared: PreparedPass, guess: _InitialGuess) -> PassFit:
+    """Fit coarsely from one initial guess, with all magnets that are found."""
+    state = guess.state
     candidates, _ = guess.matched_filter.find_magnets(
         state.path_m, prepared.scaled, prepared.max_sources, MIN_MAGNET_ENERGY
     )
     separate = _separate_candidates(candidates, state.height_m)
-    state = _initial_state(separate, state.path_m, state.mean_step_m, priors)
-    fit = fit_coarse(coarse, state, priors)
+    state = _initial_state(separate, state.path_m, state.mean_step_m, guess.priors)
+    return _add_missed_sources(
+        prepared, guess.priors, fit_coarse(_coarse_window(prepared), state, guess.priors)
+    )
+
+
+def _coarse_window(prepared: PreparedPass) -> PassWindow:
+    """Return the window of a coarse fit, which allows for a field that all sensors share."""
+    window = prepared.window
+    has_shared_field = len(window.sensors_m) >= MIN_SENSORS_WITH_SHARED_FIELD
+    return replace(window, common_t=SEARCH_SHARED_FIELD_T if has_shared_field else 0.0)
+
+
+def _add_missed_sources(prepared: PreparedPass, priors: PassPriors, fit: PassFit) -> PassFit:
+    """Add sources to a coarse fit until its residual holds no more."""
     for _ in range(MAX_GROWTH_ROUNDS):
         missed = _find_missed_sources(prepared, fit)
-        if not missed or window.effort.is_exhausted:
+        if not missed or prepared.window.effort.is_exhausted:
             break
         before = fit
-        fit = fit_coarse(coarse, _with_sources(fit.state, missed), priors)
+        fit = fit_coarse(_coarse_window(prepared), _with_sources(fit.state, missed), priors)
         if fit.rms_sigma > MAX_WORTHWHILE_RESIDUAL_RATIO * before.rms_sigma:
             break
+    return fit
+
+
+def _refine_fit(prepared: PreparedPass, priors: PassPriors, fit: PassFit) -> PassFit:
+    """Return the final fit of the magnets of a coarse one, without those that are spurious."""
+    window = prepared.window
     if window.path_m is not None and fit.rms_sigma > UNRELATED_RESIDUAL_SIGMAS:
         raise DegenerateError("the samples contradict the given path")
     # Only a fit that allows for a shared field shows how large it is.
-    if coarse.common_t and fit.shared_square > max(MAX_SHARED_SQUARE, 2 * fit.rms_sigma**2):
+    has_shared_field = len(window.sensors_m) >= MIN_SENSORS_WITH_SHARED_FIELD
+    if has_shared_field and fit.shared_square > max(MAX_SHARED_SQUARE, 2 * fit.rms_sigma**2):
         information = np.mean(1 / window.noise_t**2) * len(window.sensors_m)
         window = replace(window, common_t=float(np.sqrt((fit.shared_square - 1) / information)))
     state = _without_spurious_sources(fit.state, prepared)

@@ -7,6 +7,7 @@ rested, a second time axis without the rests is an alternative hypothesis.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -57,6 +58,8 @@ height if no tag is given."""
 MAX_SOURCES_WITHOUT_TAG = 12
 """Maximum number of magnets and other sources in a pass if no tag is given."""
 
+LEVEL_SAMPLES = 8
+"""Maximum number of samples at an end of a pass of which the median is the level there."""
 
 EFFORT_PER_SOURCE_SQUARE = 2.5e5
 """Work that a pass may take, in samples times unknowns of all iterations, by the square of the
@@ -301,11 +304,25 @@ def _subtract_line(scaled: Array) -> Array:
     """Return samples (n, 3 N) minus the straight line through both ends; 0 if missing."""
     n = len(scaled)
     flat = np.nan_to_num(scaled.reshape(n, -1))
-    ends = max(1, min(8, n // 10))
+    ends = max(1, min(LEVEL_SAMPLES, n // 10))
     left, right = np.median(flat[:ends], axis=0), np.median(flat[-ends:], axis=0)
     fraction = np.linspace(0, 1, n)[:, None]
     level = flat - (1 - fraction) * left - fraction * right
     return np.where(np.isfinite(scaled.reshape(n, -1)), level, 0)
+
+
+def begin_at_level(prepared: PreparedPass) -> PreparedPass:
+    """Return a pass whose scaled fields are relative to its first samples alone.
+
+    It is meant for a pass that has not ended: its last samples hold the field of magnets.
+    """
+    window = prepared.window
+    ends = max(1, int(np.searchsorted(np.cumsum(window.counts), LEVEL_SAMPLES, "right")))
+    flat = (window.field_t / window.noise_t).reshape(len(window.field_t), -1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # A sensor without a sample there.
+        level = np.nan_to_num(np.nanmedian(flat[:ends], axis=0))
+    return replace(prepared, scaled=np.nan_to_num(flat - level))
 
 
 def time_hypotheses(prepared: PreparedPass) -> Iterator[PreparedPass]:

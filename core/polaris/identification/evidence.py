@@ -97,6 +97,46 @@ def is_in_grid(
     return _excess(tags, grid) < 0.5
 
 
+def lattice_ahead(
+    magnets: DetectedMagnets, tags: Tags, match: TagMatch, bar_m: float, half_width_m: float
+) -> Array:
+    """Return points of the lattice of a match that the array has not passed yet.
+
+    They are the cells of the tag, and their neighbours beyond the grid, up to one spacing after the
+    last magnet.
+
+    Parameters
+    ----------
+    magnets, tags, match
+    bar_m : float
+        Position of the bar along x.
+    half_width_m : float
+        Distance from the middle of the array up to which it would detect a magnet.
+
+    Returns
+    -------
+    (K, 2) ndarray
+        In the frame of the magnets.
+    """
+    cells = tuple((i, k) for k in range(-1, tags.order + 1) for i in range(-1, tags.order + 1))
+    cos, sin = np.cos(match.heading_rad), np.sin(match.heading_rad)
+    position = cell_positions(tags, cells) @ np.array([[cos, sin], [-sin, cos]])
+    position = position + [match.x_m, match.y_m]
+    scale = match.scale if magnets.is_path_estimated else 1.0
+    direction = 1.0 if magnets.path_m[-1] >= magnets.path_m[0] else -1.0
+    along = direction * position[:, 0]
+    last = (direction * magnets.position_m[list(match.magnets), 0] * scale).max()
+    is_ahead = along > direction * bar_m * scale - magnets.height_m
+    is_ahead &= along < last + 1.1 * tags.spacing_m
+    is_ahead &= np.abs(position[:, 1]) < half_width_m
+    # The cells of the match are explained.
+    nearest = np.linalg.norm(
+        position[:, None] - magnets.position_m[list(match.magnets)] * [scale, 1.0], axis=2
+    ).min(axis=1)
+    is_ahead &= nearest > tags.spacing_m / 2
+    return np.asarray(position[is_ahead] / [scale, 1.0])
+
+
 def contradicts_design(magnets: DetectedMagnets, tags: Tags, match: TagMatch) -> bool:
     """Return whether moment, height or spacing of a match are those of another design."""
     moment = np.median(magnets.moment_am2[list(match.magnets)])
