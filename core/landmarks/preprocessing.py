@@ -25,7 +25,7 @@ from locatk.core.landmarks.detection.trace import (
     relative,
     sensor_positions,
 )
-from locatk.core.landmarks.halls import HallSamples
+from locatk.core.landmarks.halls import HallSamples, HallSensors
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -239,8 +239,8 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
     if uncovered > MAX_UNCOVERED_FRACTION * len(time_ns):
         message = f"{uncovered} samples without odometry left out"
         warnings.append(SolverWarning("samples_without_odometry", message).about(samples.device))
-    pose = _interpolate(time_ns, odometry.time_ns, planar_poses(odometry))
-    field, reading_warnings = remove_invalid_readings(samples, _sensor_motion(samples, pose))
+    pose = interpolate_smoothly(time_ns, odometry.time_ns, planar_poses(odometry))
+    field, reading_warnings = remove_invalid_readings(samples, sensor_motion(samples.sensors, pose))
     field, time_ns = field[is_covered], time_ns[is_covered]
     return HallRecording(
         samples=HallSamples(samples.device, samples.sensors, time_ns, field),
@@ -267,16 +267,16 @@ def _is_in_gap(
     samples: HallSamples, odometry: Trajectory, invalid_ns: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """Return which samples (n,) are at invalid poses between valid ones that are far apart."""
-    motion_m = _sensor_motion(samples, planar_poses(odometry))
+    motion_m = sensor_motion(samples.sensors, planar_poses(odometry))
     has_invalid = np.diff(np.searchsorted(invalid_ns, odometry.time_ns)) > 0
     is_gap = np.pad(has_invalid & (motion_m > MAX_INTERPOLATED_MOTION_M), 1)
     return np.asarray(is_gap[np.searchsorted(odometry.time_ns, samples.time_ns)])
 
 
-def _sensor_motion(samples: HallSamples, pose: Array) -> Array:
+def sensor_motion(sensors: HallSensors, pose: Array) -> Array:
     """Return the largest motion (n - 1,) of a sensor between successive poses (n, 3)."""
     step = np.diff(pose, axis=0)
-    radius_m = float(np.hypot(*samples.sensors.position_m.T).max())
+    radius_m = float(np.hypot(*sensors.position_m.T).max())
     return np.asarray(np.hypot(step[:, 0], step[:, 1]) + radius_m * np.abs(step[:, 2]))
 
 
@@ -348,7 +348,7 @@ def remove_invalid_readings(
     """
     field = samples.field_t.copy()
     warnings = []
-    is_spike = _detect_spikes(field, motion_m, _sample_noise(samples, field))
+    is_spike = detect_spikes(field, motion_m, _sample_noise(samples, field))
     field[is_spike] = np.nan
     if is_spike.any():
         message = f"{int(is_spike.sum())} single readings jump; left out"
@@ -368,7 +368,7 @@ def remove_invalid_readings(
     return field, [warning.about(samples.device) for warning in warnings]
 
 
-def _detect_spikes(field: Array, motion_m: Array, noise_t: float) -> NDArray[np.bool_]:
+def detect_spikes(field: Array, motion_m: Array, noise_t: float) -> NDArray[np.bool_]:
     """Return which readings (n, N) deviate from both neighbours."""
     is_spike = np.zeros(field.shape, bool)
     if len(field) < 3:
@@ -446,7 +446,9 @@ def _sample_noise(samples: HallSamples, field: Array) -> float:
     return max(float(quantile / NORMAL_QUARTILE_OF_MAGNITUDE / math.sqrt(6)), least_t)
 
 
-def _interpolate(time_ns: NDArray[np.int64], known_ns: NDArray[np.int64], values: Array) -> Array:
+def interpolate_smoothly(
+    time_ns: NDArray[np.int64], known_ns: NDArray[np.int64], values: Array
+) -> Array:
     """Interpolate values (n, k) smoothly, without overshoot where they are constant."""
     known_s, wanted_s = (known_ns - known_ns[0]) * 1e-9, (time_ns - known_ns[0]) * 1e-9
     if len(known_s) < 3:
@@ -511,7 +513,7 @@ def segment_visits(
         begin = int(np.searchsorted(distance, distance[first] - MARGIN_M))
         end = int(np.searchsorted(distance, distance[stop - 1] + MARGIN_M, "right"))
         segments.append(
-            _segment(recording, max(earliest, begin), min(latest, end), centroid, drift)
+            average_samples(recording, max(earliest, begin), min(latest, end), centroid, drift)
         )
     return segments
 
@@ -524,7 +526,7 @@ def merge_segments(
     drift: OdometryDrift,
 ) -> VisitSegment:
     """Merge two successive visits to the landmark at ``centre``, with the samples in between."""
-    return _segment(recording, first.first, second.stop, centre, drift)
+    return average_samples(recording, first.first, second.stop, centre, drift)
 
 
 def _sensor_path(recording: HallRecording, pose: Array) -> Array:
@@ -573,10 +575,13 @@ def _velocity(recording: HallRecording, first: int, stop: int) -> Array:
     return (ahead - behind) / (2e-9 * VELOCITY_SPAN_NS)
 
 
-def _segment(
+def average_samples(
     recording: HallRecording, first: int, stop: int, centre: Array, drift: OdometryDrift
 ) -> VisitSegment:
-    """Average the samples ``first`` to ``stop - 1`` in bins of the path."""
+    """Average the samples ``first`` to ``stop - 1`` of a visit in bins of the path.
+
+    ``centre`` (2,) is the landmark's position by odometry, at which the reference is nearest.
+    """
     pose = recording.pose[first:stop]
     path = _sensor_path(recording, pose)
     bin_m = max(BIN_M, path[-1] / MAX_BINS)

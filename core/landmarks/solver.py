@@ -8,11 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError, InputError
 from locatk.core.landmarks.detection.fit import ModelPriors
 from locatk.core.landmarks.detection.hypotheses import detect_landmarks
-from locatk.core.landmarks.detection.trace import CONSTANT_ERROR_COUNT, known_drift
+from locatk.core.landmarks.detection.trace import (
+    CONSTANT_ERROR_COUNT,
+    OdometryDrift,
+    known_drift,
+)
 from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.localization.cell_filter import (
@@ -21,6 +26,7 @@ from locatk.core.landmarks.localization.cell_filter import (
     select_visits_on_map,
 )
 from locatk.core.landmarks.localization.consistency import (
+    MAP_CONTRADICTED_WARNING,
     NO_MAP_WARNING,
     contradicts_odometry,
     describe_visit,
@@ -47,6 +53,8 @@ from locatk.core.landmarks.published.solver import solve as solve_published
 from locatk.core.landmarks.results import LandmarkFacts, RobotFacts
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import PROVISIONAL_PROBABILITY, Trajectory
+
+Array = NDArray[np.float64]
 
 METHODS = ("field", "paper")
 
@@ -290,11 +298,7 @@ def localize_robot(
     if floor is None:
         return _with_warnings(unlocalized, NO_MAP_WARNING.about(identified.device))
     if is_map_contradicted(visits, on_map, identified.map_probability):
-        message = (
-            "not localised; too many of its landmarks differ from the map: is it the map of this "
-            "floor, and does the odometry have the right sign?"
-        )
-        obstacle = SolverWarning("map_contradicted", message).about(identified.device)
+        obstacle = MAP_CONTRADICTED_WARNING.about(identified.device)
     elif not on_map:
         obstacle = warn_of_missing_pose(recording, visits)
     else:
@@ -362,10 +366,7 @@ def localize_robot(
 
 
 def lag_of_visits(identified: IdentifiedRecording) -> float:
-    """Return the lag in seconds by the fits of single visits, or 0 if it is not significant.
-
-    It must be significant without any one visit as well, in which a wheel may have slipped.
-    """
+    """Return the lag in seconds by the fits of single visits, or 0 if it is not significant."""
     fits = [
         (visit.hypotheses.best.fit, visit.segment.trace)
         for visit in identified.visits
@@ -374,12 +375,22 @@ def lag_of_visits(identified: IdentifiedRecording) -> float:
     information, vector = constant_error_information(
         [(fit, trace) for fit, trace in fits if fit is not None]
     )
+    return common_lag(information, vector, identified.priors.drift)
+
+
+def common_lag(information: Array, vector: Array, drift: OdometryDrift) -> float:
+    """Return the lag in seconds by the information of single visits, or 0 if it is not significant.
+
+    It must be significant without any one visit as well, in which a wheel may have slipped.
+
+    Parameters are those that :func:`.smoothing.constant_error_information` returns.
+    """
     # The sums over all visits, and over all but each one.
     information = information.sum(axis=0) - np.concatenate([np.zeros((1, 4, 4)), information])
     vector = vector.sum(axis=0) - np.concatenate([np.zeros((1, 4)), vector])
     covariance = np.linalg.inv(np.eye(CONSTANT_ERROR_COUNT) + information)
     lags = [
-        significant_lag(errors[LAG_COLUMN], own[LAG_COLUMN, LAG_COLUMN], identified.priors.drift)
+        significant_lag(errors[LAG_COLUMN], own[LAG_COLUMN, LAG_COLUMN], drift)
         for errors, own in zip(np.einsum("kij,kj->ki", covariance, vector), covariance, strict=True)
     ]
     return lags[0] if all(lag * lags[0] > 0 for lag in lags) else 0.0

@@ -807,13 +807,13 @@ def check_wiring(
     """
     names, device = recording.samples.sensors.names, recording.samples.device
     longest_first = sorted(visits, key=lambda visit: -len(visit.segment.trace))
-    doubtful = [visit.segment.trace for visit in longest_first if _is_doubtful(visit)]
+    doubtful = [visit.segment.trace for visit in longest_first if is_doubtful(visit)]
     if len(doubtful) <= MIN_DOUBTFUL_FRACTION * len(visits) or len(names) > MAX_PERMUTED_SENSORS:
         return 1.0
     others = [
         visit.segment.trace
         for visit in longest_first
-        if not (_is_doubtful(visit) or visit.hypotheses.refused)
+        if not (is_doubtful(visit) or visit.hypotheses.refused)
     ]
     traces = [*doubtful[:MAX_CHECKED_VISITS], *others[:MAX_CHECKED_VISITS]]
 
@@ -885,7 +885,7 @@ def check_wiring(
     return scale
 
 
-def _is_doubtful(visit: DetectedVisit) -> bool:
+def is_doubtful(visit: DetectedVisit) -> bool:
     """Return whether a visit is not explained, or only by improbable bars, gains and heights."""
     if visit.hypotheses.refused:
         return visit.hypotheses.refused == "not_explained"

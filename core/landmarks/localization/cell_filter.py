@@ -24,6 +24,7 @@ floor that has the same fraction of each code.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -237,19 +238,15 @@ def identify_cells(
         return CellIdentification([], 0.0)
     model = CellModel(visits, floor, misread=misread, drift=drift)
     estimates: list[CellEstimate] = []
-    log_map, log_other = 0.0, 0.0
-    other = OtherFloor(model)
+    forward = ForwardPass(model)
     beliefs: list[Belief] = []
     for k in range(len(visits)):
-        belief, evidence = model.initial_belief() if k == 0 else model.advance(beliefs[-1], k)
-        beliefs.append(belief)
-        log_map += math.log(evidence)
-        log_other += math.log(other.advance(k))
+        beliefs.append(forward.advance(k))
         if len(beliefs) == BLOCK_VISITS + LOOKAHEAD_VISITS and k + 1 < len(visits):
             estimates += model.estimates(beliefs)[:BLOCK_VISITS]
             beliefs = beliefs[BLOCK_VISITS:]
     estimates += model.estimates(beliefs)
-    return CellIdentification(estimates, map_probability(log_map - log_other))
+    return CellIdentification(estimates, map_probability(forward.log_evidence_ratio))
 
 
 def map_probability(log_evidence_ratio: float) -> float:
@@ -298,10 +295,34 @@ class Belief:
     outside: float
 
 
+@dataclass(frozen=True)
+class RelativeCell:
+    """Cell of a visit relative to earlier ones, by the most likely steps.
+
+    Attributes
+    ----------
+    chain : int
+        First of the visits that odometry connects.
+    cell : (x, y)
+        In the frame of that visit.
+    quarters : int
+        Rotation of the visit's frame against that of the first one.
+    """
+
+    chain: int
+    cell: Cell
+    quarters: int
+
+    @property
+    def landmark(self) -> tuple[int, Cell]:
+        """Landmark among those of all chains."""
+        return self.chain, self.cell
+
+
 class CellModel:
     """Likelihoods of visits and of the steps between them, on one map.
 
-    Parameters are those of :func:`identify_cells`.
+    Parameters are those of :func:`identify_cells`. Further visits can be appended.
     """
 
     def __init__(
@@ -312,9 +333,12 @@ class CellModel:
         misread: float,
         drift: OdometryDrift,
     ) -> None:
-        self.visits, self.pitch_m, self.drift = visits, floor.pitch_m, drift
-        self.misread = misread
-        self.followed = [_followed_hypotheses(visit) for visit in visits]
+        self.pitch_m, self.drift, self.misread = floor.pitch_m, drift, misread
+        self.visits: dict[int, VisitHypotheses] = {}
+        self.followed: dict[int, list[NumberedHypothesis]] = {}
+        self.path: dict[int, RelativeCell] = {}
+        for number, visit in enumerate(visits):
+            self._append(number, visit)
         codes = np.pad(as_built_codes(floor), PAD_CELLS, constant_values=HOLE_CODE)
         self.shape = codes.shape
         self.cell_count = codes.size
@@ -332,17 +356,84 @@ class CellModel:
         self.confirming = self._confirming_visits()
         self._steps: dict[tuple[int, int, int, int], CellSteps] = {}
 
+    # ---- visits
+
+    def append(self, visit: VisitHypotheses) -> int:
+        """Append a visit while later ones are unknown, and return its number.
+
+        It is confirming if it repeats the reading of an earlier visit to the same landmark.
+        """
+        number = max(self.visits, default=-1) + 1
+        self._append(number, visit)
+        here = self.path[number]
+        earlier = [
+            n for n, one in self.path.items() if n != number and one.landmark == here.landmark
+        ]
+        if earlier:
+            code = self._code_at(max(earlier, key=self._probability_of), here)
+            if self.followed[number][0][1].code == code:
+                self.confirming[number] = code
+        return number
+
+    def remove_last(self) -> None:
+        """Remove the last visit."""
+        number = max(self.visits)
+        for table in (self.visits, self.followed, self.path):
+            del table[number]
+        self.confirming.pop(number, None)
+        self._steps = {key: value for key, value in self._steps.items() if key[2] != number}
+
+    def forget_before(self, number: int) -> None:
+        """Forget all visits before one, to which no belief refers any more."""
+        for table in (self.visits, self.followed, self.path, self.confirming):
+            for earlier in [n for n in table if n < number]:
+                del table[earlier]
+
+    def _append(self, number: int, visit: VisitHypotheses) -> None:
+        """Add a visit after the last one, and its cell relative to that by the likeliest step."""
+        self.visits[number], self.followed[number] = visit, _followed_hypotheses(visit)
+        before = self.path.get(number - 1)
+        self.path[number] = RelativeCell(number, (0, 0), 0)
+        if before is None:
+            return
+        steps = steps_between(
+            self.visits[number - 1],
+            visit,
+            self.followed[number - 1][0][1],
+            self.followed[number][0][1],
+            pitch_m=self.pitch_m,
+            drift=self.drift,
+        )
+        if len(steps):
+            dx, dy = steps.cells[0]
+            for _ in range(before.quarters):
+                dx, dy = -dy, dx
+            self.path[number] = RelativeCell(
+                before.chain,
+                (before.cell[0] + int(dx), before.cell[1] + int(dy)),
+                int(before.quarters + steps.quarters[0]) % 4,
+            )
+
+    def _probability_of(self, visit: int) -> float:
+        """Return the probability of the most probable hypothesis of a visit."""
+        return self.followed[visit][0][1].probability
+
+    def _code_at(self, visit: int, there: RelativeCell) -> int:
+        """Return the code that a visit read, in the frame of another visit to that landmark."""
+        code = self.followed[visit][0][1].code
+        return int(rotated(rotated(code, self.path[visit].quarters), -there.quarters))
+
     def cells_of(self, states: States) -> tuple[States, States, States]:
         """Return quarters, row and column of states, on the map with its pad."""
         quarters, cell = np.divmod(states, self.cell_count)
         row, column = np.divmod(cell, self.shape[1])
         return quarters, row, column
 
-    def initial_belief(self) -> tuple[Belief, float]:
+    def initial_belief(self, visit: int = 0) -> tuple[Belief, float]:
         """Return the belief after the first visit, and the probability of its readings."""
-        count = len(self.followed[0])
-        updated = [self.likelihood(0, n) / self.state_count for n in range(count)]
-        return self._normalized(0, updated, 0.0, [])
+        count = len(self.followed[visit])
+        updated = [self.likelihood(visit, n) / self.state_count for n in range(count)]
+        return self._normalized(visit, updated, 0.0, [])
 
     def advance(self, belief: Belief, visit: int) -> tuple[Belief, float]:
         """Return the belief after the next visit, and the probability of its readings."""
@@ -523,35 +614,14 @@ class CellModel:
             Number of a visit to the code of the landmark, in the frame of the visit's most
             probable hypothesis.
         """
-        # Chain of visits that odometry connects, cell in the frame of its first visit, heading.
-        path: list[tuple[int, tuple[int, int], int]] = [(0, (0, 0), 0)]
-        for number in range(1, len(self.visits)):
-            steps = steps_between(
-                self.visits[number - 1],
-                self.visits[number],
-                self.followed[number - 1][0][1],
-                self.followed[number][0][1],
-                pitch_m=self.pitch_m,
-                drift=self.drift,
-            )
-            chain, (x, y), heading = path[-1]
-            if len(steps):
-                dx, dy = steps.cells[0]
-                for _ in range(heading):
-                    dx, dy = -dy, dx
-                heading = int(heading + steps.quarters[0]) % 4
-                path.append((chain, (x + int(dx), y + int(dy)), heading))
-            else:
-                path.append((number, (0, 0), 0))
-        visits_of: dict[tuple[int, tuple[int, int]], list[int]] = {}
-        for number, (chain, cell, _) in enumerate(path):
-            visits_of.setdefault((chain, cell), []).append(number)
+        visits_of: dict[tuple[int, Cell], list[int]] = {}
+        for number, one in self.path.items():
+            visits_of.setdefault(one.landmark, []).append(number)
         confirming: dict[int, int] = {}
         for numbers in visits_of.values():
-            best = max(numbers, key=lambda n: self.followed[n][0][1].probability)
-            code = int(rotated(self.followed[best][0][1].code, path[best][2]))
+            best = max(numbers, key=self._probability_of)
             for n in numbers:
-                code_here = int(rotated(code, -path[n][2]))
+                code_here = self._code_at(best, self.path[n])
                 # A different reading is evidence: the path may be wrong, after a slip.
                 if n != best and self.followed[n][0][1].code == code_here:
                     confirming[n] = code_here
@@ -609,6 +679,12 @@ class CellModel:
             before_outside, max((float(each.max(initial=0.0)) for each in values), default=0.0)
         )
         return [each / scale for each in values], before_outside / scale
+
+    def filtered_estimate(self, belief: Belief) -> CellEstimate:
+        """Return the estimate of the last visit from the belief after it: no later one is known."""
+        return self._estimate(
+            belief, [np.ones(len(each.states)) for each in belief.components], 1.0
+        )
 
     def _estimate(self, belief: Belief, backward: list[Array], outside: float) -> CellEstimate:
         """Return the most probable cell of a visit."""
@@ -681,7 +757,7 @@ class OtherFloor:
         """Return the probability of the readings of the next visit."""
         model = self.model
         any_code = model.any_code_likelihood(visit)
-        if visit:
+        if self.heading_of:
             arriving = CARRIED_WEIGHT * sum(self.heading_of.values()) / 4
             for before, heading in self.heading_of.items():
                 steps = model.steps(before, 0, visit, 0)
@@ -712,6 +788,49 @@ class OtherFloor:
         missed = np.where((columns == 0) | (rows == 0), np.maximum(columns + rows - 1, 0), 0)
         weight = steps.likelihood * self.mean_miss**missed
         return np.asarray(np.bincount(steps.quarters % 4, weight, minlength=4), float)
+
+
+class ForwardPass:
+    """Belief after successive visits, and the evidence for the map.
+
+    Attributes
+    ----------
+    model : CellModel
+    belief : Belief or None
+        After the last visit.
+    """
+
+    def __init__(self, model: CellModel) -> None:
+        self.model = model
+        self.other = OtherFloor(model)
+        self.belief: Belief | None = None
+        self._log_map, self._log_other = 0.0, 0.0
+
+    @property
+    def log_evidence_ratio(self) -> float:
+        """Log evidence of all visits for the map, relative to that for any other floor."""
+        return self._log_map - self._log_other
+
+    def copy(self) -> ForwardPass:
+        """Return a copy that can be advanced by itself."""
+        other = copy.copy(self)
+        other.other = copy.copy(self.other)
+        return other
+
+    def limit_evidence(self, max_log_ratio: float) -> None:
+        """Limit the evidence for and against the map: it may change later on."""
+        ratio = self.log_evidence_ratio
+        self._log_map, self._log_other = min(max(ratio, -max_log_ratio), max_log_ratio), 0.0
+
+    def advance(self, visit: int) -> Belief:
+        """Return the belief after the next visit."""
+        if self.belief is None:
+            self.belief, evidence = self.model.initial_belief(visit)
+        else:
+            self.belief, evidence = self.model.advance(self.belief, visit)
+        self._log_map += math.log(evidence)
+        self._log_other += math.log(self.other.advance(visit))
+        return self.belief
 
 
 def _followed_hypotheses(visit: VisitHypotheses) -> list[NumberedHypothesis]:

@@ -71,6 +71,11 @@ to be misread, or are unexplained."""
 MIN_MAP_PROBABILITY = 0.05
 """Probability of being on the floor below which its map is rejected."""
 
+MAP_CONTRADICTED_WARNING = SolverWarning(
+    "map_contradicted",
+    "not localised; too many of its landmarks differ from the map: is it the map of this floor, "
+    "and does the odometry have the right sign?",
+)
 NO_MAP_WARNING = SolverWarning("no_map", "no map, so that its landmarks have no cells")
 
 
