@@ -83,7 +83,7 @@ class Sink(Protocol):
     Attributes
     ----------
     address : str
-        As given by the user.
+        As given by the user, without a password.
     """
 
     address: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -115,3 +116,16 @@ def finite(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: finite(each) for key, each in value.items()}
     return value
+
+
+def dump(value: object) -> bytes:
+    """Return the shortest JSON of a value in UTF-8.
+
+    Raises
+    ------
+    ValueError
+        It contains a number that is not finite.
+    """
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode(
+        "utf-8", "replace"
+    )
