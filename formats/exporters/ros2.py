@@ -187,7 +187,12 @@ def pose_with_covariance(trajectory: Trajectory) -> list[bytes]:
 def transforms(trajectory: Trajectory) -> list[bytes]:
     """Encode one ``tf2_msgs/msg/TFMessage`` with one transform per pose in CDR."""
     head = struct.pack("<I", 1) + bytes(8) + _string(trajectory.frame)
-    return _messages(trajectory, head + _string(child_frame(trajectory)), 4, _poses(trajectory))
+    return _messages(
+        trajectory,
+        head + _string(child_frame(trajectory.device, trajectory.frame)),
+        4,
+        _poses(trajectory),
+    )
 
 
 def known_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -128,7 +128,7 @@ def transforms(topic: str, trajectory: Trajectory) -> Iterator[MessageBatch]:
             [
                 timestamp_field(1, time_ns),
                 text_field(2, trajectory.frame, len(time_ns)),
-                text_field(3, child_frame(trajectory), len(time_ns)),
+                text_field(3, child_frame(trajectory.device, trajectory.frame), len(time_ns)),
                 message_field(4, [double_fields(1, position)]),
                 message_field(5, [double_fields(1, quaternion)]),
             ]
@@ -153,9 +153,9 @@ def _pose_fields(position: NDArray[np.float64], quaternion: NDArray[np.float64])
     ]
 
 
-def child_frame(trajectory: Trajectory) -> str:
+def child_frame(device: str, frame: str) -> str:
     """Return the name of the device's own frame: its name, unless the poses' frame has it."""
-    return trajectory.device + ("_body" if trajectory.device == trajectory.frame else "")
+    return device + ("_body" if device == frame else "")
 
 
 def path(trajectory: Trajectory, time_ns: int) -> PosesInFrame:
@@ -202,6 +202,11 @@ def scene_update(artifact: object, trajectories: Sequence[Trajectory], time_ns: 
             color = PATH_COLORS[number % len(PATH_COLORS)]
             entities.append(_line(trajectory, color, time_ns))
     return SceneUpdate(entities=entities)
+
+
+def is_path(entity: SceneEntity) -> bool:
+    """Return whether an entity of a scene is a path, and not a part of the artifact."""
+    return bool(entity.id.startswith(_PATH_PREFIX))
 
 
 def tags_in_frames(
@@ -473,7 +478,7 @@ def artifact_points(scene: SceneUpdate, time_ns: int) -> dict[str, PointCloud]:
     """Return outlines and centres of the entities of a scene except paths, one cloud per frame."""
     parts: dict[str, list[tuple[ArrayLike, Color]]] = {}
     for entity in scene.entities:
-        if not entity.id.startswith(_PATH_PREFIX):
+        if not is_path(entity):
             parts.setdefault(entity.frame_id, []).extend(_entity_points(entity))
     return {frame: _cloud(clouds, frame, time_ns) for frame, clouds in parts.items() if clouds}
 
