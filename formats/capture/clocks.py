@@ -52,6 +52,26 @@ class HostClock:
         return self._wall() - self.now()
 
 
+class ReplayClock(HostClock):
+    """Clock of a replay whose bytes have the times of their recording: that of the newest byte."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._time_ns: int | None = None
+
+    def set(self, time_ns: int) -> None:
+        """Set the time to that of a byte; it never decreases."""
+        self._time_ns = max(time_ns, self._time_ns or 0)
+
+    def now(self) -> int:
+        """Return the time in ns since the epoch: that of the host before the first byte."""
+        return super().now() if self._time_ns is None else self._time_ns
+
+    def stepped_ns(self) -> int:
+        """Return 0: the wall clock does not matter."""
+        return 0
+
+
 MIN_KEPT_READS = 1 << 16
 """Reads whose times are kept: decoders that search for the start of a frame hold records back."""
 

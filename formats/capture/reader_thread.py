@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from locatk.formats.capture.clocks import HostClock
+from locatk.formats.capture.clocks import HostClock, ReplayClock
 from locatk.formats.capture.links import Link, LinkEnded, LinkLost, Overruns, Port
 
 READ_TIMEOUT_S = 0.1
@@ -214,6 +214,8 @@ class PortReader:
         self._attempts = 0
         size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
         recorded_ns: int | None = getattr(self._link, "time_ns", None)
+        if recorded_ns is not None and isinstance(self._clock, ReplayClock):
+            self._clock.set(recorded_ns)
         self.last_data_ns = self._clock.now() if recorded_ns is None else recorded_ns
         self.received += size
         self._add(ReceivedData(self.last_data_ns, data, size))

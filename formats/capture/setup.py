@@ -290,9 +290,7 @@ def _port(request: CaptureRequest, clock: HostClock, stop: threading.Event) -> P
         from locatk.formats.capture.session_frames import SessionFramesPort
 
         address = request.port.removeprefix(CAMERA)
-        if address.rpartition("#/")[0].lower().endswith(".mcap") or (
-            address.lower().endswith(".mcap")
-        ):
+        if is_session_address(address):
             return SessionFramesPort(address, speed=request.speed)
         return camera_port(
             address,
@@ -309,6 +307,11 @@ def _port(request: CaptureRequest, clock: HostClock, stop: threading.Event) -> P
         keeps_time=request.keeps_time,
         stop=stop,
     )
+
+
+def is_session_address(address: str) -> bool:
+    """Return whether the address of a camera is a session with its frames."""
+    return address.lower().endswith(".mcap") or ".mcap#/" in address.lower()
 
 
 def _facts(request: CaptureRequest, port: Port, clock: HostClock) -> dict[str, str]:

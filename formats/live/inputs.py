@@ -168,6 +168,7 @@ class LiveInput:
         self._stop_recorder = threading.Event()
         self._source = source
         self._thread: threading.Thread | None = None
+        self._shared: SharedReader | None = None
 
     # ---- reader and recorder
 
@@ -190,7 +191,7 @@ class LiveInput:
             self._reader.discard()
         else:
             files = create_files(self.request, self._source, self._clock)
-            shared = SharedReader(self._reader)
+            shared = self._shared = SharedReader(self._reader)
             recorder = Recorder(
                 shared,
                 self._source.intake,
@@ -235,6 +236,8 @@ class LiveInput:
 
     def stop_recording(self, timeout_s: float) -> None:
         """End the recording, and finish its files."""
+        if self._shared is not None:
+            self._shared.release()
         self._stop_recorder.set()
         if self._thread is not None:
             self._thread.join(timeout_s)
@@ -336,11 +339,18 @@ class LiveInput:
 class SharedReader:
     """Reader for a recorder that neither starts nor stops it, because the solver uses it as well.
 
-    Attributes are those of :class:`.reader_thread.PortReader`.
+    The end of the source is held back until :meth:`release`: the recording also contains the poses
+    of the last bytes. Attributes are those of :class:`.reader_thread.PortReader`.
     """
 
     def __init__(self, reader: PortReader) -> None:
         self._reader = reader
+        self._is_released = False
+        self._end: list[Event] = []
+
+    def release(self) -> None:
+        """Let the recorder know the end of the source."""
+        self._is_released = True
 
     @property
     def received(self) -> int:
@@ -385,7 +395,13 @@ class SharedReader:
 
     def take(self) -> Sequence[Event]:
         """Return all events since the last call."""
-        return self._reader.take()
+        is_released = self._is_released
+        events = self._reader.take()
+        self._end += [event for event in events if isinstance(event, SourceEnded)]
+        events = [event for event in events if not isinstance(event, SourceEnded)]
+        if is_released:
+            events, self._end = [*events, *self._end], []
+        return events
 
 
 def open_inputs(

@@ -27,8 +27,8 @@ from locatk.core.streaming.events import (
     WarningEvent,
 )
 from locatk.core.streaming.localizer import LiveLocalizer
-from locatk.formats.capture.clocks import HostClock
-from locatk.formats.capture.setup import CaptureRequest
+from locatk.formats.capture.clocks import HostClock, ReplayClock
+from locatk.formats.capture.setup import CAMERA, CaptureRequest, is_session_address
 from locatk.formats.capture.status import RecordingResult
 from locatk.formats.live.background import BackgroundWorker
 from locatk.formats.live.inputs import (
@@ -154,7 +154,9 @@ class LiveSession:
         self, request: LiveRequest, sinks: Sequence[Sink], *, tell: Callable[[str], None]
     ) -> None:
         self._request, self._sinks, self._tell = request, sinks, tell
-        self._clock = HostClock()
+        self._clock: HostClock = HostClock()
+        if all(each.keeps_time or _is_session(each.port) for each in request.inputs):
+            self._clock = ReplayClock()
         self._queue = ArrivalQueue()
         self._inputs: list[LiveInput] = []
         self._recorded: list[RecordedEvents] = []
@@ -481,7 +483,9 @@ class LiveSession:
                 }
                 for each in sinks
             ],
-            "rejected": {} if self._localizer is None else self._localizer.rejected,
+            "rejected": {}
+            if self._localizer is None
+            else getattr(self._localizer.stream, "rejected", {}),
             "warnings": list(self._warnings),
         }
 
@@ -489,6 +493,11 @@ class LiveSession:
     def devices(self) -> dict[str, DeviceStatus]:
         """State of each device."""
         return dict(self._devices)
+
+
+def _is_session(port: str) -> bool:
+    """Return whether a port plays a session."""
+    return port.startswith(CAMERA) and is_session_address(port.removeprefix(CAMERA))
 
 
 def _last_ns(observations: Observations) -> int:
