@@ -215,6 +215,10 @@ class TickClock:
         """
         n = len(ticks)
         self.tick_count += n
+        if n == 1:
+            mapped = self._map_single(int(ticks[0]), int(arrival_ns[0]))
+            if mapped is not None:
+                return np.array([mapped], np.int64)
         out = np.empty(n, np.int64)
         if n and arrival_ns[-1] - arrival_ns[0] < _PIECE_NS:
             self._map(ticks, arrival_ns, out)
@@ -225,6 +229,42 @@ class TickClock:
             for start, stop in pairwise(edges):
                 self._map(ticks[start:stop], arrival_ns[start:stop], out[start:stop])
         return out
+
+    def _map_single(self, tick: int, arrival_ns: int) -> int | None:
+        """Map one tick that fits the mapping and does not change its line; otherwise return None.
+
+        The result and the state are those of :meth:`_map_consistent`. With numbers instead of
+        arrays it takes a tenth of the time, which counts if each sample is mapped as it arrives.
+        """
+        era = self._era
+        if era is None or self._pending:
+            return None
+        x = float(tick - era.tick)
+        arrival = float(arrival_ns - era.arrival_ns)
+        if self._wrap:
+            expected = (arrival - era.origin) / era.rate
+            x += round((expected - x) / self._wrap) * self._wrap
+        delay = arrival - (era.origin + era.rate * x)
+        max_early, max_late = self._tolerance(era, arrival)
+        is_ordinary = -max_early <= delay <= max_late and x >= era.newest - max_early / era.rate
+        previous = era.earliest.get(int(x // self._bin))
+        origin, rate = era.target
+        (x0, y0), (x1, y1) = era.knots[-2:].tolist() if len(era.knots) > 1 else ((0, 0), (0, 0))
+        if not is_ordinary or previous is None or x < x0:
+            return None
+        new_origin = era.origin + min(delay, 0.0)
+        if new_origin != origin and era.newest > era.departure + self._bin / 10:
+            return None
+        if arrival - previous[1] < era.rate * (x - previous[0]):
+            era.earliest[int(x // self._bin)] = (x, arrival)
+        era.origin, era.late_since = new_origin, np.inf
+        if min(era.earliest) <= 0:
+            era.start = new_origin
+        mapped = origin + rate * x if x >= x1 else (y1 - y0) / (x1 - x0) * (x - x0) + y0
+        era.newest, era.newest_arrival = max(era.newest, x), arrival
+        self._delays[self._n_delays % MAX_DELAYS] = arrival - mapped
+        self._n_delays += 1
+        return era.arrival_ns + round(mapped)
 
     def _map(self, ticks: Times, arrival_ns: Times, out: Times) -> None:
         """Map one piece into ``out``."""

@@ -158,7 +158,10 @@ class DeviceClock:
 
         Return None if the tick rate is implausible. ``topic`` separates the streams of the device.
         """
-        self._compare(topic, tick, read_ns)
+        if len(tick) == 1:
+            self._compare_single(topic, int(tick[0]), int(read_ns[0]))
+        else:
+            self._compare(topic, tick, read_ns)
         if self.rate is not None:
             return None
         return np.minimum(self.model.times(tick, read_ns), read_ns)
@@ -169,6 +172,24 @@ class DeviceClock:
         self._last.clear()
         self._ticked = self._passed = 0
         self._before = self.rate = None
+
+    def _compare_single(self, topic: str, tick: int, read_ns: int) -> None:
+        """Compare one tick as :meth:`_compare`, in a tenth of the time."""
+        last = self._last.get(topic)
+        if last is not None:
+            tick_step, time_step = tick - last[0], read_ns - last[1]
+            max_step_ns = float("inf")
+            if self.ticks.bits < 63:
+                tick_step &= (1 << self.ticks.bits) - 1
+                max_step_ns = 0.5e9 * (1 << self.ticks.bits) / self.ticks.hz
+            is_usable = tick_step >= 0 and time_step < max_step_ns
+            if is_usable and tick_step * (1e9 / self.ticks.hz) < max_step_ns:
+                self._ticked += tick_step
+                self._passed += time_step
+        self._last[topic] = (tick, read_ns)
+        if self._passed >= RATE_WINDOW_NS * len(self._last):
+            self._judge(1e9 * self._ticked / self.ticks.hz / self._passed)
+            self._ticked = self._passed = 0
 
     def _compare(self, topic: str, tick: Ints, read_ns: Ints) -> None:
         last = self._last.get(topic)

@@ -590,6 +590,10 @@ class MessageEncoder:
 
     def _ascending(self, topic: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return times that increase by at least a nanosecond, also across batches."""
+        if len(time_ns) == 1:
+            only = max(int(time_ns[0]), self._last.get(topic, -1) + 1)
+            self._last[topic] = only
+            return np.array([only], np.int64)
         steps = np.arange(len(time_ns))
         last = self._last.get(topic, -1)
         rising = np.maximum.accumulate(np.maximum(time_ns - steps, last + 1)) + steps

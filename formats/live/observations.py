@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -87,25 +88,16 @@ class RecordConverter:
         InputError
             The geometry of a sensor is unknown or of another number of sensors.
         """
-        for batch in records:
-            convert = _CONVERSIONS.get(batch.stream.kind)
+        for kind, group in groupby(records, key=lambda batch: batch.stream.kind):
+            if kind == "lighthouse":
+                yield _sweeps(list(group))
+                continue
+            convert = _CONVERSIONS.get(kind)
             if convert is None:
-                self.ignored.add(batch.stream.kind)
-            else:
+                self.ignored.add(kind)
+                continue
+            for batch in group:
                 yield convert(self, batch)
-
-    def _sweeps(self, batch: TimedBatch) -> Sweeps:
-        columns = batch.columns
-        return Sweeps(
-            devices=(batch.device,),
-            time_ns=batch.time_ns,
-            device=np.zeros(len(batch.time_ns), np.int32),
-            sensor=columns["sensor"],
-            channel=columns["channel"],
-            polynomial=columns["polynomial"],
-            sweep=columns["sweep"],
-            count=columns["count"],
-        )
 
     def _magnetometers(self, batch: TimedBatch) -> Samples:
         array = self._sensors(ARRAY, batch, "array")
@@ -164,13 +156,29 @@ class RecordConverter:
 
 
 _CONVERSIONS: dict[str, Any] = {
-    "lighthouse": RecordConverter._sweeps,
     "magnetometers": RecordConverter._magnetometers,
     "halls": RecordConverter._halls,
     "odometry": RecordConverter._odometry,
     "imu": RecordConverter._inertial,
 }
-"""Conversion of each kind of records that streams use."""
+"""Conversion of each kind of records that streams use, besides sweeps."""
+
+
+def _sweeps(batches: Sequence[TimedBatch]) -> Sweeps:
+    """Return the sweeps of several devices, which the stream solves at once."""
+    devices = tuple(dict.fromkeys(batch.device for batch in batches))
+    counts = [len(batch.time_ns) for batch in batches]
+    numbers = np.array([devices.index(batch.device) for batch in batches], np.int32)
+    columns = {
+        name: np.concatenate([batch.columns[name] for batch in batches])
+        for name in ("sensor", "channel", "polynomial", "sweep", "count")
+    }
+    return Sweeps(
+        devices=devices,
+        time_ns=np.concatenate([batch.time_ns for batch in batches]),
+        device=np.repeat(numbers, counts),
+        **columns,
+    )
 
 
 def system_of(observations: Observations) -> str:

@@ -46,6 +46,9 @@ from locatk.formats.sinks.interface import LiveMessage, Sink, SinkContext
 TICK_S = 0.05
 """Longest wait for data, and interval at which the stream learns how much time has passed."""
 
+MIN_INTERVAL_S = 0.002
+"""Shortest time between two calls of the solver: what arrives meanwhile is solved at once."""
+
 ARRIVAL_DELAY_NS = 200_000_000
 """Age from which an observation that has not arrived is missing: buffers of USB and Bluetooth."""
 
@@ -291,10 +294,16 @@ class LiveSession:
     # ---- solver
 
     def _work(self, stop: threading.Event) -> str:
-        advanced_s = time.monotonic()
+        advanced_s = solved_s = time.monotonic()
         while True:
             arrivals = self._queue.take(TICK_S)
+            early_s = solved_s + MIN_INTERVAL_S - time.monotonic()
+            if arrivals and early_s > 0:
+                # Each call costs more than each further observation in it.
+                time.sleep(early_s)
+                arrivals += self._queue.take(0.0)
             self._take(arrivals)
+            solved_s = time.monotonic()
             now_s = time.monotonic()
             if now_s - advanced_s >= TICK_S:
                 advanced_s = now_s

@@ -284,3 +284,51 @@ def test_before_and_after() -> None:
 def test_no_counter(hz: float, bits: int) -> None:
     with pytest.raises(ValueError, match="impossible"):
         TickClock(hz, bits)
+
+
+@pytest.mark.slow
+@settings(deadline=None, max_examples=10)
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from([(1e6, 64), (24e6, 24), (48e6, 32)]),
+    st.floats(-100, 100),
+    st.lists(
+        st.tuples(st.integers(0, 999), st.sampled_from(["late", "wrong", "restart"])), max_size=3
+    ),
+)
+def test_single_ticks_are_mapped_as_in_arrays(
+    seed: int, counter_of: tuple[float, int], ppm: float, faults: list[tuple[int, str]]
+) -> None:
+    hz, bits = counter_of
+    seconds = sampled(100.0, 0.0, 10.0, seed)
+    ticks = counter(seconds * (1 + ppm * 1e-6) + 5.0, hz, bits)
+    arrivals = usb(seconds, seed)
+    for index, fault in faults:
+        if fault == "late":
+            arrivals[index:] = np.maximum(arrivals[index:], arrivals[index] + 0.3)
+        elif fault == "wrong":
+            ticks[index] ^= 1 << 22
+        else:
+            ticks[index:] = counter(seconds[index:] - seconds[index] + 0.01, hz, bits)
+    single, general = TickClock(hz, bits), TickClock(hz, bits)
+    general._map_single = lambda tick, arrival_ns: None  # type: ignore[method-assign]
+    arrival_ns = host_ns(arrivals)
+    for k in range(len(ticks)):
+        part = slice(k, k + 1)
+        assert single.times(ticks[part], arrival_ns[part]) == general.times(
+            ticks[part], arrival_ns[part]
+        )
+    for name in ("offset_ns", "drift_ppm", "jitter_ns", "restarts", "outliers", "tick_count"):
+        assert getattr(single, name) == getattr(general, name)
+
+
+@pytest.mark.slow
+def test_most_single_ticks_take_the_fast_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = sampled(200.0, 0.0, 20.0)
+    ticks, arrival_ns = counter(seconds, 1e6), host_ns(usb(seconds))
+    clock, calls = TickClock(1e6), []
+    general = clock._map_consistent
+    monkeypatch.setattr(clock, "_map_consistent", lambda *a: calls.append(1) or general(*a))
+    for k in range(len(ticks)):
+        clock.times(ticks[k : k + 1], arrival_ns[k : k + 1])
+    assert len(calls) < len(ticks) / 10
