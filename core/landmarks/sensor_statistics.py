@@ -38,6 +38,9 @@ OFFSET_BIN_T = 1e-6
 NOISE_BIN_T, NOISE_BINS = 1e-6, 4000
 """Resolution and number of the second differences from which the noise is estimated."""
 
+UPDATE_SAMPLES = 32
+"""Samples after which the results are computed again."""
+
 MAX_LEVELS = 1024
 """Different readings that are kept in order to find the resolution of the sensors."""
 
@@ -45,9 +48,17 @@ MAX_LEVELS = 1024
 class SensorStatistics:
     """Statistics of the readings of one robot.
 
-    Parameters
+    Attributes
     ----------
     sensors : HallSensors
+    offset_t : (N,) ndarray
+        Offsets of the sensors; 0 as long as too few readings are known.
+    noise_t : float
+        Standard deviation of a sample: as given, or from second differences.
+    range_t : float
+        Range of the sensors: as given, or the largest reading if many have it.
+    is_silent, is_constant : (N,) ndarray
+        Sensors that have reported nothing, and those that never changed, compared with the others.
     """
 
     def __init__(self, sensors: HallSensors) -> None:
@@ -60,6 +71,16 @@ class SensorStatistics:
         self._levels = np.empty(0)
         self._moments = np.zeros((3, count))  # Sums of 1, x and x^2.
         self._largest_t, self._largest_count = 0.0, 0
+        self._samples, self._updated_samples = 0, 0
+        self._update()
+
+    def _update(self) -> None:
+        """Compute the results from the samples so far."""
+        self._updated_samples = self._samples
+        self.offset_t, self.noise_t = self._median_offsets(), self._sample_noise()
+        self.range_t = self._range()
+        self.is_silent = np.asarray(self._moments[0] == 0)
+        self.is_constant = self._constant_sensors()
 
     def add_raw(self, field_t: Array) -> None:
         """Take raw readings (n, N), the newest last."""
@@ -95,10 +116,13 @@ class SensorStatistics:
         if self._quiet_rows > MAX_STATISTIC_SAMPLES:
             self._quiet /= 2
             self._quiet_rows /= 2
+        self._samples += len(field_t)
+        # The first samples are few: their results change with every one of them.
+        if self._samples - self._updated_samples >= min(UPDATE_SAMPLES, self._samples / 4):
+            self._update()
 
-    @property
-    def offset_t(self) -> Array:
-        """Offsets (N,) of the sensors; 0 as long as too few readings are known."""
+    def _median_offsets(self) -> Array:
+        """Return the offsets (N,) of the sensors."""
         total = self._quiet.sum(axis=1)
         if self._quiet_rows < MIN_OFFSET_SAMPLES:
             return np.zeros(len(total))
@@ -106,9 +130,8 @@ class SensorStatistics:
         offset = (np.array(median) + 0.5) * OFFSET_BIN_T - MAX_OFFSET_T
         return np.where(total > 0, offset, 0.0)
 
-    @property
-    def noise_t(self) -> float:
-        """Standard deviation of a sample: as given, or from second differences."""
+    def _sample_noise(self) -> float:
+        """Return the standard deviation of a sample."""
         step_t = float(np.diff(self._levels).min()) if len(self._levels) >= MIN_LEVELS else 0.0
         least_t = max(MIN_NOISE_T, step_t / math.sqrt(12))
         if self.sensors.noise_t > 0 and math.isfinite(self.sensors.noise_t):
@@ -120,22 +143,15 @@ class SensorStatistics:
         # A second difference has the variance 1 + 4 + 1.
         return max(quantile_t / NORMAL_QUARTILE_OF_MAGNITUDE / math.sqrt(6), least_t)
 
-    @property
-    def range_t(self) -> float:
-        """Range of the sensors: as given, or the largest reading if many have it."""
+    def _range(self) -> float:
+        """Return the range of the sensors."""
         if math.isfinite(self.sensors.range_t):
             return self.sensors.range_t
         is_plateau = self._largest_count >= MIN_PLATEAU_READINGS
         return self._largest_t if is_plateau and self._largest_t >= MIN_SPIKE_T else math.inf
 
-    @property
-    def is_silent(self) -> NDArray[np.bool_]:
-        """Return which sensors (N,) have reported nothing."""
-        return np.asarray(self._moments[0] == 0)
-
-    @property
-    def is_constant(self) -> NDArray[np.bool_]:
-        """Return which sensors (N,) never changed, compared with the others."""
+    def _constant_sensors(self) -> NDArray[np.bool_]:
+        """Return which sensors (N,) never changed."""
         count, total, squares = self._moments
         count = np.maximum(count, 1e-300)
         variance = np.where(self.is_silent, np.nan, squares / count - (total / count) ** 2)

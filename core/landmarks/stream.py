@@ -303,8 +303,10 @@ class RobotStream:
         events = self._judge_map()
         if self.last_event_ns is None or visit.hypotheses.time_ns > self.last_event_ns:
             self.last_event_ns = visit.hypotheses.time_ns
+            if self.is_contradicted:
+                estimate = None
             events.append(self._detection(visit.hypotheses, estimate))
-            if estimate is not None and not self.is_contradicted:
+            if estimate is not None:
                 events += self._fix(identified, estimate.map_probability)
         events += self._estimate_lag(visit)
         events += self._judge_sensors(left.recording)

@@ -11,6 +11,7 @@ together. The evidence of a hypothesis follows from cost and information by Lapl
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -121,6 +122,7 @@ class ParameterLayout:
     size: int
 
     @classmethod
+    @functools.lru_cache(maxsize=256)
     def of(cls, sensors: int, corrections: int, neighbours: int = 0) -> ParameterLayout:
         """Return the layout for numbers of sensors, errors of the odometry and further bars."""
         counts = (3, sensors, sensors, BAR_COUNT, 2 * BAR_COUNT, 1, corrections, neighbours)
