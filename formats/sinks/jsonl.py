@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import IO
 
-from locatk.core.errors import InputError, LocatkError, system_hint
+from locatk.core.errors import InputError, LocatkError, OutputExistsError, system_hint
 from locatk.formats.output import check_output
 from locatk.formats.sinks.addresses import SinkAddress
 from locatk.formats.sinks.interface import LiveMessage
@@ -38,20 +38,26 @@ class JsonLinesSink(QueuedSink):
         self._file: IO[bytes] | None = None
 
     def prepare(self) -> None:
-        """Create the file."""
+        """Create the file.
+
+        Raises
+        ------
+        OutputExistsError
+            It exists, and is not to be overwritten.
+        LocatkError
+            It cannot be written.
+        """
+        check_output(self._path, overwrite=True)
         try:
-            check_output(self._path, overwrite=self._overwrite)
             mode = "wb" if self._overwrite else "xb"
             self._file = open(self._path, mode, buffering=0)  # noqa: SIM115 - open until stop()
-        except FileExistsError as error:
-            raise LocatkError(
+        except FileExistsError:
+            raise OutputExistsError(
                 "output exists",
                 file=self._path,
                 hint=f"Choose another name or write jsonl:{self._path}?overwrite",
-            ) from error
+            ) from None
         except OSError as error:
-            if isinstance(error, LocatkError):
-                raise
             raise LocatkError(
                 f"cannot write: {error.strerror}", file=self._path, hint=system_hint(error)
             ) from error

@@ -356,3 +356,71 @@ def test_missing_package_is_named(without_extras: Any) -> None:
     assert "geheim" not in str(caught.value)
     assert not isinstance(caught.value, InputError)
     sink.close(1)
+
+
+@needs_broker
+@pytest.mark.parametrize("options", ["vda5050=visualization", "vda5050=state&version=3.0"])
+def test_vda5050_of_two_vehicles(
+    live: ModuleType, broker: Broker, session: Any, options: str
+) -> None:
+    broker.start()
+    subscriber = session.subscriber(broker.port)
+    sink = session.sink(f"mqtt://127.0.0.1:{broker.port}?{options}&map=hall", "kiwi")
+    is_v3 = "3.0" in options
+    prefix = "vda5050/v3/locatk" if is_v3 else "uagv/v2/locatk"
+    live.wait_for(lambda: subscriber.of(f"{prefix}/kiwi/connection"))
+    live.offer(sink, live.pose(1, "kiwi"), live.lost("kiwi"), live.correction(0, "kiwi"))
+    live.offer(sink, live.pose(2, "lime"))
+    live.wait_for(lambda: subscriber.of(f"{prefix}/lime/connection"))
+    live.offer(sink, live.pose(3, "lime"))
+    live.wait_for(lambda: subscriber.of(f"{prefix}/lime/visualization"))
+    live.wait_for(lambda: len(subscriber.of(f"{prefix}/kiwi/visualization")) == 2)
+    key = "mobileRobotPosition" if is_v3 else "agvPosition"
+    first, second = subscriber.of(f"{prefix}/kiwi/visualization")
+    assert (first["headerId"], first[key]["x"], first[key]["mapId"]) == (1, 1, "hall")
+    assert (second["headerId"], second[key]["localizationScore"]) == (2, 0)
+    states = subscriber.of(f"{prefix}/kiwi/state")
+    assert len(states) == (2 if is_v3 else 0)  # at the connection and at the change
+    if is_v3:
+        assert states[-1]["errors"][0]["errorType"] == "LOCALIZATION_ERROR"
+        assert second["referenceStateHeaderId"] == states[-1]["headerId"]
+    sink.close(5)
+    live.wait_for(lambda: len(subscriber.of(f"{prefix}/lime/connection")) == 2)
+    for device in ("kiwi", "lime"):
+        connection = subscriber.of(f"{prefix}/{device}/connection")
+        assert [each["connectionState"] for each in connection] == ["ONLINE", "OFFLINE"]
+    by_topic = {topic: qos for topic, _, qos, *_ in subscriber.messages}
+    assert {topic.rpartition("/")[2]: qos for topic, qos in by_topic.items()} == (
+        {"connection": 1, "visualization": 0, "state": 0}
+        if is_v3
+        else {"connection": 1, "visualization": 0}
+    )
+    assert not [topic for topic in by_topic if topic.startswith("locatk/")]
+
+
+@needs_broker
+def test_vda5050_state_every_30_s(
+    live: ModuleType, broker: Broker, session: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mqtt, "STATE_PERIOD_S", 0.02)
+    broker.start()
+    subscriber = session.subscriber(broker.port)
+    session.sink(f"mqtt://127.0.0.1:{broker.port}?vda5050=state", "kiwi")
+    live.wait_for(lambda: len(subscriber.of("uagv/v2/locatk/kiwi/state")) > 3)
+
+
+@needs_broker
+@pytest.mark.slow
+def test_vda5050_last_will(live: ModuleType, broker: Broker, session: Any) -> None:
+    broker.start()
+    subscriber = session.subscriber(broker.port)
+    sink = session.sink(f"mqtt://127.0.0.1:{broker.port}?vda5050=visualization", "kiwi", "lime")
+    live.wait_for(lambda: len(subscriber.messages) == 2)
+    # The connection of one vehicle breaks.
+    broken = sink._connections[0]._client
+    broken.reconnect_delay_set(30, 30)
+    broken.socket().shutdown(socket.SHUT_RDWR)
+    topic = "uagv/v2/locatk/kiwi/connection"
+    live.wait_for(lambda: len(subscriber.of(topic)) == 2)
+    assert subscriber.of(topic)[1]["connectionState"] == "CONNECTIONBROKEN"
+    assert len(subscriber.of("uagv/v2/locatk/lime/connection")) == 1
