@@ -827,7 +827,7 @@
     const status = element("td", "status");
     cells.chip = element("span", "chip", "no pose yet");
     cells.reason = element("span", "reason");
-    status.append(cells.chip, cells.reason);
+    status.append(cells.chip, " ", cells.reason);
     row.append(status);
     for (const [key, label, extra] of [
       ["x", "x [m]", "value"], ["y", "y [m]", "value"], ["z", "z [m]", "value"], ["heading", "Heading", "value"],
