@@ -121,6 +121,13 @@ def ros_bags() -> ModuleType:
     return _load_module("ros_bags")
 
 
+@pytest.fixture(scope="session")
+def servers() -> ModuleType:
+    """Module with poses, clients and a browser for sinks that are servers."""
+    pytest.importorskip("websockets", reason="websockets is not installed")
+    return _load_module("live_servers")
+
+
 def _load_module(name: str) -> ModuleType:
     """Return a module of this folder."""
     if name in sys.modules:

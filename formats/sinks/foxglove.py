@@ -172,8 +172,10 @@ class FoxgloveSink(ServerSink):
             self._add_device(device)
         super().open(context)
 
-    def accepts_origin(self, origin: str) -> bool:
-        """Return whether it is an origin of Foxglove or Lichtblick, or of this machine."""
+    def accepts_origin(self, origin: str, has_token: bool) -> bool:
+        """Return whether a page is Foxglove or Lichtblick, is of this machine, or has the token."""
+        if self.token is not None:
+            return has_token
         scheme, _, host = origin.partition("://")
         name = host.rpartition(":")[0] if not host.endswith("]") and ":" in host else host
         is_local = scheme in ("http", "https") and is_loopback(name.strip("[]"))

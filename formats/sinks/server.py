@@ -343,8 +343,11 @@ class ServerSink:
         """Return whether WebSockets are accepted at this path."""
         return True
 
-    def accepts_origin(self, origin: str) -> bool:
-        """Return whether pages of another origin (in lower case) may connect without a token."""
+    def accepts_origin(self, origin: str, has_token: bool) -> bool:
+        """Return whether pages of another origin (in lower case) may connect.
+
+        ``has_token`` is whether the request has the token, true if none is needed.
+        """
         return False
 
     def greet(self, client: Client) -> Iterable[Frame]:
@@ -632,7 +635,8 @@ class ServerSink:
             return _response(http.HTTPStatus.MISDIRECTED_REQUEST, "unknown Host")
         has_token = self._has_token(request, query)
         origin = request.headers.get("Origin")
-        if origin is not None and not self._is_allowed_origin(origin.lower(), host, has_token):
+        is_own = origin is None or self._is_own_origin(origin.lower(), host)
+        if origin is not None and not (is_own or self.accepts_origin(origin.lower(), has_token)):
             return _response(http.HTTPStatus.FORBIDDEN, "pages of this origin have no access")
         resource = self.resource(path, host)
         if resource is not None:
@@ -676,10 +680,9 @@ class ServerSink:
         is_own = name in names or name.removesuffix(".local") in names or _is_ip_address(name)
         return host if is_own else None
 
-    def _is_allowed_origin(self, origin: str, host: str, has_token: bool) -> bool:
-        if origin in (f"http://{host}", f"https://{host}") or origin in self._origins:
-            return True
-        return self.accepts_origin(origin) if self._token is None else has_token
+    def _is_own_origin(self, origin: str, host: str) -> bool:
+        """Return whether a page is of this server, or of its reverse proxy."""
+        return origin in (f"http://{host}", f"https://{host}") or origin in self._origins
 
     def _has_token(self, request: Request, query: str) -> bool:
         """Return whether a request contains the token, or none is needed."""

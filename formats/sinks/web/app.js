@@ -9,6 +9,7 @@
   const MAX_EVENTS = 200;
   const MAX_RETRY_S = 5;
   const TABLE_INTERVAL_MS = 200;
+  const TRAIL_REFRESH_MS = 2000;
   const COLOR_COUNT = 21;
   const STATES = ["tracking", "provisional", "dead reckoning", "lost"];
   const CHIPS = {
@@ -25,6 +26,7 @@
   let connection = "connecting", lostSince = null, lastMessage = 0, retry_s = 0.5;
   let colors = {};
   let dirty = true, tableDue = 0;
+  let version = 0;  // Increases when the artifact or the colors change.
   const view = { x: 0, y: 0, scale: 100, plane: 1, frame: "", follow: "", auto: true,
                  labels: true, trail_s: 30, cursor: null };
 
@@ -66,6 +68,7 @@
   }
 
   function hello(message) {
+    version++;
     for (const device of devices.values()) device.row.remove();
     devices.clear();
     $("events").replaceChildren();
@@ -75,6 +78,7 @@
       const device = deviceOf(known.device);
       for (const [t, x, y, z, state, reset, frame] of known.trail) {
         device.trail.push({ t, x, y, z, state: STATES[state], reset, frame });
+        device.appended++;
       }
       if (known.pose) takePose(known.pose, known.age_s);
       if (known.detection) device.detection = describeDetection(known.detection.detection);
@@ -101,7 +105,8 @@
     let device = devices.get(name);
     if (device) return device;
     device = { name, index: devices.size, pose: null, received: -Infinity, state: "", reason: "",
-               stateTime: -Infinity, detection: "", rate: null, latency: null, trail: [] };
+               stateTime: -Infinity, detection: "", rate: null, latency: null, trail: [],
+               appended: 0, painted: 0 };
     device.row = newRow(device);
     devices.set(name, device);
     $("rows").append(device.row);
@@ -129,6 +134,7 @@
         pose.state !== last.state || pose.reset_counter !== last.reset || pose.frame !== last.frame) {
       trail.push({ t: pose.time_s, x: pose.x_m, y: pose.y_m, z: pose.z_m, state: pose.state,
                    reset: pose.reset_counter, frame: pose.frame });
+      device.appended++;
     }
     let old = 0;
     while (old < trail.length && trail[old].t < pose.time_s - MAX_TRAIL_S) old++;
@@ -169,7 +175,7 @@
   function setArtifact(message) {
     artifact = message;
     artifactPaths = {};
-    layerKey = "";
+    version++;
     const frames = Object.keys(artifact.frames);
     const select = $("frame");
     select.replaceChildren(...frames.map((frame) => {
@@ -322,7 +328,7 @@
         return cache[name];
       },
     });
-    layerKey = "";
+    version++;
     dirty = true;
   }
 
@@ -336,64 +342,87 @@
 
   const decimalsOf = (step) => Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9)));
 
-  let layer = document.createElement("canvas"), layerKey = "";
+  // Pictures of what changes seldom, PAD pixels larger than the map on all sides: if the view moves
+  // (also when it follows a device), they are moved, and drawn again only beyond that.
+  const PAD = 120;
+  const newLayer = () => ({ canvas: document.createElement("canvas"), key: "", x: 0, y: 0, painted: 0 });
+  const ground = newLayer(), trails = newLayer();
 
-  // Grid and artifact change seldom; they are kept in a picture of their own.
-  function drawLayer() {
-    const key = [view.x, view.y, view.scale, view.plane, view.frame, view.labels, size.width,
-                 size.height, size.ratio].join(" ");
-    if (key === layerKey) return;
-    layerKey = key;
-    layer.width = canvas.width;
-    layer.height = canvas.height;
-    const c = layer.getContext("2d");
-    c.setTransform(size.ratio, 0, 0, size.ratio, 0, 0);
+  function onLayer(layer, paint) {
+    const c = layer.canvas.getContext("2d"), { x, y } = view;
+    [view.x, view.y] = [layer.x, layer.y];
+    c.setTransform(size.ratio, 0, 0, size.ratio, PAD * size.ratio, PAD * size.ratio);
+    paint(c);
+    [view.x, view.y] = [x, y];
+  }
+
+  // Draw a layer on the map. Return whether it was painted again.
+  function drawLayer(layer, key, paint) {
+    const offset = () => [(layer.x - view.x) * view.scale, (view.y - layer.y) * view.scale];
+    const all = [key, view.scale, view.plane, view.frame, size.width, size.height, size.ratio].join(" ");
+    const isNew = layer.key !== all || offset().some((each) => Math.abs(each) > PAD);
+    if (isNew) {
+      Object.assign(layer, { key: all, x: view.x, y: view.y });
+      layer.canvas.width = canvas.width + 2 * Math.round(PAD * size.ratio);
+      layer.canvas.height = canvas.height + 2 * Math.round(PAD * size.ratio);
+      onLayer(layer, paint);
+    }
+    const [x, y] = offset();
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.drawImage(layer.canvas, Math.round((x - PAD) * size.ratio), Math.round((y - PAD) * size.ratio));
+    context.setTransform(size.ratio, 0, 0, size.ratio, 0, 0);
+    return isNew;
+  }
+
+  function paintGround(c) {
     c.fillStyle = colors.card;
-    c.fillRect(0, 0, size.width, size.height);
-    const ticks = drawGrid(c);
+    c.fillRect(-PAD, -PAD, size.width + 2 * PAD, size.height + 2 * PAD);
+    drawGrid(c);
     if (view.plane === 1) drawGround(c);
     drawMarks(c);
     if (view.labels) drawArtifactLabels(c);
-    drawTicks(c, ticks);
+  }
+
+  function ticksBetween(low, high, step) {
+    const ticks = [];
+    for (let k = Math.ceil(low / step); k <= high / step; k++) ticks.push(k * step);
+    return ticks;
   }
 
   function drawGrid(c) {
     const step = niceStep(85);
-    const [left, top] = fromScreen(0, 0), [right, bottom] = fromScreen(size.width, size.height);
-    const ticks = { step, x: [], y: [] };
-    for (let k = Math.ceil(left / step); k <= right / step; k++) ticks.x.push(k * step);
-    for (let k = Math.ceil(bottom / step); k <= top / step; k++) ticks.y.push(k * step);
+    const [left, top] = fromScreen(-PAD, -PAD), [right, bottom] = fromScreen(size.width + PAD, size.height + PAD);
     c.lineWidth = 1;
-    for (const value of ticks.x) {
+    for (const value of ticksBetween(left, right, step)) {
       const x = Math.round(size.width / 2 + (value - view.x) * view.scale) + 0.5;
       c.strokeStyle = Math.abs(value) < step / 2 ? colors.rule : colors.grid;
-      line(c, x, 0, x, size.height);
+      line(c, x, -PAD, x, size.height + PAD);
     }
-    for (const value of ticks.y) {
+    for (const value of ticksBetween(bottom, top, step)) {
       const y = Math.round(size.height / 2 - (value - view.y) * view.scale) + 0.5;
       c.strokeStyle = Math.abs(value) < step / 2 ? colors.rule : colors.grid;
-      line(c, 0, y, size.width, y);
+      line(c, -PAD, y, size.width + PAD, y);
     }
-    return ticks;
   }
 
-  function drawTicks(c, ticks) {
-    const unit = artifact.unit === "unit" ? "units" : "m", decimals = decimalsOf(ticks.step);
+  function drawTicks(c) {
+    const unit = artifact.unit === "unit" ? "units" : "m";
+    const step = niceStep(85), decimals = decimalsOf(step);
+    const [left, top] = fromScreen(46, 74), [right, bottom] = fromScreen(size.width - 50, size.height - 24);
     c.font = "11px system-ui, sans-serif";
     c.textBaseline = "alphabetic";
     c.textAlign = "center";
-    const vertical = view.plane === 1 ? "y" : "z";
-    for (const value of ticks.x) {
+    for (const value of ticksBetween(left, right, step)) {
       const x = size.width / 2 + (value - view.x) * view.scale;
-      if (x > 46 && x < size.width - 50) halo(c, value.toFixed(decimals), x, size.height - 8, colors.muted);
+      halo(c, number(value, decimals), x, size.height - 8, colors.muted);
     }
     halo(c, `x [${unit}]`, size.width - 24, size.height - 8, colors.ink);
     c.textAlign = "left";
-    for (const value of ticks.y) {
+    for (const value of ticksBetween(bottom, top, step)) {
       const y = size.height / 2 - (value - view.y) * view.scale;
-      if (y > 74 && y < size.height - 24) halo(c, value.toFixed(decimals), 8, y + 4, colors.muted);
+      halo(c, number(value, decimals), 8, y + 4, colors.muted);
     }
-    halo(c, `${vertical} [${unit}]`, 8, 60, colors.ink);
+    halo(c, `${view.plane === 1 ? "y" : "z"} [${unit}]`, 8, 60, colors.ink);
   }
 
   function drawScaleBar(c) {
@@ -486,7 +515,7 @@
     c.beginPath();
     for (const [point] of shape.points) {
       const [x, y] = toScreen(point[0], point[1], height(point));
-      if (x < -9 || y < -9 || x > size.width + 9 || y > size.height + 9) continue;
+      if (x < -PAD || y < -PAD || x > size.width + PAD || y > size.height + PAD) continue;
       if (isSquare) {
         c.rect(x - radius, y - radius, 2 * radius, 2 * radius);
       } else {
@@ -555,7 +584,8 @@
     const visible = [];
     for (const label of frame.labels) {
       const [x, y] = toScreen(...label.at);
-      if (x > -40 && y > -20 && x < size.width + 40 && y < size.height + 20) visible.push([label.text, x, y + 20]);
+      const isVisible = x > -PAD && y > -PAD && x < size.width + PAD && y < size.height + PAD;
+      if (isVisible) visible.push([label.text, x, y + 20]);
       if (visible.length > 500) return;
     }
     const free = visible.filter(([text, x, y]) => {
@@ -575,19 +605,17 @@
     } else if (view.auto) {
       fitIfNeeded();
     }
-    drawLayer();
     const c = context;
-    c.setTransform(1, 0, 0, 1, 0, 0);
-    c.drawImage(layer, 0, 0);
-    c.setTransform(size.ratio, 0, 0, size.ratio, 0, 0);
+    drawLayer(ground, [view.labels, version].join(" "), paintGround);
     const shown = [];
     for (const device of devices.values()) {
       if (device.pose && device.pose.frame === view.frame) shown.push(device);
     }
-    for (const device of shown) drawTrail(c, device, isOld(device, now));
+    if (view.trail_s) drawTrails(c, shown, now);
     for (const device of shown) drawEllipse(c, device, isOld(device, now));
     for (const device of shown) drawDevice(c, device, isOld(device, now));
     if (view.labels) drawNames(c, shown, now);
+    drawTicks(c);
     drawScaleBar(c);
     if (connection === "lost") {
       c.fillStyle = colors["bad"];
@@ -599,32 +627,58 @@
     document.body.dataset.drawn = Number(document.body.dataset.drawn || 0) + 1;
   }
 
-  function drawTrail(c, device, old) {
-    if (!view.trail_s || !device.trail.length) return;
-    const pose = device.pose, trail = device.trail;
-    c.strokeStyle = old ? colors.muted : colorOf(device);
-    c.lineWidth = 2;
-    c.lineJoin = "round";
+  // The strokes of all paths take longer than all else. They are painted each TRAIL_REFRESH_MS;
+  // in between, only what is new is added.
+  function drawTrails(c, shown, now) {
+    const old = shown.map((device) => (isOld(device, now) ? device.index + "o" : device.index)).join(",");
+    if (now - trails.painted > TRAIL_REFRESH_MS) trails.key = "";
+    const isNew = drawLayer(trails, [old, view.trail_s, version].join(" "), (layer) => {
+      layer.clearRect(-PAD, -PAD, size.width + 2 * PAD, size.height + 2 * PAD);
+      trails.painted = now;
+      for (const device of shown) drawTrail(layer, device, 0, now);
+    });
+    if (!isNew) {
+      onLayer(trails, (layer) => {
+        for (const device of shown) {
+          const first = device.painted - (device.appended - device.trail.length);
+          if (device.painted < device.appended) drawTrail(layer, device, Math.max(0, first - 1), now);
+        }
+      });
+    }
+    for (const device of shown) {
+      // From the last point of the path to the newest pose.
+      const last = device.trail[device.trail.length - 1], pose = device.pose;
+      if (!last || last.reset !== pose.reset_counter || last.frame !== pose.frame) continue;
+      c.strokeStyle = isOld(device, now) ? colors.muted : colorOf(device);
+      c.lineWidth = 1.5;
+      line(c, ...toScreen(last.x, last.y, last.z), ...toScreen(pose.x_m, pose.y_m, pose.z_m));
+    }
+  }
+
+  function drawTrail(c, device, first, now) {
+    const trail = device.trail, time = device.pose.time_s;
+    device.painted = device.appended;
+    c.strokeStyle = isOld(device, now) ? colors.muted : colorOf(device);
+    c.lineWidth = 1.5;
+    c.lineJoin = "bevel";
     let previous = null, x = 0, y = 0, part = "";
     c.beginPath();
-    const points = trail.length;
-    for (let k = 0; k <= points; k++) {
-      const point = k < points ? trail[k]
-        : { t: pose.time_s, x: pose.x_m, y: pose.y_m, z: pose.z_m, state: pose.state,
-            reset: pose.reset_counter, frame: pose.frame };
-      const age = (pose.time_s - point.t) / view.trail_s;
+    for (let k = first; k < trail.length; k++) {
+      const point = trail[k], age = (time - point.t) / view.trail_s;
       if (age > 1) continue;
-      const px = size.width / 2 + (point.x - view.x) * view.scale;
-      const py = size.height / 2 - ((view.plane === 1 ? point.y : point.z) - view.y) * view.scale;
+      const [px, py] = toScreen(point.x, point.y, point.z);
       // Older parts are paler; parts without a recent fix are dotted.
       const own = (age > 0.66 ? "a" : age > 0.33 ? "b" : "c") + (point.state === "tracking" ? "s" : "d");
       const joined = previous && previous.reset === point.reset && previous.frame === point.frame &&
         point.frame === view.frame;
+      if (joined && own === part && k < trail.length - 1 && Math.abs(px - x) < 2 && Math.abs(py - y) < 2) {
+        continue;
+      }
       if (own !== part) {
         c.stroke();
         c.beginPath();
         part = own;
-        c.globalAlpha = { a: 0.25, b: 0.5, c: 0.85 }[own[0]];
+        c.globalAlpha = { a: 0.3, b: 0.55, c: 0.9 }[own[0]];
         c.setLineDash(own[1] === "s" ? [] : [2, 4]);
         if (joined) c.moveTo(x, y);
       }
@@ -773,7 +827,7 @@
     const status = element("td", "status");
     cells.chip = element("span", "chip", "no pose yet");
     cells.reason = element("span", "reason");
-    status.append(cells.chip, cells.reason);
+    status.append(cells.chip, " ", cells.reason);
     row.append(status);
     for (const [key, label, extra] of [
       ["x", "x [m]", "value"], ["y", "y [m]", "value"], ["z", "z [m]", "value"], ["heading", "Heading", "value"],
