@@ -283,11 +283,12 @@ class PhotodiodeFixes:
         pairs = state.pairs.get(station)
         if pairs is None:
             pairs = state.pairs[station] = deque(maxlen=PAIRS_KEPT)
+        now_ns = pair.time_ns[1]
         if pairs and not pairs[-1].uses:
             # Another station was waited for, and did not come.
-            self._make_due(state, pairs[-1].time_ns[1], flush)
+            waiting_ns = max(p[-1].time_ns[1] for p in state.pairs.values() if p)
+            self._make_due(state, min(waiting_ns, now_ns), flush)
         pairs.append(pair)
-        now_ns = pair.time_ns[1]
         for other, other_pairs in state.pairs.items():
             age_ns = now_ns - other_pairs[-1].time_ns[1]
             if MAX_FIX_SPAN_NS < age_ns <= EXPECTED_STATION_NS and other not in self.known.excluded:
@@ -317,9 +318,7 @@ class PhotodiodeFixes:
             and station not in self.known.excluded
         ]
 
-    def _make_due(
-        self, state: PhotodiodeState, now_ns: int, flush: Callable[[], None]
-    ) -> None:
+    def _make_due(self, state: PhotodiodeState, now_ns: int, flush: Callable[[], None]) -> None:
         """Prepare the fix of the newest pairs, the newest of which ended at ``now_ns``."""
         if any(due.state is state for due in self.due):
             flush()
@@ -405,38 +404,62 @@ class PhotodiodeFixes:
         else:
             estimates = intersect_planes(ideal, *known.arrays, floor_z=known.floor_z)
             estimates = self._repair(due, ideal, angles, estimates)
-        is_solved = np.isfinite(estimates.position[:, 0])
+        is_solved = np.isfinite(estimates.position[:, 0]).tolist()
         max_residual = estimates.max_residual
         unit = estimates.covariance(1.0, self._is_planar)
+        spread = np.sqrt(np.maximum(np.einsum("mii->m", unit), 0.0)).tolist()
+        variance = np.array([f.inflation * self.sigma_rad**2 + f.motion_variance for f in due])
+        common, covariance = np.full((2, len(due), 6, 6), np.nan)
+        common[:, :3, :3] = unit * known.calibration_sigma_rad**2
+        for row, fix in enumerate(due):
+            if is_solved[row]:
+                common[row, :3, :3] += known.errors.position_covariance(
+                    estimates.position[row].tolist(), [station for station, _ in fix.members]
+                )
+        covariance[:, :3, :3] = unit * variance[:, None, None] + common[:, :3, :3]
+        dims = range(2 if self._is_planar else 3)
+        covariance[:, dims, dims] += np.array([f.motion_sigma_m**2 for f in due])[:, None]
         with np.errstate(invalid="ignore"):
             distance = np.linalg.norm(estimates.position[:, None] - known.arrays[0], axis=2)
+            is_inconsistent = max_residual > self.gate_rad
+            is_out_of_range = distance.min(axis=1) > MAX_RANGE_M
         fixes = []
         for row, fix in enumerate(due):
             self._noise.append((estimates.residual[row], int(estimates.redundancy[row])))
             reason = ""
             if not is_solved[row]:
                 reason = "moment_with_too_few_sweeps"
-            elif max_residual[row] > self.gate_rad:
+            elif is_inconsistent[row]:
                 reason = "moment_inconsistent"
-            elif np.min(distance[row]) > MAX_RANGE_M and known.scene.scale != "unit":
+            elif is_out_of_range[row] and known.scene.scale != "unit":
                 reason = "moment_out_of_reach"
-            elif self._jumps(fix, estimates.position[row], unit[row]):
+            elif self._jumps(fix, estimates.position[row], spread[row] * self.sigma_rad):
                 reason = "moment_jumps"
-            self._observe(angles[row], bool(is_solved[row]), reason == "moment_inconsistent")
+            self._observe(angles[row], is_solved[row], reason == "moment_inconsistent")
+            residual = estimates.residual[row].tolist()
             for station, pair in fix.members:
-                pair.is_outlier |= bool(reason) or np.isnan(estimates.residual[row, station, 0])
+                is_used = not reason and math.isfinite(residual[station][0])
+                pair.is_outlier |= not is_used
+                if is_used:
+                    self.used[station] += 2
+                    self.residual[station].extend(residual[station])
+                else:
+                    self.rejected[station] += 2
             if reason:
                 self._reject(reason, 1)
                 fixes.append(None)
                 continue
-            for station, _ in fix.members:
-                residual = estimates.residual[row, station].tolist()
-                if residual[0] == residual[0]:
-                    self.used[station] += 2
-                    self.residual[station].extend(residual)
-                else:
-                    self.rejected[station] += 2
-            fixes.append(self._accepted(fix, estimates.position[row], unit[row]))
+            fixes.append(
+                Fix(
+                    fix.state.name,
+                    known.scene.frame,
+                    fix.time_ns,
+                    estimates.position[row],
+                    IDENTITY_QUATERNION,
+                    covariance[row],
+                    common[row],
+                )
+            )
         return fixes
 
     @property
@@ -476,13 +499,13 @@ class PhotodiodeFixes:
             self._reject("station_contradicts_others", repaired)
         return estimates
 
-    def _jumps(self, fix: DueFix, position: Array, unit: Array) -> bool:
-        """Return whether a position departs from those before, and remember it if so."""
+    def _jumps(self, fix: DueFix, position: Array, noise_m: float) -> bool:
+        """Return whether a position departs from those before it, and remember it."""
         state = fix.state
-        sigma_m = math.sqrt(max(0.0, float(np.trace(unit)))) * self.sigma_rad
-        now = (fix.time_ns, position, math.hypot(sigma_m, fix.motion_sigma_m))
+        now = (fix.time_ns, position, math.hypot(noise_m, fix.motion_sigma_m))
         if self.known.scene.scale == "unit" or not _departs(state.recent, now):
             state.departed.clear()
+            state.recent.append(now)
             return False
         if state.departed and not _departs(state.departed[-2:], now):
             state.departed.append(now)
@@ -490,32 +513,9 @@ class PhotodiodeFixes:
             state.departed = [now]
         if len(state.departed) < CONFIRMING_FIXES:
             return True
-        state.recent.clear()
-        state.recent.append(state.departed[-2])
+        state.recent.extend(state.departed[-2:])
         state.departed.clear()
         return False
-
-    def _accepted(self, fix: DueFix, position: Array, unit: Array) -> Fix:
-        """Return an accepted fix."""
-        known = self.known
-        variance = fix.inflation * self.sigma_rad**2 + fix.motion_variance
-        sigma_m = math.sqrt(float(np.trace(unit)) * self.sigma_rad**2 + fix.motion_sigma_m**2)
-        fix.state.recent.append((fix.time_ns, position, sigma_m))
-        common = np.full((6, 6), np.nan)
-        common[:3, :3] = unit * known.calibration_sigma_rad**2
-        covariance = np.full((6, 6), np.nan)
-        covariance[:3, :3] = unit * variance + common[:3, :3]
-        dims = 2 if self._is_planar else 3
-        covariance[range(dims), range(dims)] += fix.motion_sigma_m**2
-        return Fix(
-            fix.state.name,
-            known.scene.frame,
-            fix.time_ns,
-            position,
-            IDENTITY_QUATERNION,
-            covariance,
-            common if known.calibration_sigma_rad else None,
-        )
 
     def update_noise(self) -> None:
         """Estimate the noise of an angle and the gate from the last fixes, as offline."""
@@ -549,9 +549,7 @@ class PhotodiodeFixes:
         return new
 
 
-def _departs(
-    before: Sequence[tuple[int, Array, float]], now: tuple[int, Array, float]
-) -> bool:
+def _departs(before: Sequence[tuple[int, Array, float]], now: tuple[int, Array, float]) -> bool:
     """Return whether a position departs from the line through those before, or from the last one.
 
     Each is a time in nanoseconds, a position (3,) and its standard deviation in metres.

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import quaternion_from_matrix, rotation_angle, rotation_exp
+from locatk.core.geometry import quaternion_from_matrix, rotation_angle
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.devices.device_sweeps import (
     MAX_SWEEPS_PER_WINDOW,
@@ -79,13 +79,13 @@ MAX_FIT_ITERATIONS = 8
 MAX_POSITION_STEP_M, MAX_ROTATION_STEP_RAD = 0.3, 0.5
 """Largest step that a predicted pose needs. A larger one means that it is lost."""
 
-CONVERGED_STEP = 2e-5
-"""Largest component of a step (m, rad, m/s, rad/s times the window) at which a fit ends: a tenth of
-the effect of noise."""
+CONVERGED_COST = 0.01
+"""Square of a step, in standard deviations of the pose, at which a fit ends: a tenth of one. The
+next step would be several times smaller."""
 
-SEED_INTERVAL_NS = 200_000_000
-"""Time between attempts to find the pose of a device without an initial guess [ns]. Each takes as
-long as a hundred fits."""
+FIRST_SEED_INTERVAL_NS, MAX_SEED_INTERVAL_NS = 40_000_000, 640_000_000
+"""Time between attempts to find the pose of a device without an initial guess [ns]. It doubles with
+each, because one takes as long as a hundred fits."""
 
 AMBIGUITY_INTERVAL_NS = 1_000_000_000
 """Time between attempts to find the orientation of a device that had two [ns]."""
@@ -136,7 +136,7 @@ class PoseState:
         return PoseState(
             time_ns,
             self.position + self.rate[:3] * seconds,
-            rotation_exp(self.rate[3:] * seconds) @ self.rotation,
+            _rotation(self.rate[3:] * seconds) @ self.rotation,
             self.rate,
             self.margin,
         )
@@ -165,6 +165,7 @@ class DeviceState:
     pose: PoseState | None = None
     next_ns: int | None = None
     next_seed_ns: int = 0
+    seed_interval_ns: int = FIRST_SEED_INTERVAL_NS
     sigma_rad: float = FIRST_SIGMA_RAD
     lasting_rad: float = 0.0
     gate_rad: float = INLIER_GATE_RAD
@@ -318,8 +319,11 @@ class RigidFixes:
         is_ambiguous = last is not None and last.margin < MIN_SEED_MARGIN
         if (fit is None or is_ambiguous) and now_ns >= device.next_seed_ns:
             seeded = self._seed(device, window, time_ns, planes, offset_s)
-            pause_ns = SEED_INTERVAL_NS if fit is None else AMBIGUITY_INTERVAL_NS
-            device.next_seed_ns = now_ns + pause_ns
+            if fit is None:
+                device.next_seed_ns = now_ns + device.seed_interval_ns
+                device.seed_interval_ns = min(2 * device.seed_interval_ns, MAX_SEED_INTERVAL_NS)
+            else:
+                device.next_seed_ns = now_ns + AMBIGUITY_INTERVAL_NS
             if seeded is not None and (fit is None or _replaces(seeded.state, fit.state)):
                 fit = seeded
         if fit is None:
@@ -329,6 +333,7 @@ class RigidFixes:
         if last is not None:
             acceleration = (fit.state.rate - last.rate) / ((time_ns - last.time_ns) * 1e-9)
         device.pose = fit.state
+        device.seed_interval_ns = FIRST_SEED_INTERVAL_NS
         return self._accept(device, window, fit, acceleration)
 
     def _seed(
@@ -402,9 +407,9 @@ class RigidFixes:
             if not (size_m < MAX_POSITION_STEP_M and size_rad < MAX_ROTATION_STEP_RAD):
                 return None
             position = position + step[:3]
-            rotation = rotation_exp(step[3:6]) @ rotation
+            rotation = _rotation(step[3:6]) @ rotation
             rate = rate + step[6:]
-            if max(size_m, size_rad, 0.01 * float(np.abs(step[6:]).max())) < CONVERGED_STEP:
+            if -float(gradient @ step) < CONVERGED_COST:
                 break
         inliers = int(np.count_nonzero(np.abs(residual) < INLIER_GATE_RAD))
         if inliers < max(MIN_SWEEPS, MIN_INLIER_FRACTION * len(planes)):
@@ -418,16 +423,20 @@ class RigidFixes:
         """Return the fix of a pose that is determined, and remember its residuals."""
         device.windows.append((window, fit.residual))
         is_used = np.abs(fit.residual) < device.gate_rad
-        sensors = {row.sensor for row, used in zip(window, is_used, strict=True) if used}
-        for row, used, residual in zip(window, is_used.tolist(), fit.residual.tolist(), strict=True):
-            if row.time_ns <= fit.state.time_ns:
-                continue  # Each sweep counts once, in the first of its windows.
+        sensors = set()
+        for row, used, residual in zip(
+            window, is_used.tolist(), fit.residual.tolist(), strict=True
+        ):
             if used:
-                self.used[row.station] += 1
-                self.residual[row.station].append(residual)
-            else:
-                self.rejected[row.station] += 1
-                self._reject("sweep_contradicts_pose", 1)
+                sensors.add(row.sensor)
+            # Each sweep counts once, in the first of its windows.
+            if row.time_ns > fit.state.time_ns:
+                if used:
+                    self.used[row.station] += 1
+                    self.residual[row.station].append(residual)
+                else:
+                    self.rejected[row.station] += 1
+                    self._reject("sweep_contradicts_pose", 1)
         if np.count_nonzero(is_used) < MIN_SWEEPS or len(sensors) < MIN_SENSORS:
             self._reject("moment_with_too_few_sweeps", 1)
             return None
@@ -435,7 +444,9 @@ class RigidFixes:
         unit = np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2
         lasting = device.lasting_rad**2 + self.known.calibration_sigma_rad**2
         noise = max(device.sigma_rad**2 - device.lasting_rad**2, ANGLE_SIGMA_RAD**2 / 4)
+        members = sorted({row.station for row in window})
         common = ROTATIONS_PER_WINDOW * lasting * unit
+        common += self.known.errors.pose_covariance(fit.state.position, members)
         motion = 0.5 * acceleration * (0.5e-9 * self._window_ns) ** 2 / 3
         covariance = WINDOW_OVERLAP * noise * unit + common + np.outer(motion, motion)
         variance = np.diagonal(covariance)
@@ -524,9 +535,28 @@ def _device_sweeps(rows: list[PlaneRow]) -> DeviceSweeps:
     )
 
 
+def _rotation(vector: Array) -> Array:
+    """Return the matrix of one rotation vector (3,); faster than ``rotation_exp`` for one."""
+    x, y, z = vector.tolist()
+    squared = x * x + y * y + z * z
+    angle = math.sqrt(squared)
+    sine = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    versine = 2.0 * (math.sin(0.5 * angle) / angle) ** 2 if angle > 1e-8 else 0.5
+    diagonal = 1.0 - versine * squared
+    xy, xz, yz = versine * x * y, versine * x * z, versine * y * z
+    sx, sy, sz = sine * x, sine * y, sine * z
+    return np.array(
+        [
+            [diagonal + versine * x * x, xy - sz, xz + sy],
+            [xy + sz, diagonal + versine * y * y, yz - sx],
+            [xz - sy, yz + sx, diagonal + versine * z * z],
+        ]
+    )
+
+
 def _cross(a: Array, b: Array) -> Array:
     """Return the cross products of rows (n, 3); faster than ``np.cross`` for few of them."""
-    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    product = np.empty_like(b)
     product[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     product[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
     product[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
