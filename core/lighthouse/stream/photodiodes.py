@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,7 +36,6 @@ from locatk.core.lighthouse.epochs import (
 )
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD, angles_to_counts
 from locatk.core.lighthouse.localization.photodiodes import (
-    MAX_JUMP_WINDOW_S,
     MAX_RANGE_M,
     angle_sigma,
     inlier_gate,
@@ -53,9 +52,9 @@ from locatk.core.lighthouse.noise import (
     INLIER_GATE_SIGMAS,
     MIN_INLIER_GATE_RAD,
 )
-from locatk.core.lighthouse.plane_labels import LIKELY_ACCELERATION_RAD_S2
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.core.lighthouse.stream.known_scene import KnownScene
+from locatk.core.lighthouse.stream.recent_path import SPEED_SIGMA_M_S, RecentPath
 from locatk.core.streaming.events import Fix
 
 Array = NDArray[np.float64]
@@ -66,15 +65,6 @@ rotation (19.98 ms on channel 1) and the motion of the photodiode against the pl
 
 EXPECTED_STATION_NS = 500_000_000
 """Time since its last pair for which a station is waited for [ns]: two reports at 4 Hz."""
-
-SPEED_SIGMA_M_S = 0.5
-"""Standard deviation of the speed of a photodiode whose rate of angles is unknown [m/s]."""
-
-LIKELY_ACCELERATION_M_S2 = LIKELY_ACCELERATION_RAD_S2
-"""Acceleration that does not make a jump [m/s^2], as of pulses at a metre from a station."""
-
-JUMP_SIGMAS = 6.0
-"""Departure from a prediction, in its standard deviations, that noise explains."""
 
 CONFIRMING_FIXES = 3
 """Successive departures that agree with each other: the photodiode was carried there."""
@@ -125,17 +115,13 @@ class PhotodiodeState:
         By station: time, count, plane and label of a sweep that has no partner yet.
     pairs : dict of int to deque of Pair
         By station, ascending in time.
-    recent : deque of (int, ndarray, float)
-        Time, position and standard deviation of the last accepted fixes.
-    departed : list of (int, ndarray, float)
-        The same of fixes since then that departed from these.
+    path : RecentPath
     """
 
     name: str
     lone: dict[int, tuple[int, float, int, bool]] = field(default_factory=dict)
     pairs: dict[int, deque[Pair]] = field(default_factory=dict)
-    recent: deque[tuple[int, Array, float]] = field(default_factory=lambda: deque(maxlen=2))
-    departed: list[tuple[int, Array, float]] = field(default_factory=list)
+    path: RecentPath = field(default_factory=RecentPath)
 
 
 @dataclass
@@ -500,22 +486,10 @@ class PhotodiodeFixes:
         return estimates
 
     def _jumps(self, fix: DueFix, position: Array, noise_m: float) -> bool:
-        """Return whether a position departs from those before it, and remember it."""
-        state = fix.state
+        """Return whether a position departs from the path of its photodiode."""
         now = (fix.time_ns, position, math.hypot(noise_m, fix.motion_sigma_m))
-        if self.known.scene.scale == "unit" or not _departs(state.recent, now):
-            state.departed.clear()
-            state.recent.append(now)
-            return False
-        if state.departed and not _departs(state.departed[-2:], now):
-            state.departed.append(now)
-        else:
-            state.departed = [now]
-        if len(state.departed) < CONFIRMING_FIXES:
-            return True
-        state.recent.extend(state.departed[-2:])
-        state.departed.clear()
-        return False
+        is_metric = self.known.scene.scale != "unit"
+        return is_metric and not fix.state.path.accepts(now, CONFIRMING_FIXES)
 
     def update_noise(self) -> None:
         """Estimate the noise of an angle and the gate from the last fixes, as offline."""
@@ -547,25 +521,3 @@ class PhotodiodeFixes:
         new = PhotodiodeFixes(known, self._reject, self._observe)
         new.sigma_rad, new.gate_rad, new.restored = self.sigma_rad, INLIER_GATE_RAD, self.restored
         return new
-
-
-def _departs(before: Sequence[tuple[int, Array, float]], now: tuple[int, Array, float]) -> bool:
-    """Return whether a position departs from the line through those before, or from the last one.
-
-    Each is a time in nanoseconds, a position (3,) and its standard deviation in metres.
-    """
-    if not before or now[0] - before[-1][0] > MAX_JUMP_WINDOW_S * 1e9:
-        return False
-    time_ns, position, sigma_m = before[-1]
-    elapsed_s = (now[0] - time_ns) * 1e-9
-    if len(before) > 1 and time_ns - before[0][0] < MAX_JUMP_WINDOW_S * 1e9:
-        interval_s = max((time_ns - before[0][0]) * 1e-9, 1e-3)
-        fraction = elapsed_s / interval_s
-        predicted = position + fraction * (position - before[0][1])
-        noise_m = sigma_m * (1.0 + 2.0 * fraction) + now[2]
-        motion_m = 0.5 * LIKELY_ACCELERATION_M_S2 * elapsed_s * (elapsed_s + interval_s)
-    else:
-        predicted, noise_m = position, sigma_m + now[2]
-        motion_m = 3 * SPEED_SIGMA_M_S * elapsed_s
-    departure_m = math.dist(now[1].tolist(), predicted.tolist())
-    return departure_m > JUMP_SIGMAS * noise_m + motion_m
