@@ -13,6 +13,7 @@ from locatk.core.lighthouse.epochs import MAX_PLANE_DELAY_TURNS, MIN_PLANE_DELAY
 from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
+from locatk.core.lighthouse.stream.scene_errors import SceneErrors
 
 Array = NDArray[np.float64]
 
@@ -44,9 +45,7 @@ class AngleCorrection:
         difference = self._difference_start + np.arange(
             0.0, 2 * half_range + GRID_STEP_RAD, GRID_STEP_RAD
         )
-        angles = np.stack(
-            [mean[:, None] - difference / 2, mean[:, None] + difference / 2], axis=-1
-        )
+        angles = np.stack([mean[:, None] - difference / 2, mean[:, None] + difference / 2], axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
             correction = ideal_angles(angles, calibration) - angles
         self._rows, self._columns = len(mean) - 1, len(difference) - 1
@@ -86,6 +85,12 @@ class KnownScene:
         Height of all photodiodes, if they move on a plane.
     floor_map : (3, 3) ndarray or None
         Of a single station over a floor with markers.
+    errors : SceneErrors
+    min_stations : int
+        Fewest stations that determine the position of a photodiode.
+    calibration_sigma_rad : float
+        Standard deviation of the angles that generic calibrations add; 0 if there are none. A floor
+        homography absorbs their errors, and the covariance of a scene may contain them.
     excluded : set of int
         Indices of stations that contradict the others.
     """
@@ -97,32 +102,29 @@ class KnownScene:
     corrections: tuple[AngleCorrection, ...]
     floor_z: float | None
     floor_map: Array | None
+    errors: SceneErrors
+    min_stations: int
+    calibration_sigma_rad: float
     excluded: set[int] = field(default_factory=set)
 
     @classmethod
     def of(cls, scene: Scene) -> KnownScene:
         """Prepare a scene with one station or more."""
         stations = tuple(sorted(scene.stations, key=lambda s: s.channel))
+        floor_map = stations[0].floor_map if len(stations) == 1 else None
+        floor_z = scene.floor_z if scene.planar else None
+        errors = SceneErrors(scene, stations, floor_z)
+        is_generic = any(s.calibration.is_generic for s in stations)
+        has_generic_error = is_generic and floor_map is None and not errors.has_calibration
         return cls(
             scene,
             stations,
             {s.channel: k for k, s in enumerate(stations)},
             stack_stations(stations),
             tuple(AngleCorrection(s.calibration) for s in stations),
-            scene.floor_z if scene.planar else None,
-            stations[0].floor_map if len(stations) == 1 else None,
+            floor_z,
+            floor_map,
+            errors,
+            1 if scene.planar or floor_map is not None else 2,
+            CALIBRATION_SIGMA_RAD if has_generic_error else 0.0,
         )
-
-    @property
-    def calibration_sigma_rad(self) -> float:
-        """Standard deviation of the angles that generic calibrations add; 0 if there are none.
-
-        A floor homography absorbs the errors of the calibration.
-        """
-        is_generic = any(s.calibration.is_generic for s in self.stations)
-        return CALIBRATION_SIGMA_RAD if is_generic and self.floor_map is None else 0.0
-
-    @property
-    def min_stations(self) -> int:
-        """Fewest stations that determine the position of a photodiode."""
-        return 1 if self.floor_z is not None or self.floor_map is not None else 2

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,7 +36,6 @@ from locatk.core.lighthouse.epochs import (
 )
 from locatk.core.lighthouse.light_planes import ROTOR_ZERO_RAD, angles_to_counts
 from locatk.core.lighthouse.localization.photodiodes import (
-    MAX_JUMP_WINDOW_S,
     MAX_RANGE_M,
     angle_sigma,
     inlier_gate,
@@ -53,9 +52,9 @@ from locatk.core.lighthouse.noise import (
     INLIER_GATE_SIGMAS,
     MIN_INLIER_GATE_RAD,
 )
-from locatk.core.lighthouse.plane_labels import LIKELY_ACCELERATION_RAD_S2
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.core.lighthouse.stream.known_scene import KnownScene
+from locatk.core.lighthouse.stream.recent_path import SPEED_SIGMA_M_S, RecentPath
 from locatk.core.streaming.events import Fix
 
 Array = NDArray[np.float64]
@@ -66,15 +65,6 @@ rotation (19.98 ms on channel 1) and the motion of the photodiode against the pl
 
 EXPECTED_STATION_NS = 500_000_000
 """Time since its last pair for which a station is waited for [ns]: two reports at 4 Hz."""
-
-SPEED_SIGMA_M_S = 0.5
-"""Standard deviation of the speed of a photodiode whose rate of angles is unknown [m/s]."""
-
-LIKELY_ACCELERATION_M_S2 = LIKELY_ACCELERATION_RAD_S2
-"""Acceleration that does not make a jump [m/s^2], as of pulses at a metre from a station."""
-
-JUMP_SIGMAS = 6.0
-"""Departure from a prediction, in its standard deviations, that noise explains."""
 
 CONFIRMING_FIXES = 3
 """Successive departures that agree with each other: the photodiode was carried there."""
@@ -125,17 +115,13 @@ class PhotodiodeState:
         By station: time, count, plane and label of a sweep that has no partner yet.
     pairs : dict of int to deque of Pair
         By station, ascending in time.
-    recent : deque of (int, ndarray, float)
-        Time, position and standard deviation of the last accepted fixes.
-    departed : list of (int, ndarray, float)
-        The same of fixes since then that departed from these.
+    path : RecentPath
     """
 
     name: str
     lone: dict[int, tuple[int, float, int, bool]] = field(default_factory=dict)
     pairs: dict[int, deque[Pair]] = field(default_factory=dict)
-    recent: deque[tuple[int, Array, float]] = field(default_factory=lambda: deque(maxlen=2))
-    departed: list[tuple[int, Array, float]] = field(default_factory=list)
+    path: RecentPath = field(default_factory=RecentPath)
 
 
 @dataclass
@@ -283,11 +269,12 @@ class PhotodiodeFixes:
         pairs = state.pairs.get(station)
         if pairs is None:
             pairs = state.pairs[station] = deque(maxlen=PAIRS_KEPT)
+        now_ns = pair.time_ns[1]
         if pairs and not pairs[-1].uses:
             # Another station was waited for, and did not come.
-            self._make_due(state, pairs[-1].time_ns[1], flush)
+            waiting_ns = max(p[-1].time_ns[1] for p in state.pairs.values() if p)
+            self._make_due(state, min(waiting_ns, now_ns), flush)
         pairs.append(pair)
-        now_ns = pair.time_ns[1]
         for other, other_pairs in state.pairs.items():
             age_ns = now_ns - other_pairs[-1].time_ns[1]
             if MAX_FIX_SPAN_NS < age_ns <= EXPECTED_STATION_NS and other not in self.known.excluded:
@@ -317,9 +304,7 @@ class PhotodiodeFixes:
             and station not in self.known.excluded
         ]
 
-    def _make_due(
-        self, state: PhotodiodeState, now_ns: int, flush: Callable[[], None]
-    ) -> None:
+    def _make_due(self, state: PhotodiodeState, now_ns: int, flush: Callable[[], None]) -> None:
         """Prepare the fix of the newest pairs, the newest of which ended at ``now_ns``."""
         if any(due.state is state for due in self.due):
             flush()
@@ -405,38 +390,62 @@ class PhotodiodeFixes:
         else:
             estimates = intersect_planes(ideal, *known.arrays, floor_z=known.floor_z)
             estimates = self._repair(due, ideal, angles, estimates)
-        is_solved = np.isfinite(estimates.position[:, 0])
+        is_solved = np.isfinite(estimates.position[:, 0]).tolist()
         max_residual = estimates.max_residual
         unit = estimates.covariance(1.0, self._is_planar)
+        spread = np.sqrt(np.maximum(np.einsum("mii->m", unit), 0.0)).tolist()
+        variance = np.array([f.inflation * self.sigma_rad**2 + f.motion_variance for f in due])
+        common, covariance = np.full((2, len(due), 6, 6), np.nan)
+        common[:, :3, :3] = unit * known.calibration_sigma_rad**2
+        for row, fix in enumerate(due):
+            if is_solved[row]:
+                common[row, :3, :3] += known.errors.position_covariance(
+                    estimates.position[row].tolist(), [station for station, _ in fix.members]
+                )
+        covariance[:, :3, :3] = unit * variance[:, None, None] + common[:, :3, :3]
+        dims = range(2 if self._is_planar else 3)
+        covariance[:, dims, dims] += np.array([f.motion_sigma_m**2 for f in due])[:, None]
         with np.errstate(invalid="ignore"):
             distance = np.linalg.norm(estimates.position[:, None] - known.arrays[0], axis=2)
+            is_inconsistent = max_residual > self.gate_rad
+            is_out_of_range = distance.min(axis=1) > MAX_RANGE_M
         fixes = []
         for row, fix in enumerate(due):
             self._noise.append((estimates.residual[row], int(estimates.redundancy[row])))
             reason = ""
             if not is_solved[row]:
                 reason = "moment_with_too_few_sweeps"
-            elif max_residual[row] > self.gate_rad:
+            elif is_inconsistent[row]:
                 reason = "moment_inconsistent"
-            elif np.min(distance[row]) > MAX_RANGE_M and known.scene.scale != "unit":
+            elif is_out_of_range[row] and known.scene.scale != "unit":
                 reason = "moment_out_of_reach"
-            elif self._jumps(fix, estimates.position[row], unit[row]):
+            elif self._jumps(fix, estimates.position[row], spread[row] * self.sigma_rad):
                 reason = "moment_jumps"
-            self._observe(angles[row], bool(is_solved[row]), reason == "moment_inconsistent")
+            self._observe(angles[row], is_solved[row], reason == "moment_inconsistent")
+            residual = estimates.residual[row].tolist()
             for station, pair in fix.members:
-                pair.is_outlier |= bool(reason) or np.isnan(estimates.residual[row, station, 0])
+                is_used = not reason and math.isfinite(residual[station][0])
+                pair.is_outlier |= not is_used
+                if is_used:
+                    self.used[station] += 2
+                    self.residual[station].extend(residual[station])
+                else:
+                    self.rejected[station] += 2
             if reason:
                 self._reject(reason, 1)
                 fixes.append(None)
                 continue
-            for station, _ in fix.members:
-                residual = estimates.residual[row, station].tolist()
-                if residual[0] == residual[0]:
-                    self.used[station] += 2
-                    self.residual[station].extend(residual)
-                else:
-                    self.rejected[station] += 2
-            fixes.append(self._accepted(fix, estimates.position[row], unit[row]))
+            fixes.append(
+                Fix(
+                    fix.state.name,
+                    known.scene.frame,
+                    fix.time_ns,
+                    estimates.position[row],
+                    IDENTITY_QUATERNION,
+                    covariance[row],
+                    common[row],
+                )
+            )
         return fixes
 
     @property
@@ -476,46 +485,11 @@ class PhotodiodeFixes:
             self._reject("station_contradicts_others", repaired)
         return estimates
 
-    def _jumps(self, fix: DueFix, position: Array, unit: Array) -> bool:
-        """Return whether a position departs from those before, and remember it if so."""
-        state = fix.state
-        sigma_m = math.sqrt(max(0.0, float(np.trace(unit)))) * self.sigma_rad
-        now = (fix.time_ns, position, math.hypot(sigma_m, fix.motion_sigma_m))
-        if self.known.scene.scale == "unit" or not _departs(state.recent, now):
-            state.departed.clear()
-            return False
-        if state.departed and not _departs(state.departed[-2:], now):
-            state.departed.append(now)
-        else:
-            state.departed = [now]
-        if len(state.departed) < CONFIRMING_FIXES:
-            return True
-        state.recent.clear()
-        state.recent.append(state.departed[-2])
-        state.departed.clear()
-        return False
-
-    def _accepted(self, fix: DueFix, position: Array, unit: Array) -> Fix:
-        """Return an accepted fix."""
-        known = self.known
-        variance = fix.inflation * self.sigma_rad**2 + fix.motion_variance
-        sigma_m = math.sqrt(float(np.trace(unit)) * self.sigma_rad**2 + fix.motion_sigma_m**2)
-        fix.state.recent.append((fix.time_ns, position, sigma_m))
-        common = np.full((6, 6), np.nan)
-        common[:3, :3] = unit * known.calibration_sigma_rad**2
-        covariance = np.full((6, 6), np.nan)
-        covariance[:3, :3] = unit * variance + common[:3, :3]
-        dims = 2 if self._is_planar else 3
-        covariance[range(dims), range(dims)] += fix.motion_sigma_m**2
-        return Fix(
-            fix.state.name,
-            known.scene.frame,
-            fix.time_ns,
-            position,
-            IDENTITY_QUATERNION,
-            covariance,
-            common if known.calibration_sigma_rad else None,
-        )
+    def _jumps(self, fix: DueFix, position: Array, noise_m: float) -> bool:
+        """Return whether a position departs from the path of its photodiode."""
+        now = (fix.time_ns, position, math.hypot(noise_m, fix.motion_sigma_m))
+        is_metric = self.known.scene.scale != "unit"
+        return is_metric and not fix.state.path.accepts(now, CONFIRMING_FIXES)
 
     def update_noise(self) -> None:
         """Estimate the noise of an angle and the gate from the last fixes, as offline."""
@@ -547,27 +521,3 @@ class PhotodiodeFixes:
         new = PhotodiodeFixes(known, self._reject, self._observe)
         new.sigma_rad, new.gate_rad, new.restored = self.sigma_rad, INLIER_GATE_RAD, self.restored
         return new
-
-
-def _departs(
-    before: Sequence[tuple[int, Array, float]], now: tuple[int, Array, float]
-) -> bool:
-    """Return whether a position departs from the line through those before, or from the last one.
-
-    Each is a time in nanoseconds, a position (3,) and its standard deviation in metres.
-    """
-    if not before or now[0] - before[-1][0] > MAX_JUMP_WINDOW_S * 1e9:
-        return False
-    time_ns, position, sigma_m = before[-1]
-    elapsed_s = (now[0] - time_ns) * 1e-9
-    if len(before) > 1 and time_ns - before[0][0] < MAX_JUMP_WINDOW_S * 1e9:
-        interval_s = max((time_ns - before[0][0]) * 1e-9, 1e-3)
-        fraction = elapsed_s / interval_s
-        predicted = position + fraction * (position - before[0][1])
-        noise_m = sigma_m * (1.0 + 2.0 * fraction) + now[2]
-        motion_m = 0.5 * LIKELY_ACCELERATION_M_S2 * elapsed_s * (elapsed_s + interval_s)
-    else:
-        predicted, noise_m = position, sigma_m + now[2]
-        motion_m = 3 * SPEED_SIGMA_M_S * elapsed_s
-    departure_m = math.dist(now[1].tolist(), predicted.tolist())
-    return departure_m > JUMP_SIGMAS * noise_m + motion_m

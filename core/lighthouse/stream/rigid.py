@@ -18,14 +18,14 @@ average of fixes has the covariance of independent ones.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import quaternion_from_matrix, rotation_angle, rotation_exp
+from locatk.core.geometry import quaternion_from_matrix, rotation_angle
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.devices.device_sweeps import (
     MAX_SWEEPS_PER_WINDOW,
@@ -66,6 +66,7 @@ from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.core.lighthouse.stream.known_scene import KnownScene
 from locatk.core.lighthouse.stream.plane_tracking import PlaneTracker, Sweep
+from locatk.core.lighthouse.stream.recent_path import RecentPath
 from locatk.core.robust import robust_sigma
 from locatk.core.streaming.events import Fix
 from locatk.core.trajectory import PROVISIONAL_PROBABILITY
@@ -79,13 +80,13 @@ MAX_FIT_ITERATIONS = 8
 MAX_POSITION_STEP_M, MAX_ROTATION_STEP_RAD = 0.3, 0.5
 """Largest step that a predicted pose needs. A larger one means that it is lost."""
 
-CONVERGED_STEP = 2e-5
-"""Largest component of a step (m, rad, m/s, rad/s times the window) at which a fit ends: a tenth of
-the effect of noise."""
+CONVERGED_COST = 0.01
+"""Square of a step, in standard deviations of the pose, at which a fit ends: a tenth of one. The
+next step would be several times smaller."""
 
-SEED_INTERVAL_NS = 200_000_000
-"""Time between attempts to find the pose of a device without an initial guess [ns]. Each takes as
-long as a hundred fits."""
+FIRST_SEED_INTERVAL_NS, MAX_SEED_INTERVAL_NS = 40_000_000, 640_000_000
+"""Time between attempts to find the pose of a device without an initial guess [ns]. It doubles with
+each, because one takes as long as a hundred fits."""
 
 AMBIGUITY_INTERVAL_NS = 1_000_000_000
 """Time between attempts to find the orientation of a device that had two [ns]."""
@@ -102,6 +103,10 @@ MIN_NOISE_WINDOWS = 8
 
 FIRST_SIGMA_RAD = MIN_INLIER_GATE_RAD / INLIER_GATE_SIGMAS
 """Standard deviation of an angle before it is estimated [rad]."""
+
+CONFIRMING_WINDOWS = 25
+"""Successive poses that depart from the path and agree with each other: the device was carried
+there. Reflections last for about half a second."""
 
 WINDOW_OVERLAP = 2.0
 """Number of windows that share a sweep."""
@@ -136,7 +141,7 @@ class PoseState:
         return PoseState(
             time_ns,
             self.position + self.rate[:3] * seconds,
-            rotation_exp(self.rate[3:] * seconds) @ self.rotation,
+            _rotation(self.rate[3:] * seconds) @ self.rotation,
             self.rate,
             self.margin,
         )
@@ -165,9 +170,11 @@ class DeviceState:
     pose: PoseState | None = None
     next_ns: int | None = None
     next_seed_ns: int = 0
+    seed_interval_ns: int = FIRST_SEED_INTERVAL_NS
     sigma_rad: float = FIRST_SIGMA_RAD
     lasting_rad: float = 0.0
     gate_rad: float = INLIER_GATE_RAD
+    path: RecentPath = field(default_factory=RecentPath)
     windows: deque[tuple[list[PlaneRow], Array]] = field(
         default_factory=lambda: deque(maxlen=NOISE_WINDOWS)
     )
@@ -296,40 +303,83 @@ class RigidFixes:
         rows = device.rows
         while rows and rows[0].time_ns <= now_ns - self._window_ns:
             rows.popleft()
-        window = [row for row in rows if row.station not in self.known.excluded]
-        sensors = {row.sensor for row in window}
-        if len(window) < MIN_SWEEPS or len(sensors) < MIN_SENSORS:
+        window = list(rows)
+        excluded = self.known.excluded
+        active = [k for k, row in enumerate(window) if row.station not in excluded]
+        if not _is_sufficient(window, active):
             self._reject("moment_with_too_few_sweeps", 1)
             return None
         first_ns = window[0].time_ns
-        time_ns = first_ns + round(sum(row.time_ns - first_ns for row in window) / len(window))
+        time_ns = first_ns + round(sum(window[k].time_ns - first_ns for k in active) / len(active))
         planes = np.array([row.values for row in window])
         offset_s = np.array([row.time_ns - time_ns for row in window]) * 1e-9
-        fit = None
         last = device.pose
         if last is not None and time_ns - last.time_ns > MAX_PROPAGATION_GAP_S * 1e9:
             last = device.pose = None
-        if last is not None:
-            start = last.later(time_ns)
-            loss_rad = LOSS_SCALE_SIGMAS * device.sigma_rad
-            fit = self._fit(planes, offset_s, start, device.sigma_rad, loss_rad)
-            if fit is None:
-                fit = self._fit(planes, offset_s, start, INITIAL_SIGMA_RAD, LOSS_SCALE_RAD)
+        fit = self._track(device, planes[active], offset_s[active], time_ns)
         is_ambiguous = last is not None and last.margin < MIN_SEED_MARGIN
         if (fit is None or is_ambiguous) and now_ns >= device.next_seed_ns:
-            seeded = self._seed(device, window, time_ns, planes, offset_s)
-            pause_ns = SEED_INTERVAL_NS if fit is None else AMBIGUITY_INTERVAL_NS
-            device.next_seed_ns = now_ns + pause_ns
+            own = [window[k] for k in active]
+            seeded = self._seed(device, own, time_ns, planes[active], offset_s[active])
+            if fit is None:
+                device.next_seed_ns = now_ns + device.seed_interval_ns
+                device.seed_interval_ns = min(2 * device.seed_interval_ns, MAX_SEED_INTERVAL_NS)
+            else:
+                device.next_seed_ns = now_ns + AMBIGUITY_INTERVAL_NS
             if seeded is not None and (fit is None or _replaces(seeded.state, fit.state)):
                 fit = seeded
         if fit is None:
             self._reject("moment_inconsistent", 1)
             return None
+        agreeing = _agreeing_stations([window[k] for k in active], fit.residual)
+        kept = [k for k in active if window[k].station in agreeing]
+        if len(kept) < len(active) and _is_sufficient(window, kept):
+            without = self._fit(
+                planes[kept], offset_s[kept], fit.state, INITIAL_SIGMA_RAD, LOSS_SCALE_RAD
+            )
+            fit, active = (fit, active) if without is None else (without, kept)
         acceleration = np.zeros(6)
         if last is not None:
             acceleration = (fit.state.rate - last.rate) / ((time_ns - last.time_ns) * 1e-9)
         device.pose = fit.state
-        return self._accept(device, window, fit, acceleration)
+        device.seed_interval_ns = FIRST_SEED_INTERVAL_NS
+        self._count(
+            device, window, set(active), _residuals(planes, offset_s[:, None], fit.state)[0]
+        )
+        return self._accept(device, [window[k] for k in active], fit, acceleration)
+
+    def _track(
+        self, device: DeviceState, planes: Array, offset_s: Array, time_ns: int
+    ) -> WindowFit | None:
+        """Fit the pose that follows from the last one, if there is one."""
+        if device.pose is None:
+            return None
+        start = device.pose.later(time_ns)
+        fit = self._fit(
+            planes, offset_s, start, device.sigma_rad, LOSS_SCALE_SIGMAS * device.sigma_rad
+        )
+        if fit is None:
+            fit = self._fit(planes, offset_s, start, INITIAL_SIGMA_RAD, LOSS_SCALE_RAD)
+        return fit
+
+    def _count(
+        self, device: DeviceState, window: list[PlaneRow], active: set[int], residual: Array
+    ) -> None:
+        """Count the sweeps that agree with a pose, each in the first of its windows.
+
+        Those of stations that are left out for good agree or not; they take no part.
+        """
+        middle_ns = (window[0].time_ns + window[-1].time_ns) // 2
+        for k, (row, value) in enumerate(zip(window, residual.tolist(), strict=True)):
+            if row.time_ns <= middle_ns:
+                continue
+            is_excluded = row.station in self.known.excluded
+            if abs(value) < device.gate_rad and (k in active or is_excluded):
+                self.used[row.station] += 1
+                self.residual[row.station].append(value)
+            else:
+                self.rejected[row.station] += 1
+                self._reject("sweep_contradicts_pose", 1)
 
     def _seed(
         self,
@@ -367,26 +417,15 @@ class RigidFixes:
         self, planes: Array, offset_s: Array, start: PoseState, sigma_rad: float, loss_rad: float
     ) -> WindowFit | None:
         """Fit a pose to the planes of a window; None if it does not converge or few agree."""
-        normal, lever, station, up = (planes[:, k : k + 3] for k in (0, 3, 6, 9))
-        squared_tangent = planes[:, 12] ** 2
-        position, rotation, rate = start.position, start.rotation, start.rate.copy()
+        state = replace(start)
         prior = np.zeros(12)
         prior[RATE] = RATE_SIGMA**-2.0
         elapsed = offset_s[:, None]
         jacobian = np.empty((len(planes), 12))
         for _ in range(MAX_FIT_ITERATIONS):
-            arm = lever @ rotation.T
-            if rate.any():
-                swing = _cross(rate[3:] * elapsed, arm)
-                arm = arm + swing + 0.5 * _cross(rate[3:] * elapsed, swing)
-            point = position + rate[:3] * elapsed + arm - station
-            height = (point * up).sum(axis=1)
-            squared = (point * point).sum(axis=1) - height**2 * (1.0 + squared_tangent)
-            scaled = normal / np.sqrt(np.maximum(squared, 1e-9))[:, None]
-            residual = (scaled * point).sum(axis=1)
-            size = np.abs(residual)
+            residual, scaled, arm = _residuals(planes, elapsed, state)
             weight = np.where(
-                size > OUTLIER_CUTOFF_RAD, 0.0, 1.0 / (1.0 + (residual / loss_rad) ** 2)
+                np.abs(residual) > OUTLIER_CUTOFF_RAD, 0.0, 1.0 / (1.0 + (residual / loss_rad) ** 2)
             )
             jacobian[:, :3] = scaled
             jacobian[:, 3:6] = _cross(arm, scaled)
@@ -395,21 +434,20 @@ class RigidFixes:
             information = weighted @ jacobian
             information[range(12), range(12)] += prior
             gradient = weighted @ residual
-            gradient[RATE] += prior[RATE] * rate
+            gradient[RATE] += prior[RATE] * state.rate
             step = np.linalg.solve(information, -gradient)
             size_m = float(np.abs(step[:3]).max())
             size_rad = float(np.abs(step[3:6]).max())
             if not (size_m < MAX_POSITION_STEP_M and size_rad < MAX_ROTATION_STEP_RAD):
                 return None
-            position = position + step[:3]
-            rotation = rotation_exp(step[3:6]) @ rotation
-            rate = rate + step[6:]
-            if max(size_m, size_rad, 0.01 * float(np.abs(step[6:]).max())) < CONVERGED_STEP:
+            state.position = state.position + step[:3]
+            state.rotation = _rotation(step[3:6]) @ state.rotation
+            state.rate = state.rate + step[6:]
+            if -float(gradient @ step) < CONVERGED_COST:
                 break
         inliers = int(np.count_nonzero(np.abs(residual) < INLIER_GATE_RAD))
         if inliers < max(MIN_SWEEPS, MIN_INLIER_FRACTION * len(planes)):
             return None
-        state = PoseState(start.time_ns, position, rotation, rate, start.margin)
         return WindowFit(state, residual, information, sigma_rad)
 
     def _accept(
@@ -418,29 +456,26 @@ class RigidFixes:
         """Return the fix of a pose that is determined, and remember its residuals."""
         device.windows.append((window, fit.residual))
         is_used = np.abs(fit.residual) < device.gate_rad
-        sensors = {row.sensor for row, used in zip(window, is_used, strict=True) if used}
-        for row, used, residual in zip(window, is_used.tolist(), fit.residual.tolist(), strict=True):
-            if row.time_ns <= fit.state.time_ns:
-                continue  # Each sweep counts once, in the first of its windows.
-            if used:
-                self.used[row.station] += 1
-                self.residual[row.station].append(residual)
-            else:
-                self.rejected[row.station] += 1
-                self._reject("sweep_contradicts_pose", 1)
-        if np.count_nonzero(is_used) < MIN_SWEEPS or len(sensors) < MIN_SENSORS:
+        if not _is_sufficient(window, np.flatnonzero(is_used).tolist()):
             self._reject("moment_with_too_few_sweeps", 1)
             return None
         information = fit.information + WEAK_INFORMATION * np.eye(12)
         unit = np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2
         lasting = device.lasting_rad**2 + self.known.calibration_sigma_rad**2
         noise = max(device.sigma_rad**2 - device.lasting_rad**2, ANGLE_SIGMA_RAD**2 / 4)
+        members = sorted({row.station for row in window})
         common = ROTATIONS_PER_WINDOW * lasting * unit
+        common += self.known.errors.pose_covariance(fit.state.position, members)
         motion = 0.5 * acceleration * (0.5e-9 * self._window_ns) ** 2 / 3
         covariance = WINDOW_OVERLAP * noise * unit + common + np.outer(motion, motion)
         variance = np.diagonal(covariance)
         if not np.all((variance >= 0) & (variance <= MAX_POSE_SIGMA_M_RAD**2)):
             self._reject("pose_not_determined", 1)
+            return None
+        noise_m = math.sqrt(float(np.trace((covariance - common)[:3, :3])))
+        now = (fit.state.time_ns, fit.state.position, noise_m)
+        if not device.path.accepts(now, CONFIRMING_WINDOWS):
+            self._reject("moment_jumps", 1)
             return None
         return Fix(
             device.name,
@@ -489,6 +524,20 @@ class RigidFixes:
         return RigidFixes(known, self._receivers, self._reject)
 
 
+def _is_sufficient(window: list[PlaneRow], rows: list[int]) -> bool:
+    """Return whether some rows of a window can determine a pose."""
+    return len(rows) >= MIN_SWEEPS and len({window[k].sensor for k in rows}) >= MIN_SENSORS
+
+
+def _agreeing_stations(window: list[PlaneRow], residual: Array) -> set[int]:
+    """Return the stations of which most sweeps agree with a pose; the others are reflected."""
+    total, inliers = Counter[int](), Counter[int]()
+    for row, value in zip(window, residual.tolist(), strict=True):
+        total[row.station] += 1
+        inliers[row.station] += abs(value) < INLIER_GATE_RAD
+    return {k for k, n in total.items() if inliers[k] >= MIN_INLIER_FRACTION * n}
+
+
 def _replaces(seeded: PoseState, tracked: PoseState) -> bool:
     """Return whether a new seed is better than the pose of an ambiguous one.
 
@@ -524,9 +573,46 @@ def _device_sweeps(rows: list[PlaneRow]) -> DeviceSweeps:
     )
 
 
+def _residuals(planes: Array, elapsed_s: Array, state: PoseState) -> tuple[Array, Array, Array]:
+    """Return predicted minus observed angles (n,) of sweeps, with two factors of their derivatives.
+
+    These are the normals of the planes, divided by the lever arms on which these rotate, and the
+    vectors from the device to the photodiodes, (n, 3) each.
+    """
+    normal, lever, station, up = (planes[:, k : k + 3] for k in (0, 3, 6, 9))
+    arm = lever @ state.rotation.T
+    if state.rate.any():
+        swing = _cross(state.rate[3:] * elapsed_s, arm)
+        arm = arm + swing + 0.5 * _cross(state.rate[3:] * elapsed_s, swing)
+    point = state.position + state.rate[:3] * elapsed_s + arm - station
+    height = (point * up).sum(axis=1)
+    squared = (point * point).sum(axis=1) - height**2 * (1.0 + planes[:, 12] ** 2)
+    scaled = normal / np.sqrt(np.maximum(squared, 1e-9))[:, None]
+    return (scaled * point).sum(axis=1), scaled, arm
+
+
+def _rotation(vector: Array) -> Array:
+    """Return the matrix of one rotation vector (3,); faster than ``rotation_exp`` for one."""
+    x, y, z = vector.tolist()
+    squared = x * x + y * y + z * z
+    angle = math.sqrt(squared)
+    sine = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    versine = 2.0 * (math.sin(0.5 * angle) / angle) ** 2 if angle > 1e-8 else 0.5
+    diagonal = 1.0 - versine * squared
+    xy, xz, yz = versine * x * y, versine * x * z, versine * y * z
+    sx, sy, sz = sine * x, sine * y, sine * z
+    return np.array(
+        [
+            [diagonal + versine * x * x, xy - sz, xz + sy],
+            [xy + sz, diagonal + versine * y * y, yz - sx],
+            [xz - sy, yz + sx, diagonal + versine * z * z],
+        ]
+    )
+
+
 def _cross(a: Array, b: Array) -> Array:
     """Return the cross products of rows (n, 3); faster than ``np.cross`` for few of them."""
-    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    product = np.empty_like(b)
     product[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     product[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
     product[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

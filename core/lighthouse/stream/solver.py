@@ -1,4 +1,4 @@
-"""Stream of Lighthouse: fixes of photodiodes and rigid devices, in a known or an estimated scene."""
+"""Stream of Lighthouse: fixes of photodiodes and rigid devices, in a scene given or estimated."""
 
 from __future__ import annotations
 
@@ -181,7 +181,8 @@ class LighthouseStream:
 
     def _push_sweeps(self, sweeps: Sweeps) -> None:
         """Take sweeps one by one, so that results do not depend on how they are cut."""
-        channel = np.where(np.isin(sweeps.channel, CHANNELS), sweeps.channel, 0)
+        is_known = (sweeps.channel >= CHANNELS.start) & (sweeps.channel < CHANNELS.stop)
+        channel = np.where(is_known, sweeps.channel, 0)
         with np.errstate(invalid="ignore"):
             is_in_period = (sweeps.count >= 0) & (sweeps.count < self._period[channel])
         for name, *row, usable in zip(
@@ -240,9 +241,7 @@ class LighthouseStream:
             return
         photodiode = f"{name}/{sensor}" if name in self._multiple else name
         is_labelled = polynomial != UNKNOWN
-        self._photodiodes.push(
-            photodiode, time_ns, station, plane, count, is_labelled, self._flush
-        )
+        self._photodiodes.push(photodiode, time_ns, station, plane, count, is_labelled, self._flush)
 
     def _flush(self) -> None:
         """Estimate the positions that are due, before any later event."""

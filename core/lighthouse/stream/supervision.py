@@ -105,10 +105,9 @@ class StationSupervision:
         """Exclude stations that disagree with the others; return the warnings about them."""
         warnings = [*self._check_epochs(), *self._check_poses(rigid)]
         inconsistent = sum(self._is_inconsistent)
-        is_contradicted = (
-            len(self._is_inconsistent) >= MAX_EPOCHS
-            and inconsistent > MAX_INCONSISTENT_FRACTION * len(self._is_inconsistent)
-        )
+        is_contradicted = len(
+            self._is_inconsistent
+        ) >= MAX_EPOCHS and inconsistent > MAX_INCONSISTENT_FRACTION * len(self._is_inconsistent)
         if is_contradicted and not self._is_contradicted and not self.known.excluded:
             warnings.append(
                 SolverWarning(
@@ -163,7 +162,9 @@ class StationSupervision:
             for (used, rejected), before in zip(totals, self._counted, strict=True)
         ]
         self._counted = totals
-        is_wrong = [used < rejected and used + rejected >= MIN_POSE_SWEEPS for used, rejected in new]
+        is_wrong = [
+            used < rejected and used + rejected >= MIN_POSE_SWEEPS for used, rejected in new
+        ]
         is_right = [used > rejected for used, rejected in new]
         warnings = []
         for k, station in enumerate(known.stations):
