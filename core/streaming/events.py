@@ -242,9 +242,9 @@ class Stream(Protocol):
 
         Parameters
         ----------
-        observations : Sweeps, Samples, HallSamples, Frames, Trajectory (odometry) or InertialSamples
-            The newest of their kind, in the order of time within a device. They may be cut into
-            pieces of any size: the results are the same.
+        observations : Sweeps, Samples, HallSamples, Frames, Trajectory or InertialSamples
+            A trajectory is odometry. The newest of their kind, in the order of time within a
+            device. They may be cut into pieces of any size: the results are the same.
         """
 
     def advance(self, time_ns: int) -> Sequence[StreamEvent]:
