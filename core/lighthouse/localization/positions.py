@@ -284,7 +284,9 @@ def estimate_floor_positions(
     PositionEstimates
         The redundancy is 0 or less: nothing checks these positions.
     """
-    return project_on_floor(ideal_angles(angles[:, 0], calibration), calibration, floor_map, floor_z)
+    return project_on_floor(
+        ideal_angles(angles[:, 0], calibration), calibration, floor_map, floor_z
+    )
 
 
 def project_on_floor(

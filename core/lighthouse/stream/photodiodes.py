@@ -76,7 +76,7 @@ NOISE_FIXES = 512
 """Number of fixes from which noise and gate are estimated."""
 
 MIN_NOISE_FIXES = 30
-"""Fewest fixes with redundancy from which noise and gate are estimated."""
+"""Fewest fixes with redundancy from which noise and gate are estimated, and fewest new ones."""
 
 INITIAL_SIGMA_RAD = MIN_INLIER_GATE_RAD / INLIER_GATE_SIGMAS
 """Standard deviation of an angle before it is estimated [rad]."""
@@ -197,6 +197,7 @@ class PhotodiodeFixes:
         self.rejected = [0] * len(known.stations)
         self.restored = 0
         self._noise: deque[tuple[Array, int]] = deque(maxlen=NOISE_FIXES)
+        self._new_fixes = 0
         self._period = [float(period_counts(s.channel)) for s in known.stations]
 
     # ---- sweeps
@@ -279,7 +280,9 @@ class PhotodiodeFixes:
             age_ns = now_ns - other_pairs[-1].time_ns[1]
             if MAX_FIX_SPAN_NS < age_ns <= EXPECTED_STATION_NS and other not in self.known.excluded:
                 return
-        if len(self._members(state, now_ns)) >= self.known.min_stations:
+        # A position from a single station is checked by nothing: another one is waited for.
+        needed = max(self.known.min_stations, min(2, len(self.known.stations)))
+        if len(self._members(state, now_ns)) >= needed:
             self._make_due(state, now_ns, flush)
 
     def advance(self, time_ns: int, flush: Callable[[], None]) -> None:
@@ -412,6 +415,7 @@ class PhotodiodeFixes:
         fixes = []
         for row, fix in enumerate(due):
             self._noise.append((estimates.residual[row], int(estimates.redundancy[row])))
+            self._new_fixes += 1
             reason = ""
             if not is_solved[row]:
                 reason = "moment_with_too_few_sweeps"
@@ -493,8 +497,11 @@ class PhotodiodeFixes:
 
     def update_noise(self) -> None:
         """Estimate the noise of an angle and the gate from the last fixes, as offline."""
+        if self._new_fixes < MIN_NOISE_FIXES:
+            return
         if sum(redundancy > 0 for _, redundancy in self._noise) < MIN_NOISE_FIXES:
             return
+        self._new_fixes = 0
         n = len(self._noise)
         estimates = PositionEstimates(
             np.zeros((n, 3)),
