@@ -100,16 +100,16 @@ CHANGE_WINDOW_SAMPLES = 2 * max(CHANGE_LAGS_SAMPLES)
 MAX_SILENCE_S = 1.0
 """Time without samples after which a pass has ended [s]."""
 
-ROW_PASSED_RATIO = 0.6
+ROW_PASSED_RATIO = 0.8
 """Energy of the field relative to its last maximum from which a row of magnets is behind the array.
-A magnet at a distance r has r^-6 of it: at the usual height of 10 mm the array is 4 mm behind."""
+A magnet at a distance r has r^-6 of it: at the usual height of 10 mm the array is 3 mm behind."""
 
 RISE_RATIO = 1.5
 """Energy relative to its last minimum from which the next row approaches."""
 
-DECAY_RATIO = 0.1
+DECAY_RATIO = 0.3
 """Energy relative to that of the last attempt from which another one follows: the array has moved
-on by half its distance from the magnets."""
+on by a fifth of its distance from the magnets."""
 
 MIN_ROW_ENERGY = 200.0
 """Least energy of a maximum in units of the noise: a magnet explains 80 of several samples."""
@@ -497,41 +497,28 @@ class _DeviceStream:
         running = self.running
         if running is None or not self.designs or self.noise_t is None:
             return []
-        events: list[StreamEvent] = []
-        if running.has_passed_row(bar_energy(field_t, running.level_t, self.noise_t)):
-            running.attempts += 1
-            preprocessed, events = self._preprocess(running.first - HISTORY_SAMPLES)
-            part, path_m = self._running_part(running, preprocessed)
-            if preprocessed is not None and part is not None:
-                known = len(self.reported) + 1
-                least = known * min(tags.magnets for tags in self.designs)
-                running.early = identify_running(preprocessed, part, self.designs, path_m, least)
-                running.checked = NEVER_NS
+        is_passed = running.has_passed_row(bar_energy(field_t, running.level_t, self.noise_t))
         number = self.samples.stop
-        if running.early is not None and number >= running.checked + CHECK_PERIOD_SAMPLES:
-            running.checked = number
-            preprocessed, more = self._preprocess(running.first - HISTORY_SAMPLES)
-            events += more
-            part, path_m = self._running_part(running, preprocessed)
-            if preprocessed is None or part is None:
-                return events
-            if is_beyond_doubt(running.early, preprocessed, part, path_m):
-                for observation in running.early.result.observations:
-                    events += self._report_tag(preprocessed.samples, observation)
-                running.early = None
-        return events
-
-    def _running_part(
-        self, running: _RunningPass, preprocessed: PreprocessedSamples | None
-    ) -> tuple[PassRange | None, Array | None]:
-        """Return the range of the running pass in a window, and the path if it is known."""
-        if preprocessed is None:
-            return None, None
+        is_check = running.early is not None and number >= running.checked + CHECK_PERIOD_SAMPLES
+        if not (is_passed or is_check):
+            return []
+        preprocessed, events = self._preprocess(running.first - HISTORY_SAMPLES)
+        if preprocessed is None or number - running.first < MIN_SAMPLES:
+            return events
         count = len(preprocessed.samples)
-        part = PassRange(count - (self.samples.stop - running.first), count)
-        if part.stop - part.first < MIN_SAMPLES:
-            return None, None
-        return part, known_path(self._given_path(preprocessed.samples.time_ns), part)
+        part = PassRange(count - (number - running.first), count)
+        path_m = known_path(self._given_path(preprocessed.samples.time_ns), part)
+        if is_passed:
+            running.attempts += 1
+            least = (len(self.reported) + 1) * min(tags.magnets for tags in self.designs)
+            running.early = identify_running(preprocessed, part, self.designs, path_m, least)
+        running.checked = number
+        early = running.early
+        if early is not None and is_beyond_doubt(early, preprocessed, part, path_m):
+            running.early = None
+            for observation in early.result.observations:
+                events += self._report_tag(preprocessed.samples, observation)
+        return events
 
     def _given_path(self, time_ns: NDArray[np.int64]) -> Array | None:
         """Return the distance (n,) moved at samples, by speed or odometry; None without either."""
