@@ -6,10 +6,14 @@ beyond doubt is reported at once. The others are reported, or refused, when the 
 would in :func:`.solver.solve`, by the same stages on a window of the newest samples. The pass of an
 early tag is solved again at its end, for further tags in it.
 
-A fix is the pose at the last sample over the tag whose position is well determined. Odometry
-carries the pose from there on, and the noise of its steps after that sample is not in the fix. (The
-pose in the middle of the tag is a little more accurate, but it was estimated from the path after it
-as well: a filter that adds the same odometry again would count its error twice.)
+A pass gives one fix. Its time is chosen so that a filter, which adds the odometry after it, counts
+no error twice:
+
+- If the path was estimated from the field, it is that of the last sample over the tag whose
+  position is well determined. No odometry is in the fix.
+- If odometry measured the path, it is that of the sample in the middle of the magnets. There, an
+  error of the scale of odometry has no effect, which has moved the last pose by half the length of
+  the tag times that error; the odometry after it is new to the fix.
 """
 
 from __future__ import annotations
@@ -45,6 +49,7 @@ from locatk.core.polaris.localization import (
     heading_correction,
     poses_over_tag,
 )
+from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import (
     CHANGE_LAGS_SAMPLES,
     MIN_CHANGE_SIGMAS,
@@ -264,7 +269,7 @@ class _RunningPass:
     peak, least : float
         Maximum of the energy while it rises, and minimum after that.
     attempt_energy, last_energy : float
-        Energies at the last early identification, and of the last sample.
+        Energies at the last early identification (0 if it was successful), and of the last sample.
     attempts : int
         Number of early identifications.
     early : EarlyTags or None
@@ -510,12 +515,12 @@ class _DeviceStream:
         path_m = known_path(self._given_path(preprocessed.samples.time_ns), part)
         if is_passed:
             running.attempts += 1
-            least = (len(self.reported) + 1) * min(tags.magnets for tags in self.designs)
-            running.early = identify_running(preprocessed, part, self.designs, path_m, least)
+            known = len(self.reported)
+            running.early = identify_running(preprocessed, part, self.designs, path_m, known)
         running.checked = number
         early = running.early
         if early is not None and is_beyond_doubt(early, preprocessed, part, path_m):
-            running.early = None
+            running.early, running.attempt_energy = None, 0.0
             for observation in early.result.observations:
                 events += self._report_tag(preprocessed.samples, observation)
         return events
@@ -655,7 +660,7 @@ class _DeviceStream:
             return events + self._warn(time_ns, "tag_not_on_site", message, message)
         if poses is None:
             return events
-        events.append(self._fix(poses))
+        events.append(self._fix(observation.magnets, poses))
         if self.first_tag is None:
             events += self._correct_heading(time_ns, tag_id, pose)
             self.last_tag = (tag_id, pose, poses.select(slice(-1, None)))
@@ -682,10 +687,12 @@ class _DeviceStream:
         poses = None if pose is None else poses_over_tag(samples, observation, pose)
         return poses if poses is not None and len(poses.time_ns) else None
 
-    def _fix(self, poses: PlanarPoses) -> Fix:
-        """Return the last pose that is about as well determined as the best one."""
+    def _fix(self, magnets: DetectedMagnets, poses: PlanarPoses) -> Fix:
+        """Return the pose of a pass that serves a filter best (see the module)."""
         variance = poses.covariance[:, 0, 0] + poses.covariance[:, 1, 1]
         row = int(np.flatnonzero(variance <= MAX_VARIANCE_RATIO * variance.min())[-1])
+        if not magnets.is_path_estimated:
+            row = int(np.abs(poses.time_ns - magnets.time_ns).argmin())
         return Fix(
             device=self.device,
             frame=self._frame,
