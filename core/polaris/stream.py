@@ -442,7 +442,7 @@ class _DeviceStream:
         if not np.isfinite(window.field_t).any():
             message = f"no sensor of {self.device} gives samples"
             return None, self._warn(self.last_ns, "no_samples", message)
-        preprocessed = preprocess(window)
+        preprocessed = preprocess(window, is_running=True)
         events: list[StreamEvent] = []
         for warning in preprocessed.warnings:
             # The numbers in parentheses are those of the window.
