@@ -409,6 +409,7 @@ def test_events_do_not_depend_on_cuts_and_interleaving(seed: int) -> None:
     assert exact(events) == exact(list(live_drive()))
 
 
+@pytest.mark.slow
 def test_advance_releases_a_visit_without_later_samples() -> None:
     """After the sensors fell silent, odometry shows that the robot has left."""
     one = drive(((2, 2), (2, 3)), stop_s=0.0)
@@ -440,6 +441,7 @@ def test_robots_do_not_influence_each_other() -> None:
 # ---- segments
 
 
+@pytest.mark.slow
 def test_segments_begin_as_offline() -> None:
     one = drive()
     recording = preprocess(one.samples[0], one.odometry[0])
@@ -485,6 +487,7 @@ def test_statistics_agree_with_the_offline_preprocessing() -> None:
     assert not statistics.is_silent.any()
 
 
+@pytest.mark.slow
 def test_statistics_follow_an_offset_that_drifts() -> None:
     sensors = drive().samples[0].sensors
     statistics, random = SensorStatistics(sensors), np.random.default_rng(3)
@@ -577,6 +580,7 @@ def test_scale_of_the_readings_is_corrected_by_a_task() -> None:
     assert tasks == 1
 
 
+@pytest.mark.slow
 def test_opposite_polarity_is_reported_by_a_task() -> None:
     visits = tuple(
         stream_module.IdentifiedVisit(None, visit)  # type: ignore[arg-type]
@@ -706,6 +710,7 @@ def test_memory_does_not_grow_while_a_robot_stays_on_a_landmark(
     assert (visits > 5) == is_turning
 
 
+@pytest.mark.slow
 def test_observations_that_wait_for_others_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(visit_stream, "MAX_WAITING_NS", 1_000_000_000)
     one = drive()
