@@ -56,9 +56,13 @@ from locatk.core.streaming.events import (
 
 Images = NDArray[np.uint8]
 
-TRIAL_INTERVAL_NS = 100_000_000
-"""Least time between two rejected frames in which another cause is searched [ns]. A search takes as
-long as the localization of a rejected frame, so that at 100 frames/s a tenth is added."""
+TRIAL_INTERVAL_NS, LATER_TRIAL_INTERVAL_NS = 100_000_000, 1_000_000_000
+"""Least time between two rejected frames in which another cause is searched [ns], at first and
+after :data:`FIRST_CYCLES`. A search takes up to twice as long as the localization of a rejected
+frame."""
+
+FIRST_CYCLES = 2
+"""Number of trials of each cause at first. A setting of the camera is wrong from the beginning."""
 
 MIN_FRAMES_OF_OTHER_CODEC = 2
 """Number of frames that another codec locates on a sheet of the manifest before that is reported.
@@ -262,7 +266,7 @@ class DotsStream:
     ) -> list[StreamEvent]:
         """Try the next cause on a rejected frame, if the last trial is long enough ago."""
         time_ns = int(frame.time_ns[0])
-        if state.next_trial_ns is not None and time_ns < state.next_trial_ns:
+        if state.altered or (state.next_trial_ns is not None and time_ns < state.next_trial_ns):
             return []
         cause = self._causes[state.trials % len(self._causes)]
         if not is_unexplained and cause in RESTORATIONS:
@@ -270,7 +274,8 @@ class DotsStream:
             state.trials += len(RESTORATIONS) - state.trials % len(self._causes)
             cause = self._causes[state.trials % len(self._causes)]
         state.trials += 1
-        state.next_trial_ns = time_ns + TRIAL_INTERVAL_NS
+        is_early = state.trials <= FIRST_CYCLES * len(self._causes)
+        state.next_trial_ns = time_ns + (TRIAL_INTERVAL_NS if is_early else LATER_TRIAL_INTERVAL_NS)
         if cause in RESTORATIONS:
             restored = np.ascontiguousarray(RESTORATIONS[cause](images))
             if not localize_frames(restored, self._code, self._camera).accepted[0]:
