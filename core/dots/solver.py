@@ -33,6 +33,12 @@ from locatk.core.dots.localization.recordings import (
     localize_recording,
 )
 from locatk.core.dots.localization.seams import relocalize_at_seams
+from locatk.core.dots.localization.sheet_poses import (
+    SheetPoses,
+    frame_detections,
+    sheet_poses,
+    spatial_covariance,
+)
 from locatk.core.dots.published.localization import localize_published
 from locatk.core.dots.results import DotDetection, DotFacts, FrameOutcome
 from locatk.core.dots.sheet import Manifest
@@ -127,9 +133,9 @@ def solve(
         for total, count in zip(other_codecs, counts, strict=True):
             total.update(count)
         off_sheet += list(localized.grid[localized.rejected == OFF_SHEET])
-        poses = _sheet_poses(localized, sheet, manifest)
+        poses = sheet_poses(localized, sheet, manifest)
         outcomes += _outcomes(camera_frames, localized)
-        detections += _detections(camera_frames, localized, sheet, poses, manifest)
+        detections += frame_detections(camera_frames, localized, sheet, poses, manifest)
         trajectories += _trajectories(camera_frames, sheet, poses, manifest)
     rejected = Counter(frame.rejected for frame in outcomes if frame.rejected)
     return Solution(
@@ -161,37 +167,6 @@ def _localize_published(
     return result
 
 
-# ---- from the grid to metres
-
-
-@dataclass(frozen=True)
-class _SheetPoses:
-    """Poses of all frames: (n, 2) m, (n,) rad, (n, 3, 3); nan for frames without a sheet."""
-
-    position: NDArray[np.float64]
-    heading: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-
-def _sheet_poses(
-    localized: LocalizedFrames, sheet: NDArray[np.intp], manifest: Manifest
-) -> _SheetPoses:
-    """Convert poses on the grid to metres in the frames of their sheets."""
-    n = len(localized)
-    poses = _SheetPoses(np.full((n, 2), np.nan), np.full(n, np.nan), np.full((n, 3, 3), np.nan))
-    for number in np.unique(sheet[sheet >= 0]):
-        is_here = sheet == number
-        poses.position[is_here], poses.heading[is_here], poses.covariance[is_here] = (
-            manifest.poses_in_metres(
-                int(number),
-                localized.grid[is_here],
-                localized.heading[is_here],
-                localized.covariance[is_here],
-            )
-        )
-    return poses
-
-
 # ---- results
 
 
@@ -210,50 +185,21 @@ def _outcomes(frames: Frames, localized: LocalizedFrames) -> list[FrameOutcome]:
     ]
 
 
-def _detections(
-    frames: Frames,
-    localized: LocalizedFrames,
-    sheet: NDArray[np.intp],
-    poses: _SheetPoses,
-    manifest: Manifest,
-) -> list[DotDetection]:
-    """Return the frames that have a pose."""
-    return [
-        DotDetection(
-            time_s=frames.time_ns[k] * 1e-9,
-            frame=frames.names[k],
-            x_m=float(poses.position[k, 0]),
-            y_m=float(poses.position[k, 1]),
-            heading_rad=float(poses.heading[k]),
-            confidence=float(localized.confidence[k]),
-            corrected_bits=int(localized.corrected[k]),
-            dots=int(localized.dots[k]),
-            grid_x=float(localized.grid[k, 0]),
-            grid_y=float(localized.grid[k, 1]),
-            sheet=manifest.sheets[sheet[k]].id,
-        )
-        for k in np.flatnonzero(sheet >= 0)
-    ]
-
-
 def _trajectories(
-    frames: Frames, sheet: NDArray[np.intp], poses: _SheetPoses, manifest: Manifest
+    frames: Frames, sheet: NDArray[np.intp], poses: SheetPoses, manifest: Manifest
 ) -> Iterator[Trajectory]:
     """Yield one trajectory per coordinate frame; if there are several, its name is appended."""
     names = np.array([manifest.frame(k) for k in range(len(manifest.sheets))], object)
     visited = list(dict.fromkeys(names[sheet[sheet >= 0]]))
     for name in visited or [names[0]]:
         indices = np.flatnonzero((sheet >= 0) & (names[sheet] == name))
-        covariance = np.full((len(indices), 6, 6), np.nan)
-        plane = np.array([0, 1, 5])
-        covariance[:, plane[:, None], plane] = poses.covariance[indices]
         yield Trajectory(
             device=frames.device if len(visited) < 2 else f"{frames.device}-{name}",
             frame=str(name),
             time_ns=frames.time_ns[indices],
             position=np.column_stack([poses.position[indices], np.zeros(len(indices))]),
             quaternion=quaternion_from_heading(poses.heading[indices]),
-            covariance=covariance,
+            covariance=spatial_covariance(poses.covariance[indices]),
         )
 
 

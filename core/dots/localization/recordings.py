@@ -48,6 +48,13 @@ MIRRORED = "mirrored"
 INVERTED = "inverted"
 MIRRORED_AND_INVERTED = "mirrored_and_inverted"
 
+RESTORATIONS: dict[str, Callable[[Images], Images]] = {
+    MIRRORED: lambda images: images[:, :, ::-1],
+    INVERTED: lambda images: 255 - images,
+    MIRRORED_AND_INVERTED: lambda images: 255 - images[:, :, ::-1],
+}
+"""Functions that restore images as printed, by the reason for which frames are rejected."""
+
 EXPLAINED = ("", UNREADABLE, OTHER_SIZE, OFF_SHEET, SECTION_BORDER)
 """Reasons that leave no other cause to look for; that of localized frames is empty."""
 
@@ -61,29 +68,42 @@ def localize_recording(
 ) -> LocalizedFrames:
     """Localize the frames of a camera on the grid, and reject those off the sheets.
 
-    The manifest names the codec ``code``, and a position on one of its sheets confirms it: the same
-    window of another codec is elsewhere, by more than a million pitches. Off the sheets a window
-    may be one of another codec, which limits the confidence. Mirrored and inverted frames are
-    rejected with that reason. ``localize`` is another method than
-    :func:`~locatk.core.dots.localization.frames.localize_frames`.
+    See :func:`localize_batch`. Mirrored and inverted frames are rejected with that reason.
     """
     result = unlocalized_frames(len(frames), TOO_FEW_DOTS)
     done = 0
     for indices, images in batches(frames, np.arange(len(frames)), result.rejected, camera):
-        if localize is not None:
-            part = localize(images, code, camera)
-        else:
-            part = localize_frames(images, code, camera, other_codec_odds=0)
-        off_sheet = np.flatnonzero(part.accepted & (find_sheets(part, manifest) < 0))
-        part.rejected[off_sheet] = OFF_SHEET
-        if localize is None and len(off_sheet):
-            uncertain = localize_frames(images[off_sheet], code, camera)
-            part.confidence[off_sheet] = uncertain.confidence
-        result.update(indices, part)
+        result.update(indices, localize_batch(images, manifest, code, camera, localize))
         done += len(indices)
         progress.report("frames", done, len(frames))
     _recognize_altered(frames, result.rejected, code, camera)
     return result
+
+
+def localize_batch(
+    images: Images,
+    manifest: Manifest,
+    code: Codec,
+    camera: Camera | None,
+    localize: Localize | None = None,
+) -> LocalizedFrames:
+    """Localize images (n, h, w) of a camera on the grid, and reject those off the sheets.
+
+    The manifest names the codec ``code``, and a position on one of its sheets confirms it: the same
+    window of another codec is elsewhere, by more than a million pitches. Off the sheets a window
+    may be one of another codec, which limits the confidence. ``localize`` is another method than
+    :func:`~locatk.core.dots.localization.frames.localize_frames`.
+    """
+    if localize is not None:
+        part = localize(images, code, camera)
+    else:
+        part = localize_frames(images, code, camera, other_codec_odds=0)
+    off_sheet = np.flatnonzero(part.accepted & (find_sheets(part, manifest) < 0))
+    part.rejected[off_sheet] = OFF_SHEET
+    if localize is None and len(off_sheet):
+        uncertain = localize_frames(images[off_sheet], code, camera)
+        part.confidence[off_sheet] = uncertain.confidence
+    return part
 
 
 def find_sheets(localized: LocalizedFrames, manifest: Manifest) -> NDArray[np.intp]:
@@ -141,9 +161,8 @@ def _recognize_altered(
         is_any = len(localizable(restore, _sample(unexplained))) > 0
         return localizable(restore, unexplained) if is_any else []
 
-    rejected[altered(lambda images: images[:, :, ::-1])] = MIRRORED
-    rejected[altered(lambda images: 255 - images)] = INVERTED
-    rejected[altered(lambda images: 255 - images[:, :, ::-1])] = MIRRORED_AND_INVERTED
+    for reason, restore in RESTORATIONS.items():
+        rejected[altered(restore)] = reason
 
 
 def _sample(indices: NDArray[np.intp]) -> NDArray[np.intp]:
