@@ -211,7 +211,8 @@ class Connection:
         greeting: Callable[[], list[Publication]],
         sink: QueuedSink,
     ) -> None:
-        from paho.mqtt.client import CallbackAPIVersion, Client
+        from paho.mqtt.client import Client
+        from paho.mqtt.enums import CallbackAPIVersion
 
         self.sent = self.dropped = 0
         self._greeting = greeting

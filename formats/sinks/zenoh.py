@@ -136,7 +136,7 @@ class ZenohSink(QueuedSink):
             topic.publisher.undeclare()
         if self._node_token is not None:
             self._node_token.undeclare()
-        self._session.close()  # type: ignore[no-untyped-call]
+        self._session.close()
 
     def _absence(self) -> str:
         return f"no router at {self._endpoint}" if self._endpoint else "no peer"
@@ -178,4 +178,5 @@ class ZenohSink(QueuedSink):
         topic.sequence += 1
         attachment = ATTACHMENT.pack(topic.sequence, time.time_ns(), 16, topic.identifier)
         topic.publisher.put(content, attachment=attachment)
-        return topic.publisher.matching_status.matching
+        status: Any = topic.publisher.matching_status
+        return bool(status.matching)
