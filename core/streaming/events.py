@@ -203,9 +203,7 @@ class WarningEvent:
 StreamEvent = Fix | DetectionEvent | StateChange | ArtifactUpdate | WarningEvent
 """Results of the stream of a system."""
 
-LiveEvent = (
-    PoseEstimate | DetectionEvent | StateChange | Correction | ArtifactUpdate | WarningEvent
-)
+LiveEvent = PoseEstimate | DetectionEvent | StateChange | Correction | ArtifactUpdate | WarningEvent
 """Results for the user."""
 
 
