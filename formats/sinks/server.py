@@ -646,7 +646,9 @@ class ServerSink:
         is_health = path == "/health"
         if not (is_health or self.is_socket(path)):
             return _response(http.HTTPStatus.NOT_FOUND, "not found")
-        if not has_token and not (is_health and is_loopback(connection.remote_address[0])):
+        # Requests through a reverse proxy come from this machine, too.
+        is_local = not self._origins and is_loopback(connection.remote_address[0])
+        if not has_token and not (is_health and is_local):
             return _response(http.HTTPStatus.UNAUTHORIZED, "the token is missing or wrong")
         if is_health:
             health = self.health()

@@ -328,6 +328,9 @@ def test_a_reverse_proxy_is_named_and_needs_a_token(servers: ModuleType, connect
         assert status_of(connect, with_token, origin="https://robots.example") == 101
         assert status_of(connect, with_token, origin="https://evil.example") == 403
         assert servers.request(sink, "/", {"Host": "robots.example"})[0] == 200
+        # What the proxy passes on comes from this machine, but is not of its users.
+        assert servers.request(sink, "/health")[0] == 401
+        assert servers.request(sink, f"/health?token={sink.token}")[0] == 503
 
 
 def test_health_has_the_status_of_the_session(servers: ModuleType) -> None:
