@@ -11,7 +11,7 @@ A single station over a floor whose scene has a floor homography uses that inste
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray

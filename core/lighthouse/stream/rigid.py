@@ -141,7 +141,7 @@ class PoseState:
         return PoseState(
             time_ns,
             self.position + self.rate[:3] * seconds,
-            _rotation(self.rate[3:] * seconds) @ self.rotation,
+            _rotation((self.rate[3:] * seconds).tolist()) @ self.rotation,
             self.rate,
             self.margin,
         )
@@ -228,7 +228,7 @@ class RigidFixes:
         device = self._devices.get(name)
         if device is None:
             receiver = self._receivers[name]
-            has_position = np.isfinite(receiver.position_m).all(axis=1).tolist()
+            has_position: list[bool] = np.isfinite(receiver.position_m).all(axis=1).tolist()
             device = self._devices[name] = DeviceState(name, receiver, has_position)
         if not (0 <= sensor < len(device.has_position) and device.has_position[sensor]):
             self._reject("sensor_unknown", 1)
@@ -441,7 +441,7 @@ class RigidFixes:
             if not (size_m < MAX_POSITION_STEP_M and size_rad < MAX_ROTATION_STEP_RAD):
                 return None
             state.position = state.position + step[:3]
-            state.rotation = _rotation(step[3:6]) @ state.rotation
+            state.rotation = _rotation(step[3:6].tolist()) @ state.rotation
             state.rate = state.rate + step[6:]
             if -float(gradient @ step) < CONVERGED_COST:
                 break
@@ -460,11 +460,11 @@ class RigidFixes:
             self._reject("moment_with_too_few_sweeps", 1)
             return None
         information = fit.information + WEAK_INFORMATION * np.eye(12)
-        unit = np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2
+        unit: Array = np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2
         lasting = device.lasting_rad**2 + self.known.calibration_sigma_rad**2
         noise = max(device.sigma_rad**2 - device.lasting_rad**2, ANGLE_SIGMA_RAD**2 / 4)
         members = sorted({row.station for row in window})
-        common = ROTATIONS_PER_WINDOW * lasting * unit
+        common: Array = ROTATIONS_PER_WINDOW * lasting * unit
         common += self.known.errors.pose_covariance(fit.state.position, members)
         motion = 0.5 * acceleration * (0.5e-9 * self._window_ns) ** 2 / 3
         covariance = WINDOW_OVERLAP * noise * unit + common + np.outer(motion, motion)
@@ -591,9 +591,9 @@ def _residuals(planes: Array, elapsed_s: Array, state: PoseState) -> tuple[Array
     return (scaled * point).sum(axis=1), scaled, arm
 
 
-def _rotation(vector: Array) -> Array:
+def _rotation(vector: list[float]) -> Array:
     """Return the matrix of one rotation vector (3,); faster than ``rotation_exp`` for one."""
-    x, y, z = vector.tolist()
+    x, y, z = vector
     squared = x * x + y * y + z * z
     angle = math.sqrt(squared)
     sine = math.sin(angle) / angle if angle > 1e-8 else 1.0
