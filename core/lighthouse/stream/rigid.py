@@ -228,7 +228,7 @@ class RigidFixes:
         device = self._devices.get(name)
         if device is None:
             receiver = self._receivers[name]
-            has_position: list[bool] = np.isfinite(receiver.position_m).all(axis=1).tolist()
+            has_position = [bool(k) for k in np.isfinite(receiver.position_m).all(axis=1)]
             device = self._devices[name] = DeviceState(name, receiver, has_position)
         if not (0 <= sensor < len(device.has_position) and device.has_position[sensor]):
             self._reject("sensor_unknown", 1)
@@ -460,7 +460,7 @@ class RigidFixes:
             self._reject("moment_with_too_few_sweeps", 1)
             return None
         information = fit.information + WEAK_INFORMATION * np.eye(12)
-        unit: Array = np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2
+        unit = np.asarray(np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2, np.float64)
         lasting = device.lasting_rad**2 + self.known.calibration_sigma_rad**2
         noise = max(device.sigma_rad**2 - device.lasting_rad**2, ANGLE_SIGMA_RAD**2 / 4)
         members = sorted({row.station for row in window})
