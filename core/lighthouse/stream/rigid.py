@@ -21,6 +21,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,8 +113,7 @@ WINDOW_OVERLAP = 2.0
 """Number of windows that share a sweep."""
 
 
-@dataclass(frozen=True)
-class PlaneRow:
+class PlaneRow(NamedTuple):
     """Sweep as the plane on which its photodiode was."""
 
     time_ns: int
@@ -164,6 +164,7 @@ class DeviceState:
     name: str
     receiver: Receiver
     has_position: list[bool]
+    levers: list[list[float]]
     planes: dict[int, PlaneTracker] = field(default_factory=dict)
     angles: dict[tuple[int, int, int], tuple[int, float]] = field(default_factory=dict)
     rows: deque[PlaneRow] = field(default_factory=lambda: deque(maxlen=MAX_SWEEPS_PER_WINDOW))
@@ -228,8 +229,10 @@ class RigidFixes:
         device = self._devices.get(name)
         if device is None:
             receiver = self._receivers[name]
-            has_position = [bool(k) for k in np.isfinite(receiver.position_m).all(axis=1)]
-            device = self._devices[name] = DeviceState(name, receiver, has_position)
+            has_position = [bool(np.all(np.isfinite(row))) for row in receiver.position_m]
+            device = self._devices[name] = DeviceState(
+                name, receiver, has_position, receiver.position_m.tolist()
+            )
         if not (0 <= sensor < len(device.has_position) and device.has_position[sensor]):
             self._reject("sensor_unknown", 1)
             return []
@@ -286,7 +289,7 @@ class RigidFixes:
                     r[0][0] * a + r[0][1] * b + r[0][2] * c,
                     r[1][0] * a + r[1][1] * b + r[1][2] * c,
                     r[2][0] * a + r[2][1] * b + r[2][2] * c,
-                    *device.receiver.position_m[sensor].tolist(),
+                    *device.levers[sensor],
                     *self._positions[station],
                     r[0][2],
                     r[1][2],
