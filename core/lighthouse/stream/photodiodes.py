@@ -372,8 +372,8 @@ class PhotodiodeFixes:
 
     # ---- positions
 
-    def solve_due(self) -> list[Fix | None]:
-        """Estimate the due fixes; None for each that is rejected."""
+    def solve_due(self) -> list[Fix]:
+        """Estimate the due fixes, and return the accepted ones in order."""
         due, self.due = self.due, []
         if not due:
             return []
@@ -382,9 +382,9 @@ class PhotodiodeFixes:
         ideal = np.full((len(due), s, 2), np.nan)
         angles = np.full((len(due), s, 2), np.nan)
         for row, fix in enumerate(due):
-            for (station, _), pair in zip(fix.members, fix.angle, strict=True):
-                angles[row, station] = pair
-                ideal[row, station] = known.corrections[station].ideal(*pair)
+            for (station, _), angle in zip(fix.members, fix.angle, strict=True):
+                angles[row, station] = angle
+                ideal[row, station] = known.corrections[station].ideal(*angle)
         if known.floor_map is not None:
             calibration = known.stations[0].calibration
             estimates = project_on_floor(
@@ -412,7 +412,7 @@ class PhotodiodeFixes:
             distance = np.linalg.norm(estimates.position[:, None] - known.arrays[0], axis=2)
             is_inconsistent = max_residual > self.gate_rad
             is_out_of_range = distance.min(axis=1) > MAX_RANGE_M
-        fixes = []
+        fixes: list[Fix] = []
         for row, fix in enumerate(due):
             self._noise.append((estimates.residual[row], int(estimates.redundancy[row])))
             self._new_fixes += 1
@@ -437,7 +437,6 @@ class PhotodiodeFixes:
                     self.rejected[station] += 2
             if reason:
                 self._reject(reason, 1)
-                fixes.append(None)
                 continue
             fixes.append(
                 Fix(

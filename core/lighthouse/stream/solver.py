@@ -247,7 +247,7 @@ class LighthouseStream:
     def _flush(self) -> None:
         """Estimate the positions that are due, before any later event."""
         if self._known is not None and self._photodiodes.due:
-            self._events.extend(f for f in self._photodiodes.solve_due() if f is not None)
+            self._events.extend(self._photodiodes.solve_due())
 
     # ---- time
 
