@@ -522,7 +522,7 @@ class _DeviceStream:
         if early is not None and is_beyond_doubt(early, preprocessed, part, path_m):
             running.early, running.attempt_energy = None, 0.0
             for observation in early.result.observations:
-                events += self._report_tag(preprocessed.samples, observation)
+                events += self._report_tag(preprocessed.samples, early.result, observation)
         return events
 
     def _given_path(self, time_ns: NDArray[np.int64]) -> Array | None:
@@ -600,7 +600,7 @@ class _DeviceStream:
         for observation in current.observations:
             if observation.refused and is_cut:
                 observation = replace(observation, refused="pass_too_long")
-            events += self._report_tag(samples, observation)
+            events += self._report_tag(samples, current, observation)
         return events
 
     # ---- results
@@ -632,7 +632,9 @@ class _DeviceStream:
             )
         return events
 
-    def _report_tag(self, samples: Samples, observation: TagObservation) -> list[StreamEvent]:
+    def _report_tag(
+        self, samples: Samples, current: IdentifiedPass, observation: TagObservation
+    ) -> list[StreamEvent]:
         """Return the detection of a tag with its fix and heading correction, once in a pass."""
         tag_id, tags, time_ns = observation.tag_id, observation.tags, observation.magnets.time_ns
         if tag_id is None or tags is None:
@@ -660,7 +662,7 @@ class _DeviceStream:
             return events + self._warn(time_ns, "tag_not_on_site", message, message)
         if poses is None:
             return events
-        events.append(self._fix(observation.magnets, poses))
+        events.append(self._fix(current.magnets, poses))
         if self.first_tag is None:
             events += self._correct_heading(time_ns, tag_id, pose)
             self.last_tag = (tag_id, pose, poses.select(slice(-1, None)))
