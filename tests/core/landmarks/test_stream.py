@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import math
@@ -312,20 +313,22 @@ def test_kidnapped_robot_is_found_again() -> None:
 
 @pytest.mark.slow
 def test_robot_that_returns_revises_its_visit() -> None:
-    """It leaves a landmark, and returns to it: one visit more, not two readings of it."""
-    one = drive(((2, 2), (2, 3), (2, 2), (2, 3), (2, 4), (2, 5)), stop_s=0.0)
-    events = live(LandmarksStream(FLOOR), in_time(one.samples[0], one.odometry[0]))
+    """It leaves a landmark and returns to it: the filter has one reading of it, as offline."""
+    one = drive((), waypoints=((0.3, 0.4), (0.68, 0.4), (0.52, 0.4), (1.3, 0.4)), stop_s=0.0)
+    visits = left_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
+    assert [visit.is_revised for visit in visits].count(True) >= 1
+    stream = LandmarksStream(FLOOR)
+    events = live(stream, in_time(one.samples[0], one.odometry[0]))
     offline = solve(one.samples, FLOOR, odometry=one.odometry)
-    expected = [each.cell for each in offline.detections if each.cell is not None]
-    cells = [each.cell for each in detections(events) if each.cell is not None]
-    assert cells[-1] == expected[-1]
-    assert set(cells) <= set(expected)
-    wrong = [
-        fix
-        for fix in fixes(events)
-        if np.abs(difference(pose_of(fix), pose_at(one.truth[0], fix.time_ns)))[:2].max() > 0.01
-    ]
-    assert not wrong
+    assert len(detections(events)) > len(offline.detections)
+    cells = stream._robots["robot"].cells
+    assert cells is not None
+    assert len(cells.model.visits) == len(offline.detections)
+    expected = [each.cell for each in offline.detections]
+    assert all(each.cell in expected for each in detections(events) if each.cell is not None)
+    for fix in fixes(events):
+        error = difference(pose_of(fix), pose_at(one.truth[0], fix.time_ns))
+        assert np.abs(error[:2]).max() < 0.01
 
 
 # ---- cuts and interleaving
@@ -663,7 +666,7 @@ def test_memory_does_not_grow_on_a_long_drive(monkeypatch: pytest.MonkeyPatch) -
     known = _visits_of_the_drive()
 
     def detect(segment: Any, *_: Any) -> VisitHypotheses:
-        one = known[len(sizes) % len(known)]
+        one = copy.deepcopy(known[len(sizes) % len(known)])
         time_ns = int(segment.time_ns[segment.trace.reference])
         return replace(one, time_ns=time_ns, odometry=segment.origin)
 
@@ -708,6 +711,8 @@ def test_memory_does_not_grow_while_a_robot_stays_on_a_landmark(
     assert max(sizes) < 1.5e6
     assert max(sizes[-100:]) <= 1.02 * max(sizes[100:-100])
     assert (visits > 5) == is_turning
+    if not is_turning:
+        assert stream._rows.size < visit_stream.MAX_STEP_ROWS + 100
 
 
 @pytest.mark.slow
