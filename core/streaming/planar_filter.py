@@ -92,9 +92,9 @@ class OdometryNoise:
     scale: float = 0.015
     rotation_scale: float = 0.02
     drift_rad_per_m: float = 0.05
-    distance_m: float = 5e-4
-    heading_rad: float = 3e-3
-    rotation_rad: float = 3e-3
+    distance_m: float = 7e-4
+    heading_rad: float = 5e-3
+    rotation_rad: float = 5e-3
     slip_m: float = 1e-4
     slip_rad: float = 5e-4
     rest_m: float = 1e-5
