@@ -9,6 +9,7 @@ used at once by extrapolating the motion, and processed again when the motion be
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -60,6 +61,15 @@ class FilterModel(Protocol):
 
         ``interpolation_s2`` times an unknown acceleration is the error of the interpolated motion.
         """
+
+
+@dataclass(frozen=True, slots=True)
+class NewestState:
+    """State of a filter and its covariance at a time."""
+
+    time_ns: int
+    state: Array
+    covariance: Array
 
 
 class FilterHistory:
@@ -117,13 +127,24 @@ class FilterHistory:
         """Time of the newest motion."""
         return int(self._time_ns[self._last_motion]) if self._last_motion >= 0 else None
 
-    def predict(self, time_ns: int) -> tuple[Array, Array]:
-        """Return state and covariance at a time that is not before :attr:`time_ns`."""
-        state, covariance = self.state, self.covariance
-        if self.time_ns is None or time_ns <= self.time_ns:
-            return state, covariance
-        duration_s = (time_ns - self.time_ns) * 1e-9
-        return self._model.propagate(state, covariance, self._extrapolated(duration_s), duration_s)
+    def predict(self, time_ns: int, newest: NewestState | None = None) -> tuple[Array, Array]:
+        """Return state and covariance at a time that is not before that of the newest state.
+
+        ``newest`` is an earlier result of :meth:`newest_state`.
+        """
+        newest = newest or self.newest_state()
+        if time_ns <= newest.time_ns:
+            return newest.state, newest.covariance
+        duration_s = (time_ns - newest.time_ns) * 1e-9
+        motion = self._extrapolated(duration_s)
+        return self._model.propagate(newest.state, newest.covariance, motion, duration_s)
+
+    def newest_state(self) -> NewestState:
+        """Return a copy of the state after the newest motion or fix; there must be one."""
+        row = self._end - 1
+        return NewestState(
+            int(self._time_ns[row]), self._state[row].copy(), self._covariance[row].copy()
+        )
 
     def add_motion(self, time_ns: int, motion: Array) -> bool:
         """Take the motion since the previous motion sample; of the first, only the time counts.

@@ -14,13 +14,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import (
-    matrix_from_quaternion,
-    quaternion_multiply,
-    rotation_exp,
-    rotation_vector_from_quaternion,
-    skew,
-)
 from locatk.core.inertial import STANDARD_GRAVITY_M_S2
 from locatk.core.streaming.history import CHI2_999
 
@@ -43,6 +36,13 @@ acceleration of 2 m/s^2 displaces by 1 cm in it."""
 GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
 
 _IDENTITY = np.eye(15)
+_DIAGONAL, _COMPONENT = (np.arange(15), np.arange(15)), np.arange(15) // 3
+_POSITION_BY_VELOCITY, _VELOCITY_BY_POSITION = (
+    (np.arange(3), np.arange(3, 6)),
+    (np.arange(3, 6), np.arange(3)),
+)
+_ROTATION_BY_BIAS = np.arange(6, 9), np.arange(12, 15)
+_POSE = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])
 
 
 @dataclass(frozen=True)
@@ -109,39 +109,39 @@ class InertialFilter:
             return self._forget_motion(state, covariance)
         noise = self.noise
         force, rate = motion[:3] - state[FORCE_BIAS], motion[3:] - state[RATE_BIAS]
-        rotation = matrix_from_quaternion(state[QUATERNION])
+        rotation = _rotation_matrix(state[QUATERNION])
         step = rate * duration_s
         # The mean orientation within the step turns the force into the frame.
-        mean_rotation = rotation @ rotation_exp(step / 2)
+        mean_rotation = rotation @ _rotation_matrix(_quaternion(step / 2))
         acceleration = mean_rotation @ force + GRAVITY
         state = state.copy()
         state[POSITION] += state[VELOCITY] * duration_s + acceleration * (duration_s**2 / 2)
         state[VELOCITY] += acceleration * duration_s
-        quaternion = quaternion_multiply(state[QUATERNION], _quaternion(step))
+        quaternion = _product(state[QUATERNION], _quaternion(step))
         state[QUATERNION] = quaternion / math.sqrt(quaternion @ quaternion)
         transition = _IDENTITY.copy()
-        transition[0:3, 3:6] = np.eye(3) * duration_s
-        by_rotation = -mean_rotation @ skew(force) * duration_s
-        transition[3:6, 6:9], transition[3:6, 9:12] = by_rotation, -mean_rotation * duration_s
-        transition[0:3, 6:12] = transition[3:6, 6:12] * (duration_s / 2)
-        transition[6:9, 6:9] = rotation_exp(-step)
-        transition[6:9, 12:15] = -np.eye(3) * duration_s
+        by_rotation = mean_rotation @ _skew(force * -duration_s)
+        by_bias = mean_rotation * -duration_s
+        transition[3:6, 6:9], transition[3:6, 9:12] = by_rotation, by_bias
+        half_s = duration_s / 2
+        transition[0:3, 6:9], transition[0:3, 9:12] = by_rotation * half_s, by_bias * half_s
+        transition[_POSITION_BY_VELOCITY] = duration_s
+        transition[6:9, 6:9] = _rotation_matrix(_quaternion(-step))
+        transition[_ROTATION_BY_BIAS] = -duration_s
         covariance = transition @ covariance @ transition.T
         force_variance = noise.force_density**2 * duration_s
-        variance = np.repeat(
+        covariance[_DIAGONAL] += np.array(
             [
                 force_variance * duration_s**2 / 3,
                 force_variance,
                 noise.rate_density**2 * duration_s,
                 noise.force_bias_walk**2 * duration_s,
                 noise.rate_bias_walk**2 * duration_s,
-            ],
-            3,
-        )
-        covariance[range(15), range(15)] += variance
-        coupling = force_variance * duration_s / 2
-        covariance[range(3), range(3, 6)] += coupling
-        covariance[range(3, 6), range(3)] += coupling
+            ]
+        )[_COMPONENT]
+        coupling = force_variance * half_s
+        covariance[_POSITION_BY_VELOCITY] += coupling
+        covariance[_VELOCITY_BY_POSITION] += coupling
         return state, covariance
 
     def update(
@@ -155,7 +155,7 @@ class InertialFilter:
         the filter.
         """
         fix_covariance = fix[FIX_COVARIANCE].reshape(6, 6)
-        known = np.flatnonzero(np.isfinite(np.diagonal(fix_covariance)))
+        known = np.isfinite(np.diagonal(fix_covariance)).nonzero()[0]
         state = state.copy()
         if state[PHASE] == RUNNING:
             if fix[FIX_MAX_REFUSALS] > 0:
@@ -176,11 +176,10 @@ class InertialFilter:
         state[PHASE] = RUNNING
         started = self.unknown_state()[1]
         started[9:, 9:] = covariance[9:, 9:]
-        to_device = matrix_from_quaternion(state[QUATERNION]).T
-        pose = np.r_[0:3, 6:9]
+        to_device = _rotation_matrix(state[QUATERNION]).T
         axes = np.eye(6)
         axes[3:, 3:] = to_device
-        started[pose[:, None], pose] = axes @ fix_covariance @ axes.T
+        started[_POSE] = axes @ fix_covariance @ axes.T
         return _accepted(state, fix), started
 
     def _forget_motion(self, state: Array, covariance: Array) -> tuple[Array, Array]:
@@ -199,30 +198,30 @@ class InertialFilter:
         known: NDArray[np.intp],
     ) -> tuple[Array, Array] | None:
         """Return the update by a fix, or None if it contradicts the state."""
-        rotation = matrix_from_quaternion(state[QUATERNION])
+        rotation = _rotation_matrix(state[QUATERNION])
         conjugate = state[QUATERNION] * [-1.0, -1.0, -1.0, 1.0]
-        deviation = quaternion_multiply(fix[FIX_QUATERNION], conjugate)
-        residual = np.r_[
-            fix[FIX_POSITION] - state[POSITION], rotation_vector_from_quaternion(deviation)
-        ]
+        deviation = _product(fix[FIX_QUATERNION], conjugate)
+        residual = np.concatenate(
+            [fix[FIX_POSITION] - state[POSITION], _rotation_vector(deviation)]
+        )
         rows = np.zeros((6, 15))
         rows[:3, :3], rows[3:, 6:9] = np.eye(3), rotation
         if len(known) < 6:
             rows, residual = rows[known], residual[known]
             fix_covariance = fix_covariance[np.ix_(known, known)]
         cross = covariance @ rows.T
-        innovation = rows @ cross + fix_covariance
-        gain = np.linalg.solve(innovation, cross.T).T
-        if residual @ np.linalg.solve(innovation, residual) > CHI2_999[len(known)]:
+        precision = np.linalg.inv(rows @ cross + fix_covariance)
+        if residual @ precision @ residual > CHI2_999[len(known)]:
             return None
+        gain = cross @ precision
         correction = gain @ residual
         keep = _IDENTITY - gain @ rows
         covariance = keep @ covariance @ keep.T + gain @ fix_covariance @ gain.T
         reset = _IDENTITY.copy()
-        reset[6:9, 6:9] -= skew(correction[6:9] / 2)
+        reset[6:9, 6:9] -= _skew(correction[6:9] / 2)
         covariance = reset @ covariance @ reset.T
         state[:6] += correction[:6]
-        quaternion = quaternion_multiply(state[QUATERNION], _quaternion(correction[6:9]))
+        quaternion = _product(state[QUATERNION], _quaternion(correction[6:9]))
         state[QUATERNION] = quaternion / math.sqrt(quaternion @ quaternion)
         state[10:16] += correction[9:]
         return _accepted(state, fix), (covariance + covariance.T) / 2
@@ -231,16 +230,59 @@ class InertialFilter:
 def pose_covariance(state: Array, covariance: Array) -> Array:
     """Return the covariance (6, 6) of position and rotation vector in the axes of the frame."""
     axes = np.eye(6)
-    axes[3:, 3:] = matrix_from_quaternion(state[QUATERNION])
-    pose = np.r_[0:3, 6:9]
-    return np.asarray(axes @ covariance[np.ix_(pose, pose)] @ axes.T)
+    axes[3:, 3:] = _rotation_matrix(state[QUATERNION])
+    return np.asarray(axes @ covariance[_POSE] @ axes.T)
+
+
+# Rotations of single vectors and quaternions, in less time than core.geometry takes for arrays.
 
 
 def _quaternion(rotation_vector: Array) -> Array:
     """Return the quaternion (x, y, z, w) of a rotation vector."""
-    angle = math.sqrt(rotation_vector @ rotation_vector)
+    x, y, z = rotation_vector.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
     factor = 0.5 if angle < 1e-9 else math.sin(angle / 2) / angle
-    return np.append(rotation_vector * factor, math.cos(angle / 2))
+    return np.array([x * factor, y * factor, z * factor, math.cos(angle / 2)])
+
+
+def _rotation_vector(quaternion: Array) -> Array:
+    """Return the rotation vector, at most pi long, of a quaternion."""
+    x, y, z, w = quaternion.tolist()
+    length = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 if length < 1e-12 else 2 * math.atan2(length, abs(w)) / length
+    return np.asarray((-factor if w < 0 else factor) * quaternion[:3])
+
+
+def _product(first: Array, second: Array) -> Array:
+    """Return the Hamilton product of two quaternions."""
+    ax, ay, az, aw = first.tolist()
+    bx, by, bz, bw = second.tolist()
+    return np.array(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )
+
+
+def _rotation_matrix(quaternion: Array) -> Array:
+    """Return the rotation matrix of a unit quaternion."""
+    x, y, z, w = quaternion.tolist()
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _skew(vector: Array) -> Array:
+    """Return the cross-product matrix of a vector."""
+    x, y, z = vector.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _accepted(state: Array, fix: Array) -> Array:

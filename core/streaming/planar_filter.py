@@ -61,6 +61,9 @@ MAX_NOISE_FACTOR = 1000.0
 """Bound of these factors: 32 in the standard deviation."""
 
 
+_IDENTITY = np.eye(6)
+
+
 @dataclass(frozen=True)
 class OdometryNoise:
     """Errors of odometry: standard deviations.
@@ -89,9 +92,9 @@ class OdometryNoise:
     scale: float = 0.015
     rotation_scale: float = 0.02
     drift_rad_per_m: float = 0.05
-    distance_m: float = 5e-4
-    heading_rad: float = 3e-3
-    rotation_rad: float = 3e-3
+    distance_m: float = 7e-4
+    heading_rad: float = 5e-3
+    rotation_rad: float = 5e-3
     slip_m: float = 1e-4
     slip_rad: float = 5e-4
     rest_m: float = 1e-5
@@ -208,7 +211,7 @@ class PlanarFilter:
             fix_covariance[0, 0] += variance
             fix_covariance[1, 1] += variance
             fix_covariance[2, 2] += (interpolation_s2 * self.noise.angular_acceleration_rad_s2) ** 2
-        known = np.flatnonzero(np.isfinite(fix[:3]))
+        known = np.isfinite(fix[:3]).nonzero()[0]
         state = state.copy()
         if state[PHASE] == RUNNING:
             if fix[FIX_MAX_REFUSALS] > 0:
@@ -248,15 +251,15 @@ class PlanarFilter:
             rows, residual = rows[known], residual[known]
             fix_covariance = fix_covariance[np.ix_(known, known)]
         cross = covariance[:, :3] @ rows.T
-        innovation = rows @ cross[:3] + fix_covariance
-        gain = np.linalg.solve(innovation, cross.T).T
-        normalized = np.linalg.solve(innovation, residual)
+        precision = np.linalg.inv(rows @ cross[:3] + fix_covariance)
+        normalized = precision @ residual
         excess = float(residual @ normalized) / CHI2_999[len(known)]
-        _estimate_noise(state, innovation, rows, normalized / math.sqrt(max(excess, 1.0)))
+        _estimate_noise(state, precision, rows, normalized / math.sqrt(max(excess, 1.0)))
         if excess > 1.0:
             return None
+        gain = cross @ precision
         correction = gain @ residual
-        keep = np.eye(6)
+        keep = _IDENTITY.copy()
         keep[:, :3] -= gain @ rows
         sensitivity = state[NOISE_SENSITIVITY].reshape(2, 3, 3)
         state[NOISE_SENSITIVITY] = (keep[:3, :3] @ sensitivity @ keep[:3, :3].T).ravel()
@@ -265,7 +268,7 @@ class PlanarFilter:
         cx, cy, angle = correction[:3].tolist()
         hc, hs = math.cos(angle / 2), math.sin(angle / 2)
         hx, hy = cx / 2, cy / 2
-        reset = np.eye(6)
+        reset = _IDENTITY.copy()
         reset[:2, :3] = [[hc, hs, hs * hx - hc * hy], [-hs, hc, hc * hx + hs * hy]]
         covariance = reset @ covariance @ reset.T
         dx, dy = exponential(cx, cy, angle)
@@ -287,25 +290,25 @@ def _with_slip(state: Array, covariance: Array) -> Array:
     return covariance
 
 
-def _estimate_noise(state: Array, innovation: Array, rows: Array, normalized: Array) -> None:
+def _estimate_noise(state: Array, precision: Array, rows: Array, normalized: Array) -> None:
     """Improve the factors of the odometry's noise by one innovation, in place.
 
-    ``normalized`` is the innovation times the inverse of its covariance S. With the derivative G of
-    S by the logarithm of a factor, that of the log likelihood is (n' G n - tr(S^-1 G)) / 2, with
-    the information tr((S^-1 G)^2) / 2.
+    ``precision`` is the inverse of the covariance S of the innovation, and ``normalized`` its
+    product with the innovation. With the derivative G of S by the logarithm of a factor, that of
+    the log likelihood is (n' G n - tr(S^-1 G)) / 2, with the information tr((S^-1 G)^2) / 2.
     """
     parts = rows @ state[NOISE_SENSITIVITY].reshape(2, 3, 3) @ rows.T
-    relative = np.linalg.solve(innovation, parts)
+    relative = precision @ parts
     slope = (normalized @ parts @ normalized - np.trace(relative, axis1=1, axis2=2)) / 2
-    information = np.einsum("kij,kji->k", relative, relative) / 2
+    information = (relative * relative.transpose(0, 2, 1)).sum(axis=(1, 2)) / 2
     state[NOISE_INFORMATION] = NOISE_MEMORY * state[NOISE_INFORMATION] + information
     prior = LOG_NOISE_PRIOR_INFORMATION
     change = (slope - (1 - NOISE_MEMORY) * prior * state[LOG_NOISE]) / (
         state[NOISE_INFORMATION] + prior
     )
-    changed = state[LOG_NOISE] + np.clip(change, -1.0, 1.0)
+    changed = state[LOG_NOISE] + np.minimum(np.maximum(change, -1.0), 1.0)
     bound = math.log(MAX_NOISE_FACTOR)
-    state[LOG_NOISE] = np.clip(changed, -bound, bound)
+    state[LOG_NOISE] = np.minimum(np.maximum(changed, -bound), bound)
 
 
 def exponential(rx: float, ry: float, rotation: float) -> tuple[float, float]:

@@ -33,7 +33,7 @@ from locatk.core.streaming.events import (
     StateChange,
     TrackingState,
 )
-from locatk.core.streaming.history import CHI2_999, FilterHistory
+from locatk.core.streaming.history import CHI2_999, FilterHistory, NewestState
 from locatk.core.streaming.inertial_filter import (
     MAX_SILENCE_S,
     InertialFilter,
@@ -222,13 +222,16 @@ class DeviceTracker:
         head_ns = history.time_ns
         assert head_ns is not None
         time_ns = max(fix.time_ns, head_ns)
-        predicted = self._estimate(time_ns)
+        before = history.newest_state()
         accepted, refused, resets = self._counters()
         if not history.add_fix(fix.time_ns, self._measurement(fix)):
             self.counts["late_fixes"] += 1
             return events
         now_accepted, now_refused, now_resets = self._counters()
         self.counts["refused_fixes"] += max(now_refused - refused, 0)
+        # A fix in the order of time that the filter accepts is explained by its covariance.
+        is_usual = fix.time_ns >= head_ns and now_resets == resets and not self._start_anew
+        predicted = None if is_usual else self._estimate(time_ns, before)
         if now_accepted > accepted:
             self._use(fix)
         estimate = self._estimate(time_ns)
@@ -404,13 +407,13 @@ class DeviceTracker:
         pose[np.isnan(np.diagonal(plane))] = np.nan
         return np.concatenate([pose, plane.ravel(), handling])
 
-    def _estimate(self, time_ns: int) -> PoseEstimate | None:
+    def _estimate(self, time_ns: int, newest: NewestState | None = None) -> PoseEstimate | None:
         """Return the pose by the filter at a time that is not before its state, if there is one."""
         fix = self._last_fix
         assert self._history is not None
-        if fix is None or not self._is_running:
+        if fix is None:
             return None
-        state, covariance = self._history.predict(time_ns)
+        state, covariance = self._history.predict(time_ns, newest)
         if state[self._components.PHASE] != self._components.RUNNING:
             return None
         if self._is_planar:
@@ -458,7 +461,8 @@ class DeviceTracker:
         fix = self._last_fix
         assert fix is not None
         state, reason = TrackingState.TRACKING, ""
-        if not np.nanmax(np.diagonal(estimate.covariance)[:2]) <= self.settings.max_sigma_m**2:
+        variance = max(float(estimate.covariance[0, 0]), float(estimate.covariance[1, 1]))
+        if not variance <= self.settings.max_sigma_m**2:
             state, reason = TrackingState.LOST, StateReason.UNCERTAIN
         elif _is_provisional(fix):
             state, reason = TrackingState.PROVISIONAL, StateReason.AMBIGUOUS

@@ -21,6 +21,7 @@ from locatk.core.streaming.events import (
     StateChange,
     TrackingState,
 )
+from locatk.core.streaming.planar_filter import OdometryNoise
 from locatk.core.streaming.tracker import (
     DEFAULT_SETTINGS,
     DeviceTracker,
@@ -291,6 +292,60 @@ def test_heading_wraps() -> None:
     np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * true), atol=1e-3)
 
 
+def test_headings_at_half_a_rotation() -> None:
+    """Fixes of 179 and -179 degrees of a robot at rest agree."""
+    tracker = DeviceTracker("robot")
+    tracker.odometry(make_odometry(0.0, 0.0))
+    for index in range(1, 20):
+        tracker.odometry(make_odometry(index / 10, 0.0))
+        tracker.fix(make_fix(index / 10, heading=np.pi + 0.01 * (-1) ** index))
+    assert tracker.counts["refused_fixes"] == 0
+    (pose,) = poses(tracker.odometry(make_odometry(2.0, 0.0)))
+    np.testing.assert_allclose(
+        abs(float(heading_from_quaternion(pose.quaternion))), np.pi, atol=1e-2
+    )
+
+
+def test_a_fix_before_the_first_odometry_is_used() -> None:
+    tracker = DeviceTracker("robot")
+    tracker.fix(make_fix(0.05, 5.0))
+    events = tracker.odometry(make_odometry([0.0, 0.1, 0.2], [0.0, 0.1, 0.2]))
+    np.testing.assert_allclose([pose.position[0] for pose in poses(events)], [5.05, 5.15])
+
+
+def test_a_fix_in_a_silence_of_the_odometry_is_used_after_it() -> None:
+    """It passes as it is, because it is too late to extrapolate the motion."""
+    tracker = DeviceTracker("robot")
+    tracker.odometry(make_odometry([0.0, 0.1], [0.0, 0.1]))
+    fix = make_fix(0.5, 5.0)
+    (pose,) = poses(tracker.fix(fix))
+    assert pose.covariance is fix.covariance
+    (pose,) = poses(tracker.odometry(make_odometry(0.52, 0.52)))
+    np.testing.assert_allclose(pose.position[0], 5.02, atol=1e-3)
+
+
+def test_provisional_fixes_do_not_replace_a_certain_pose_at_once() -> None:
+    tracker = DeviceTracker("robot", DEFAULT_SETTINGS["polaris"])
+    tracker.odometry(make_odometry([0.0, 0.1], 0.0))
+    tracker.fix(make_fix(0.1))
+    resets = [
+        poses(tracker.fix(make_fix(0.1 + index / 100, 3.0, probability=0.6)))[0].reset_counter
+        for index in (1, 2, 3)
+    ]
+    assert resets == [0, 0, 1]
+
+
+def test_a_refused_fix_raises_the_covariance_after_motion_only() -> None:
+    """Wheels may have slipped; at rest, the fix is wrong."""
+    for distance, low, high in ((0.2, 1.5, 100.0), (0.0, 0.99, 1.1)):
+        tracker = DeviceTracker("robot")
+        tracker.odometry(make_odometry(0.0, 0.0))
+        tracker.fix(make_fix(0.0))
+        (before,) = poses(tracker.odometry(make_odometry(0.1, distance)))
+        (after,) = poses(tracker.fix(make_fix(0.1001, 3.0)))
+        assert low < after.sigma[5] / before.sigma[5] < high
+
+
 def test_odometry_connects_positions_without_heading(drive: Any, track: Any) -> None:
     """The heading follows from two positions; before, positions pass as they are."""
     case = drive(3, has_heading=False, fix_interval_s=0.1, duration_s=8.0)
@@ -383,6 +438,28 @@ def test_fewer_samples_of_odometry_give_the_same_covariance() -> None:
     np.testing.assert_allclose(sigma[0], sigma[2], rtol=3e-2)
 
 
+def test_noise_of_the_heading_displaces_within_a_step() -> None:
+    """On a straight line, any number of samples gives q d^3 / 3 of the lateral variance."""
+    noise = OdometryNoise(
+        scale=0.0,
+        rotation_scale=0.0,
+        drift_rad_per_m=0.0,
+        distance_m=0.0,
+        heading_rad=0.02,
+        slip_m=0.0,
+        slip_rad=0.0,
+    )
+    for count in (1, 10, 100):
+        tracker = DeviceTracker("robot", TrackerSettings(fix_timeout_s=10.0, odometry=noise))
+        tracker.odometry(make_odometry(0.0, 0.0))
+        fix = make_fix(0.0)
+        fix.covariance[5, 5] = 1e-12
+        tracker.fix(fix)
+        time_s = np.arange(1, count + 1) / count
+        pose = poses(tracker.odometry(make_odometry(time_s, 1.5 * time_s)))[-1]
+        np.testing.assert_allclose(pose.covariance[1, 1], 1e-6 + 0.02**2 * 1.5**3 / 3, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_covariances_are_symmetric_and_positive(drive: Any, flight: Any, track: Any) -> None:
     for case, index in ((drive(2, common_m=3e-3), [0, 1, 5]), (flight(2), range(6))):
@@ -403,6 +480,8 @@ def test_common_errors_stay_in_the_published_covariance() -> None:
         fix = make_fix(index / 100, common_covariance=common)
         fix.covariance[0, 0] = fix.covariance[1, 1] = 5e-6
         (pose,) = poses(tracker.fix(fix))
+        if index == 1:
+            np.testing.assert_allclose(pose.covariance[0, 0], 5e-6, rtol=1e-3)
         tracker.odometry(make_odometry(index / 100 + 0.001, 0.0))
     assert pose is not None
     assert 4e-6 < pose.covariance[0, 0] < 4.1e-6
