@@ -133,15 +133,9 @@ class ZenohSink(QueuedSink):
         return CHECK_PERIOD_S
 
     def stop(self) -> None:
-        """Withdraw the publishers, and close the session."""
-        if self._session is None:
-            return
-        for topic in self._topics.values():
-            topic.token.undeclare()
-            topic.publisher.undeclare()
-        if self._node_token is not None:
-            self._node_token.undeclare()
-        self._session.close()
+        """Close the session, with its publishers and tokens."""
+        if self._session is not None:
+            self._session.close()
 
     def _absence(self) -> str:
         return f"no router at {self._endpoint}" if self._endpoint else "no peer"
