@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from types import ModuleType
 from typing import Any
 
@@ -40,6 +41,7 @@ class Page:
     def __init__(self, sink: Any, servers: ModuleType) -> None:
         self._address = f"ws://127.0.0.1:{servers.port_of(sink)}/ws"
         self.messages: list[dict[str, Any]] = []
+        self._end_s = time.monotonic() + 30
 
     def __enter__(self) -> Page:
         connect = pytest.importorskip("websockets.sync.client").connect
@@ -52,6 +54,7 @@ class Page:
         self._connection.__exit__(*error)
 
     def read(self) -> dict[str, Any]:
+        assert time.monotonic() < self._end_s, "the expected message does not come"
         message: dict[str, Any] = json.loads(self._socket.recv(timeout=10))
         self.messages.append(message)
         return message
