@@ -84,6 +84,7 @@ def test_the_first_messages_are_the_present_state(servers: ModuleType) -> None:
         assert page.health["type"] == "health"
 
 
+@pytest.mark.slow
 def test_updates_have_the_newest_pose_and_all_events(servers: ModuleType) -> None:
     with servers.running(create, "web://:0", CONTEXT) as sink, Page(sink, servers) as page:
         covariance = np.diag([4e-6, 1e-6, 9e-6, 1e-4, 1e-4, 1e-4])
@@ -115,6 +116,7 @@ def test_updates_have_the_newest_pose_and_all_events(servers: ModuleType) -> Non
         assert set(health["rates_hz"]) == {"a", "b"}
 
 
+@pytest.mark.slow
 def test_a_page_that_opens_later_has_path_state_and_events(servers: ModuleType) -> None:
     with servers.running(create, "web://:0", CONTEXT) as sink:
         with Page(sink, servers) as page:
@@ -144,6 +146,7 @@ def test_a_page_that_opens_later_has_path_state_and_events(servers: ModuleType) 
             assert messages == [str(k) for k in range(RECENT_EVENTS, 2 * RECENT_EVENTS)]
 
 
+@pytest.mark.slow
 def test_what_is_remembered_is_bounded(servers: ModuleType) -> None:
     sink = create(servers.parse_address("web://:0"))
     items = [servers.queued(servers.pose("a", 10 * k)) for k in range(2 * TRAIL_POSES)]
