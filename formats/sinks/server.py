@@ -535,7 +535,9 @@ class ServerSink:
                 await asyncio.wait_for(asyncio.shield(self._server.wait_closed()), rest_s)
         for client in self.clients:
             client.disconnect()
-        await asyncio.sleep(0)
+        deadline = loop.time() + CLOSE_TIMEOUT_S / 2
+        while self._clients and loop.time() < deadline:
+            await asyncio.sleep(0.001)
 
     async def _run_safely(self) -> None:
         try:

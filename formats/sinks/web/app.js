@@ -28,7 +28,7 @@
   let dirty = true, tableDue = 0;
   let version = 0;  // Increases when the artifact or the colors change.
   const view = { x: 0, y: 0, scale: 100, plane: 1, frame: "", follow: "", auto: true,
-                 labels: true, trail_s: 30, cursor: null };
+                 labels: true, trail_s: 30, cursor: null, isFrameChosen: false };
 
   // ---- messages
 
@@ -139,8 +139,13 @@
     let old = 0;
     while (old < trail.length && trail[old].t < pose.time_s - MAX_TRAIL_S) old++;
     if (old > 50) trail.splice(0, old);
-    if (!view.frame) setFrame(pose.frame);
-    if (device.name === view.follow && pose.frame !== view.frame) setFrame(pose.frame);
+    if (pose.frame !== view.frame && (device.name === view.follow || isFrameEmpty())) setFrame(pose.frame);
+  }
+
+  // Whether no device is in the frame of the map, which the user has not chosen.
+  function isFrameEmpty() {
+    return !view.isFrameChosen &&
+      ![...devices.values()].some((each) => each.pose && each.pose.frame === view.frame);
   }
 
   function takeState(message) {
@@ -627,6 +632,8 @@
       c.globalAlpha = 1;
     }
     $("empty").hidden = shown.length > 0 || connection === "lost";
+    const hasPoses = [...devices.values()].some((device) => device.pose);
+    set($("empty"), hasPoses ? "No device is in this frame" : "Waiting for the first pose");
     document.body.dataset.drawn = Number(document.body.dataset.drawn || 0) + 1;
   }
 
@@ -1112,7 +1119,11 @@
   $("fit").onclick = showAll;
   toggle($("plane"), (pressed) => { view.plane = pressed ? 2 : 1; view.auto = true; fit(); });
   toggle($("labels"), (pressed) => { view.labels = pressed; });
-  $("frame").onchange = (event) => { follow(""); setFrame(event.target.value); };
+  $("frame").onchange = (event) => {
+    follow("");
+    view.isFrameChosen = true;
+    setFrame(event.target.value);
+  };
   $("follow").onchange = (event) => follow(event.target.value);
   $("trail").onchange = (event) => { view.trail_s = Number(event.target.value); dirty = true; };
   $("detections").onchange = (event) => $("events").classList.toggle("no-detections", !event.target.checked);

@@ -167,6 +167,7 @@ def test_servers_end_with_a_hung_client_and_share_a_thread(servers: ModuleType, 
     for k in range(2000):
         servers.offer(second, servers.pose(k=k))
     second.close(0.5)
+    assert second.status().clients == 0
     assert threads() == 1
     assert servers.request(first, "/health")[0] in (200, 503)
     first.close(0.5)
