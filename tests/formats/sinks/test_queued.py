@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from types import ModuleType
 from typing import Any
 
@@ -181,9 +180,8 @@ def test_close_is_limited_in_time_and_counts_the_rest(live: ModuleType, sink: An
     live.offer(sink, live.pose(0))
     assert sink.entered.wait(5)
     live.offer(sink, *(live.pose(k) for k in range(5)))
-    begin = time.monotonic()
     sink.close(0.05)
-    assert time.monotonic() - begin < 2
+    assert sink._thread.is_alive()  # close() did not wait for it
     assert sink.status().dropped == 5
     live.offer(sink, live.pose(9))
     assert sink.status().dropped == 6
