@@ -159,6 +159,7 @@ class LiveInput:
         self._clock, self._queue = clock, queue
         # Each is written by one thread only.
         self._delivered_bytes = self._taken_bytes = 0
+        self._decoded_ns = 0
         self._is_dropping = self._is_stopping = False
         self._end_error: str | None = None
         self._frames = 0
@@ -242,6 +243,10 @@ class LiveInput:
         if self._thread is not None:
             self._thread.join(timeout_s)
 
+    def complete_ns(self, now_ns: int) -> int:
+        """Return the time up to which everything that was received has been decoded."""
+        return now_ns if self.waiting_bytes <= 0 else min(self._decoded_ns, now_ns)
+
     @property
     def is_recording(self) -> bool:
         """Return whether its bytes are being recorded."""
@@ -284,6 +289,7 @@ class LiveInput:
             if isinstance(event, ReceivedData):
                 received.append(event)
                 self._taken_bytes += event.size
+                self._decoded_ns = event.time_ns
                 continue
             yield from self._observations(received)
             received = []

@@ -49,7 +49,7 @@ TICK_S = 0.05
 MIN_INTERVAL_S = 0.002
 """Shortest time between two calls of the solver: what arrives meanwhile is solved at once."""
 
-ARRIVAL_DELAY_NS = 200_000_000
+ARRIVAL_DELAY_NS = 500_000_000
 """Age from which an observation that has not arrived is missing: buffers of USB and Bluetooth."""
 
 MAX_LATENESS_S = 0.2
@@ -357,7 +357,8 @@ class LiveSession:
             device.count(now_s)
         if self._localizer is None:
             return
-        time_ns = self._newest_ns if self._is_replay else self._clock.now()
+        now_ns = self._newest_ns if self._is_replay else self._clock.now()
+        time_ns = min(each.complete_ns(now_ns) for each in self._inputs)
         if time_ns > ARRIVAL_DELAY_NS:
             self._publish(self._localizer.advance(time_ns - ARRIVAL_DELAY_NS), now_s)
 
