@@ -212,6 +212,7 @@ def test_motion_between_the_sweeps_of_a_fix_is_corrected() -> None:
     assert np.percentile(errors[5:], 95) < 0.1e-3
 
 
+@pytest.mark.slow
 def test_fixes_are_those_of_the_offline_solver_for_reports() -> None:
     session = simulated(replace(PHOTODIODES, report_hz=10.0, duration_s=12.0, outliers=0.0))
     assert_agrees_with_offline(session.sweeps, session.true_scene, min_share=0.97)
@@ -261,6 +262,7 @@ def test_fixes_are_those_of_the_offline_solver_on_published_recordings(
     assert_agrees_with_offline(session.sweeps, scene, min_share=0.99)
 
 
+@pytest.mark.slow
 def test_outliers_are_rejected_and_counted() -> None:
     session = simulated(replace(PHOTODIODES, outliers=0.1, duration_s=3.0, robots=3))
     stream = LighthouseStream(session.true_scene, {})
@@ -316,6 +318,7 @@ def test_a_position_that_jumps_is_held_back_until_others_confirm_it() -> None:
     assert stream.rejected["moment_jumps"] == 3
 
 
+@pytest.mark.slow
 def test_a_hidden_station_does_not_stop_fixes() -> None:
     session = simulated(replace(PHOTODIODES, outliers=0.0, duration_s=6.0))
     sweeps = session.sweeps.take(session.sweeps.device == 1)
@@ -440,6 +443,7 @@ def test_a_reflected_station_is_left_out_of_poses() -> None:
 # ---- scene in the background
 
 
+@pytest.mark.slow
 def test_a_scene_is_estimated_after_the_first_seconds() -> None:
     session = simulated(
         replace(PHOTODIODES, outliers=0.0, planar=True, report_hz=10.0, duration_s=14.0, stations=2)
@@ -578,6 +582,7 @@ def test_memory_does_not_grow_with_the_length_of_the_input(
     assert max(grown[-8:]) <= 1.2 * max(grown[:8])
 
 
+@pytest.mark.slow
 def test_devices_that_are_gone_are_forgotten() -> None:
     session = simulated(replace(PHOTODIODES, robots=1, outliers=0.0))
     stream = LighthouseStream(session.true_scene, {})
@@ -604,6 +609,7 @@ def test_the_table_of_corrections_agrees_with_the_iteration() -> None:
     assert np.isnan(table.ideal(2.0, 2.0)).all()
 
 
+@pytest.mark.slow
 def test_odometry_gives_the_scale_of_an_estimated_scene() -> None:
     session = simulated(
         replace(PHOTODIODES, outliers=0.0, planar=True, report_hz=10.0, duration_s=8.0, stations=2)
