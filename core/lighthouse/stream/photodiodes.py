@@ -276,9 +276,9 @@ class PhotodiodeFixes:
             waiting_ns = max(p[-1].time_ns[1] for p in state.pairs.values() if p)
             self._make_due(state, min(waiting_ns, now_ns), flush)
         pairs.append(pair)
-        for other, other_pairs in state.pairs.items():
+        for other_pairs in state.pairs.values():
             age_ns = now_ns - other_pairs[-1].time_ns[1]
-            if MAX_FIX_SPAN_NS < age_ns <= EXPECTED_STATION_NS and other not in self.known.excluded:
+            if MAX_FIX_SPAN_NS < age_ns <= EXPECTED_STATION_NS:
                 return
         # A position from a single station is checked by nothing: another one is waited for.
         needed = max(self.known.min_stations, min(2, len(self.known.stations)))

@@ -421,7 +421,8 @@ class RigidFixes:
     ) -> WindowFit | None:
         """Fit a pose to the planes of a window; None if it does not converge or few agree."""
         state = replace(start)
-        prior = np.zeros(12)
+        # Sweeps that are all beyond the cutoff determine nothing.
+        prior = np.full(12, WEAK_INFORMATION)
         prior[RATE] = RATE_SIGMA**-2.0
         elapsed = offset_s[:, None]
         jacobian = np.empty((len(planes), 12))
@@ -462,8 +463,7 @@ class RigidFixes:
         if not _is_sufficient(window, np.flatnonzero(is_used).tolist()):
             self._reject("moment_with_too_few_sweeps", 1)
             return None
-        information = fit.information + WEAK_INFORMATION * np.eye(12)
-        unit = np.asarray(np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2, np.float64)
+        unit = np.asarray(np.linalg.inv(fit.information)[:6, :6] / fit.sigma_rad**2, np.float64)
         lasting = device.lasting_rad**2 + self.known.calibration_sigma_rad**2
         noise = max(device.sigma_rad**2 - device.lasting_rad**2, ANGLE_SIGMA_RAD**2 / 4)
         members = sorted({row.station for row in window})

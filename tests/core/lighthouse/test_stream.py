@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from locatk.core.errors import DegenerateError
-from locatk.core.geometry import matrix_from_quaternion, rotation_exp
+from locatk.core.geometry import Similarity, matrix_from_quaternion, rotation_exp
 from locatk.core.lighthouse.calibration import ideal_angles, predict_angles
 from locatk.core.lighthouse.channels import period_counts
 from locatk.core.lighthouse.devices.solver import solve_devices
@@ -212,6 +212,7 @@ def test_motion_between_the_sweeps_of_a_fix_is_corrected() -> None:
     assert np.percentile(errors[5:], 95) < 0.1e-3
 
 
+@pytest.mark.slow
 def test_fixes_are_those_of_the_offline_solver_for_reports() -> None:
     session = simulated(replace(PHOTODIODES, report_hz=10.0, duration_s=12.0, outliers=0.0))
     assert_agrees_with_offline(session.sweeps, session.true_scene, min_share=0.97)
@@ -261,6 +262,7 @@ def test_fixes_are_those_of_the_offline_solver_on_published_recordings(
     assert_agrees_with_offline(session.sweeps, scene, min_share=0.99)
 
 
+@pytest.mark.slow
 def test_outliers_are_rejected_and_counted() -> None:
     session = simulated(replace(PHOTODIODES, outliers=0.1, duration_s=3.0, robots=3))
     stream = LighthouseStream(session.true_scene, {})
@@ -316,15 +318,19 @@ def test_a_position_that_jumps_is_held_back_until_others_confirm_it() -> None:
     assert stream.rejected["moment_jumps"] == 3
 
 
+@pytest.mark.slow
 def test_a_hidden_station_does_not_stop_fixes() -> None:
-    session = simulated(replace(PHOTODIODES, outliers=0.0, robots=1, duration_s=6.0))
-    sweeps = session.sweeps
+    session = simulated(replace(PHOTODIODES, outliers=0.0, duration_s=6.0))
+    sweeps = session.sweeps.take(session.sweeps.device == 1)
     start_ns = int(sweeps.time_ns[0])
     kept = sweeps.take((sweeps.channel != 2) | (sweeps.time_ns < start_ns + int(1e9)))
     events = run(LighthouseStream(session.true_scene, {}), cut(kept))
     fixes = fixes_of(events)
     late = [f for f in fixes if f.time_ns > start_ns + 1.1e9]
     assert len(late) / 4.9 > 45
+    # Fixes go on while the station is still waited for, one for each rotation.
+    waiting = [f for f in fixes if 1.05e9 < f.time_ns - start_ns < 1.45e9]
+    assert 17 <= len(waiting) <= 30
     hidden = [e for e in events if isinstance(e, WarningEvent)]
     assert [e.warning.code for e in hidden] == ["station_hidden"]
     assert "channel 2" in hidden[0].warning.message
@@ -354,12 +360,20 @@ def test_a_moved_station_is_found_and_left_out() -> None:
     )
     session = simulated(options)
     stream = LighthouseStream(session.true_scene, {})
-    events = run(stream, cut(session.sweeps))
+    events: list[StreamEvent] = []
+    rejected = []
+    for piece in cut(session.sweeps):
+        events += stream.push(piece)
+        if "wrong_station" in codes(events):
+            rejected.append(stream._photodiodes.rejected[3])
+    events += stream.finish()
+    assert len(rejected) > 100
+    assert rejected[0] == rejected[-1]
     start_ns = int(session.sweeps.time_ns[0])
     moved = [e for e in events if isinstance(e, WarningEvent) and e.warning.code == "wrong_station"]
     assert len(moved) == 1
     assert "channel 4" in moved[0].warning.message
-    assert 8e9 < moved[0].time_ns - start_ns < 14.5e9
+    assert 11.5e9 < moved[0].time_ns - start_ns < 14.5e9  # the second verification
     after = [f for f in fixes_of(events) if f.time_ns > moved[0].time_ns]
     assert len(after) > 100
     assert np.percentile(np.linalg.norm(errors_of(session, after), axis=1), 99) < 3e-3
@@ -393,7 +407,7 @@ def test_poses_of_devices_are_right_within_their_covariance() -> None:
     difference = np.angle(np.exp(1j * (estimated - true)))
     assert np.percentile(np.abs(difference), 95) < np.radians(4.0)
     sigma = np.array([np.sqrt(f.covariance[5, 5]) for f in fixes])
-    assert 0.3 < np.sqrt(np.mean((difference / sigma) ** 2)) < 1.6
+    assert 0.5 < np.sqrt(np.mean((difference / sigma) ** 2)) < 1.3
 
 
 @pytest.mark.slow
@@ -413,18 +427,23 @@ def test_poses_of_devices_agree_with_the_offline_solver() -> None:
 
 @pytest.mark.slow
 def test_a_reflected_station_is_left_out_of_poses() -> None:
-    session = simulated(replace(DECKS, duration_s=6.0, reflections=0.1, stations=3, seed=4))
+    """One plane of its reflection always agrees with some pose, which is wrong by decimetres."""
+    session = simulated(
+        replace(DECKS, duration_s=12.0, reflections=0.08, occlusion=0.1, outliers=0.03, seed=2)
+    )
     stream = LighthouseStream(session.true_scene, receivers(session))
-    fixes = fixes_of(run(stream, cut(session.sweeps)), "robot-2")
+    fixes = fixes_of(run(stream, cut(session.sweeps)))
     assert stream.rejected["sweep_contradicts_pose"] > 20
+    assert len(fixes) > 800
     errors = np.linalg.norm(errors_of(session, fixes), axis=1)
-    sigma = [np.sqrt(np.trace(f.covariance[:3, :3])) for f in fixes]
-    assert np.percentile(errors / sigma, 98) < 4.0
+    sigma = np.array([np.sqrt(np.trace(f.covariance[:3, :3])) for f in fixes])
+    assert np.mean(errors > 6 * sigma) < 0.018
 
 
 # ---- scene in the background
 
 
+@pytest.mark.slow
 def test_a_scene_is_estimated_after_the_first_seconds() -> None:
     session = simulated(
         replace(PHOTODIODES, outliers=0.0, planar=True, report_hz=10.0, duration_s=14.0, stations=2)
@@ -500,12 +519,15 @@ def test_a_later_scene_replaces_an_earlier_one_only_if_it_is_better() -> None:
     task = BackgroundTask("scene", len)
     assert [e.version for e in stream.complete(task, SceneResult(worse, ()))] == [1]  # type: ignore[union-attr]
     assert stream.complete(task, SceneResult(worse, ())) == []
-    assert [e.version for e in stream.complete(task, SceneResult(scene, ()))] == [2]  # type: ignore[union-attr]
+    turn = Similarity(1.0, rotation_exp(np.array([0.0, 0.0, 2.0])), np.array([1.0, -2.0, 0.0]))
+    events = stream.complete(task, SceneResult(scene.transformed(turn), ()))
+    assert [e.version for e in events] == [2]  # type: ignore[union-attr]
+    assert stream.scene is not None
+    for station, before in zip(stream.scene.stations, scene.stations, strict=True):
+        np.testing.assert_allclose(station.position, before.position, atol=1e-9)
 
 
 def test_a_later_scene_is_in_the_frame_of_the_earlier_one() -> None:
-    from locatk.core.geometry import Similarity
-
     scene = replace(simulated(PHOTODIODES).true_scene, frame_source="station", planar=False)
     turn = Similarity(1.0, rotation_exp(np.array([0.2, -0.1, 2.0])), np.array([1.0, -2.0, 0.5]))
     back = align_scene(scene.transformed(turn), scene)
@@ -533,9 +555,8 @@ def sizes(thing: Any, seen: set[int] | None = None) -> int:
         return len(thing) + sum(sizes(v, seen) for v in thing.values())
     if isinstance(thing, list | tuple | set) or type(thing).__name__ == "deque":
         return len(thing) + sum(sizes(v, seen) for v in thing)
-    slots = getattr(thing, "__slots__", ())
-    own = {**getattr(thing, "__dict__", {}), **{k: getattr(thing, k) for k in slots}}
-    return sizes(own, seen) if own else 0
+    slots = [getattr(thing, name) for name in getattr(thing, "__slots__", ())]
+    return sum(sizes(v, seen) for v in [*getattr(thing, "__dict__", {}).values(), *slots])
 
 
 def repeated(sweeps: Sweeps, times: int, period_ns: int) -> list[Sweeps]:
@@ -558,9 +579,10 @@ def test_memory_does_not_grow_with_the_length_of_the_input(
         if k >= 14:
             grown.append(sizes(stream))
     # The last pieces do not hold more than the first ones that fill the buffers.
-    assert max(grown[-8:]) <= 1.05 * max(grown[:8])
+    assert max(grown[-8:]) <= 1.2 * max(grown[:8])
 
 
+@pytest.mark.slow
 def test_devices_that_are_gone_are_forgotten() -> None:
     session = simulated(replace(PHOTODIODES, robots=1, outliers=0.0))
     stream = LighthouseStream(session.true_scene, {})
@@ -587,6 +609,7 @@ def test_the_table_of_corrections_agrees_with_the_iteration() -> None:
     assert np.isnan(table.ideal(2.0, 2.0)).all()
 
 
+@pytest.mark.slow
 def test_odometry_gives_the_scale_of_an_estimated_scene() -> None:
     session = simulated(
         replace(PHOTODIODES, outliers=0.0, planar=True, report_hz=10.0, duration_s=8.0, stations=2)
