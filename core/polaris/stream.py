@@ -529,15 +529,17 @@ class _DeviceStream:
         """Return the distance (n,) moved at samples, by speed or odometry; None without either."""
         if self.options.speed_mps is not None:
             return (time_ns - time_ns[0]) * 1e-9 * self.options.speed_mps
-        if self.odometry.stop - self.odometry.first < 2:
+        if self.odometry.stop == 0:
             return None
         pose_ns, position, quaternion = self.odometry.rows(self.odometry.first, self.odometry.stop)
         # From the pose before the first sample to that after the last one: sums over others would
         # round differently if the odometry was cut into other pieces.
         before = max(int(np.searchsorted(pose_ns, time_ns[0], "right")) - 1, 0)
         after = int(np.searchsorted(pose_ns, time_ns[-1])) + 1
-        if after - before < 2 or before + 1 >= len(pose_ns):
+        if pose_ns[0] > time_ns[-1]:
             return None
+        if len(pose_ns[before:after]) < 2:
+            return np.full(len(time_ns), np.nan)
         used = slice(before, after)
         pose_ns, position, quaternion = pose_ns[used], position[used], quaternion[used]
         covariance = np.broadcast_to(np.nan, (len(pose_ns), 6, 6))
