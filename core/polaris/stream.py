@@ -220,7 +220,7 @@ class _Ring:
         self.capacity = capacity
         self.first = 0
         self.stop = 0
-        self._columns: list[Array] = []
+        self._columns: list[NDArray[Any]] = []
 
     def append(self, *columns: Any) -> None:
         """Add rows; each column is (k, ...)."""
@@ -239,7 +239,7 @@ class _Ring:
             column[used : used + count] = new
         self.stop += count
 
-    def rows(self, first: int, stop: int) -> list[Array]:
+    def rows(self, first: int, stop: int) -> list[NDArray[Any]]:
         """Return the rows with these numbers, as copies."""
         inside = slice(max(first - self.first, 0), stop - self.first)
         return [column[inside].copy() for column in self._columns]
@@ -529,15 +529,27 @@ class _DeviceStream:
         """Return the distance (n,) moved at samples, by speed or odometry; None without either."""
         if self.options.speed_mps is not None:
             return (time_ns - time_ns[0]) * 1e-9 * self.options.speed_mps
-        if self.odometry.stop - self.odometry.first < 2:
+        if self.odometry.stop == 0:
             return None
         pose_ns, position, quaternion = self.odometry.rows(self.odometry.first, self.odometry.stop)
+        # From the pose before the first sample to that after the last one: sums over others would
+        # round differently if the odometry was cut into other pieces.
+        before = max(int(np.searchsorted(pose_ns, time_ns[0], "right")) - 1, 0)
+        after = int(np.searchsorted(pose_ns, time_ns[-1])) + 1
+        if pose_ns[0] > time_ns[-1]:
+            return None
+        if len(pose_ns[before:after]) < 2:
+            return np.full(len(time_ns), np.nan)
+        used = slice(before, after)
+        pose_ns, position, quaternion = pose_ns[used], position[used], quaternion[used]
         covariance = np.broadcast_to(np.nan, (len(pose_ns), 6, 6))
         driven = Trajectory(self.device, "odometry", pose_ns, position, quaternion, covariance)
         path_m = distance_along(driven, time_ns)
         # Whether poses after a gap are known already depends on how the input is interleaved.
-        after = np.clip(np.searchsorted(pose_ns, time_ns), 1, len(pose_ns) - 1)
-        is_gap = pose_ns[after] - pose_ns[after - 1] > self.options.max_odometry_delay_s * 1e9
+        next_pose = np.clip(np.searchsorted(pose_ns, time_ns), 1, len(pose_ns) - 1)
+        is_gap = (
+            pose_ns[next_pose] - pose_ns[next_pose - 1] > self.options.max_odometry_delay_s * 1e9
+        )
         return np.where(is_gap, np.nan, path_m)
 
     def _end_pass(self, is_cut: bool = False) -> list[StreamEvent]:

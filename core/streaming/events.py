@@ -132,7 +132,8 @@ class DetectionEvent:
     device : str
     time_ns : int
     detection : dataclass
-        ``TagDetection``, ``LandmarkDetection``, ``DotDetection`` or ``StationDetection``.
+        ``TagDetection``, ``HeadingCorrection``, ``LandmarkDetection``, ``DotDetection`` or
+        ``StationDetection``.
     """
 
     device: str

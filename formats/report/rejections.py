@@ -228,6 +228,7 @@ def _polaris_reasons() -> dict[str, Reason]:
         "no_magnets": "The field changed, but no magnets explain that, or not within the effort "
         "for a pass: several large tags in one pass, or much debris.",
         "no_pass": "The field changed while the array rested, or far less than by a tag.",
+        "pass_too_long": "The field changed for longer than a pass over a tag (live only).",
         "no_tag_given": "The design of the tags (tag.toml) is not known: magnets were detected, "
         "but not identified.",
         "partial": "The tag extends beyond the bar, or the recording begins or ends over it.",
