@@ -8,8 +8,8 @@ the input is cut.
 A visit is complete as soon as the robot leaves the strong fields of its landmark. The margin of the
 offline segments is not waited for, because it is of little use: the poses of 263 simulated visits
 differ by 0.02 (positions) and 0.09 (headings) of their standard deviations on average, and 99 of
-100 by less than 0.42. If the
-robot returns to the same landmark, the visit is complete once more when it leaves again.
+100 by less than 0.42. If the robot returns to the same landmark, the visit is complete once more
+when it leaves again.
 """
 
 from __future__ import annotations
