@@ -89,6 +89,11 @@ RECENT_VISITS = 32
 SENSORS_TASK, POLARITY_TASK = "sensors", "polarity"
 """Names of the tasks in the background."""
 
+MIN_JUDGED_VISITS = 6
+"""Visits from which on a map can be contradicted: a single landmark that differs from the map makes
+another floor as probable as 19 to 1 if it is among the first ones. Until then the probability of
+the fixes says it."""
+
 FIRST_CHECK_VISITS = 4
 """Visits after which the sensors are checked for the first time, and again after twice as many."""
 
@@ -406,7 +411,9 @@ class RobotStream:
         visits = list(self.recent)
         on_map = select_visits_on_map(visits, self.floor)
         was_contradicted = self.is_contradicted
-        self.is_contradicted = is_map_contradicted(visits, on_map, self.cells.map_probability)
+        self.is_contradicted = self.visit_count >= MIN_JUDGED_VISITS and is_map_contradicted(
+            visits, on_map, self.cells.map_probability
+        )
         if not self.is_contradicted or was_contradicted:
             return []
         if MAP_CONTRADICTED_WARNING.code not in self.warned:

@@ -3,10 +3,13 @@
 The counterpart of :func:`.preprocessing.preprocess` and :func:`.preprocessing.segment_visits` for
 observations that arrive one by one. Samples and odometry are merged by time: all decisions are made
 at the times of odometry poses, with everything up to that time, so that they do not depend on how
-the input is cut. A visit is complete as soon as the robot leaves the fields of its landmark. The
-margin of the offline segments after the last field is not waited for: without it, the poses of 92
-simulated visits differ by 0.03 of their standard deviation on average, and by 0.3 at most. If the
-robot returns to the same landmark, the visit is complete once more when it leaves again.
+the input is cut.
+
+A visit is complete as soon as the robot leaves the strong fields of its landmark. The margin of the
+offline segments is not waited for, because it is of little use: the poses of 263 simulated visits
+differ by 0.02 (positions) and 0.09 (headings) of their standard deviations on average, and 99 of
+100 by less than 0.42. If the robot returns to the same landmark, the visit is complete once more
+when it leaves again.
 """
 
 from __future__ import annotations

@@ -288,7 +288,7 @@ def test_wrong_floor_never_becomes_certain() -> None:
     other = FloorMap(np.random.default_rng(100).integers(0, 16, (12, 12)))
     one = drive()
     events = live(LandmarksStream(other), in_time(one.samples[0], one.odometry[0]))
-    assert all(fix.probability < 0.5 for fix in fixes(events))
+    assert all(fix.probability < PROVISIONAL_PROBABILITY for fix in fixes(events))
     assert warning_codes(events).count("map_contradicted") == 1
     lost = [event for event in events if isinstance(event, StateChange)]
     assert [event.state for event in lost] == [TrackingState.LOST]
