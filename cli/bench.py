@@ -17,6 +17,7 @@ BENCHES = {
     "polaris": "locatk.formats.benchmarks.polaris.suite:figures",
     "landmarks": "locatk.formats.benchmarks.landmarks.suite:figures",
     "capture": "locatk.formats.benchmarks.capture:figures",
+    "live": "locatk.formats.benchmarks.live:figures",
     "look": "locatk.formats.benchmarks.look:figures",
     "infrared": "locatk.formats.benchmarks.infrared:figures",
 }
@@ -47,6 +48,7 @@ def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
                   accuracy and speed of a system
       infrared    sweeps and factory data from raw infrared light
       capture     recording from ports, recovery of damaged files, decoding speed
+      live        latency of live poses, agreement with solve, memory
       look        eval compared with evo, reports, demo and batches
 
     Targets of durations are scaled by the machine factor: the duration of a fixed workload on this
@@ -60,6 +62,7 @@ def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
       locatk bench polaris
       locatk bench landmarks
       locatk bench capture
+      locatk bench live
       locatk bench look
       locatk bench infrared
       locatk bench lighthouse --full

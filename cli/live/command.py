@@ -243,11 +243,10 @@ def _requests(
 
 
 def _list_sinks(as_json: bool) -> None:
-    from locatk.formats.sinks.registry import known_sinks
+    from locatk.formats.sinks.registry import sink_summaries
 
-    sinks = known_sinks()
+    sinks = sink_summaries()
     if as_json:
-        console.emit_json({"version": 1, "sinks": [vars(each) for each in sinks]})
-        return
-    rows = [(each.scheme, each.summary) for each in sinks]
-    console.result(console.table(("sink", "receiver"), rows))
+        console.emit_json({"version": 1, "sinks": sinks})
+    else:
+        console.result(console.table(("sink", "receiver"), list(sinks.items())))

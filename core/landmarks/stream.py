@@ -239,20 +239,26 @@ class RobotStream:
         self.priors = replace(options.priors, drift=drift, pitch_m=self.pitch_m)
         self.visits = VisitStream(device, self.geometry, self.pitch_m, drift)
         self.visits.lag_ns = round(1e9 * (options.odometry_lag_s or 0.0))
-        self.cells = (
-            CausalCells(floor, misread=options.misread, drift=drift) if floor is not None else None
-        )
-        self.previous: StreamedVisit | None = None
-        self.current: StreamedVisit | None = None
-        self.recent: deque[IdentifiedVisit] = deque(maxlen=RECENT_VISITS)
-        self.visit_count, self.next_check = 0, FIRST_CHECK_VISITS
-        self.lag_information: deque[tuple[Array, Array]] = deque(maxlen=RECENT_VISITS)
         self.lag_rounds = 0
         self.last_event_ns: int | None = None
         self.last_cell: Cell | None = None
-        self.is_contradicted = False
         self.warned: set[str] = set()
         self.tasks: deque[BackgroundTask] = deque()
+        self._start()
+
+    def _start(self) -> None:
+        """Begin without any visit."""
+        self.cells = None
+        if self.floor is not None:
+            self.cells = CausalCells(
+                self.floor, misread=self.options.misread, drift=self.priors.drift
+            )
+        self.previous: StreamedVisit | None = None
+        self.current: StreamedVisit | None = None
+        self.recent: deque[IdentifiedVisit] = deque(maxlen=RECENT_VISITS)
+        self.lag_information: deque[tuple[Array, Array]] = deque(maxlen=RECENT_VISITS)
+        self.visit_count, self.next_check = 0, FIRST_CHECK_VISITS
+        self.is_contradicted = False
 
     # ---- observations
 
@@ -502,7 +508,7 @@ class RobotStream:
             self.visits.leave_out(check.faulty_sensor)
         else:
             return []
-        self.previous = self.current = None
+        self._start()  # The readings of all visits were wrong.
         return [event for each in recording.warnings for event in self._warn(_without_device(each))]
 
 

@@ -44,9 +44,10 @@ from locatk.core.trajectory import Trajectory
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 
-LEAVING_PATH_M = 3e-3
-"""Path of the sensors without a field after which a landmark is left. In 2 of 100 simulated visits
-the fields vanish for longer while the robot is still over the landmark."""
+LEAVING_PATH_M = 5e-3
+"""Path of the sensors without a field that would suffice for a visit, after which a landmark is
+left. In 3 of 100 simulated visits there is none for longer while the robot is still over the
+landmark: it is then left twice."""
 
 MAX_RETURN_M = 1.0
 """Path of the sensors after the last field beyond which a robot that returns to a landmark begins a
@@ -208,7 +209,7 @@ class VisitStream:
         self._unjudged_ns: Times = np.empty(0, np.int64)
         self._unjudged_t: Array = np.empty((0, 0))
         self._last = np.zeros(5)  # Pose, path and distance of the last row.
-        self._step_start, self._step_rows = 0, 0
+        self._step_start, self._step_rows, self._is_resting = 0, 0, False
         self._group: FieldGroup | None = None
         self._field_path = -math.inf
         self._previous_stop = 0
@@ -314,6 +315,7 @@ class VisitStream:
         self._is_invalid_between = False
         if self.statistics is not None:
             yield from self._take_rows(times, field)
+            yield from self._leave(pose)
         self._drop_unused()
 
     def _take_rows(
@@ -357,8 +359,13 @@ class VisitStream:
             step_m[0] = 0.0
         sensor_path = np.cumsum(np.concatenate([self._last[3:4], step_m]))[1:]
         last_step = math.floor(self._last[3] / STEP_M)
-        is_resting = math.floor(sensor_path[-1] / STEP_M) == last_step
-        if is_resting and self._step_rows >= MAX_STEP_ROWS:
+        is_in_step = math.floor(sensor_path[-1] / STEP_M) == last_step
+        was_resting, self._is_resting = self._is_resting, False
+        if is_in_step and self._step_rows >= MAX_STEP_ROWS:
+            self._is_resting = True
+            if was_resting:  # No sample that is kept is next to the last pose but one.
+                self._path_ns = np.delete(self._path_ns, -2)
+                self._path = np.delete(self._path, -2, axis=0)
             return
         self.statistics.add_valid(field)
         field = field / self.scale
@@ -389,16 +396,20 @@ class VisitStream:
         step = np.floor(sensor_path / STEP_M)
         before = math.floor(self._last[3] / STEP_M) if not is_first else step[0]
         self._last = np.array([*pose[-1], sensor_path[-1], distance[-1]])
-        has_field = np.flatnonzero(power > 0)
+        has_field = np.flatnonzero((power > 0) & (strongest >= self._min_peak_t))
         if len(has_field):
             self._field_path = float(sensor_path[has_field[-1]])
         for edge in np.flatnonzero(np.diff(step, prepend=before)).tolist():
             yield from self._close_step(first + edge)
         self._step_rows = self._rows.stop - self._step_start
+
+    def _leave(self, pose: Array) -> Iterator[LeftVisit]:
+        """Yield the visit if the robot, which is at a pose by now, has left the landmark."""
         group = self._group
         if group is None:
             return
-        since_field_m = float(sensor_path[-1]) - self._field_path
+        motion_m = float(sensor_motion(self.sensors, np.vstack([self._last[:3], pose]))[0])
+        since_field_m = float(self._last[3]) + motion_m - self._field_path
         if since_field_m > LEAVING_PATH_M and not self._is_weak(group):
             yield from self._close_step(self._rows.stop)
             if self._group is group and not self._is_weak(group):
@@ -409,7 +420,12 @@ class VisitStream:
 
     def _is_weak(self, group: FieldGroup) -> bool:
         """Return whether no strong field was measured since the visit was reported."""
-        return group.new_peak_t < MIN_PEAK_THRESHOLDS * self.geometry.threshold_t
+        return group.new_peak_t < self._min_peak_t
+
+    @property
+    def _min_peak_t(self) -> float:
+        """Strongest field below which a visit does not determine a landmark."""
+        return MIN_PEAK_THRESHOLDS * self.geometry.threshold_t
 
     # ---- groups of fields
 

@@ -108,11 +108,18 @@ class PreprocessedSamples:
     warnings: tuple[SolverWarning, ...]
 
 
-def preprocess(samples: Samples) -> PreprocessedSamples:
+def preprocess(samples: Samples, *, is_running: bool = False) -> PreprocessedSamples:
     """Remove stuck, spiked and non-finite values, and estimate the noise of the rest.
 
     A sensor that repeats the same triple is stuck (its bus hangs); a value far from those before
     and after it is a spike (a misframed message). One of them can outweigh a whole pass.
+
+    Parameters
+    ----------
+    samples : Samples
+    is_running : bool
+        True if samples follow that are not known yet: the last ones are not called spikes, because
+        a field that begins to change looks like one.
 
     Raises
     ------
@@ -131,6 +138,8 @@ def preprocess(samples: Samples) -> PreprocessedSamples:
     # The noise is estimated without stuck samples, which have none.
     field = np.where(is_stuck[..., None], np.nan, field)
     is_spike = _spikes(field, estimate_noise(replace(samples, field_t=field)))
+    if is_running:
+        is_spike[-SPIKE_NEIGHBOURS:] = False
     if is_spike.any():
         message = f"{int(is_spike.sum())} values were spikes"
         warnings.append(SolverWarning("spikes", message).about(samples.device))

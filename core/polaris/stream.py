@@ -6,10 +6,14 @@ beyond doubt is reported at once. The others are reported, or refused, when the 
 would in :func:`.solver.solve`, by the same stages on a window of the newest samples. The pass of an
 early tag is solved again at its end, for further tags in it.
 
-A fix is the pose at the last sample over the tag whose position is well determined. Odometry
-carries the pose from there on, and the noise of its steps after that sample is not in the fix. (The
-pose in the middle of the tag is a little more accurate, but it was estimated from the path after it
-as well: a filter that adds the same odometry again would count its error twice.)
+A pass gives one fix. Its time is chosen so that a filter, which adds the odometry after it, counts
+no error twice:
+
+- If the path was estimated from the field, it is that of the last sample over the tag whose
+  position is well determined. No odometry is in the fix.
+- If odometry measured the path, it is that of the sample in the middle of the magnets. There, an
+  error of the scale of odometry has no effect, which has moved the last pose by half the length of
+  the tag times that error; the odometry after it is new to the fix.
 """
 
 from __future__ import annotations
@@ -45,6 +49,7 @@ from locatk.core.polaris.localization import (
     heading_correction,
     poses_over_tag,
 )
+from locatk.core.polaris.magnets import DetectedMagnets
 from locatk.core.polaris.preprocessing import (
     CHANGE_LAGS_SAMPLES,
     MIN_CHANGE_SIGMAS,
@@ -100,16 +105,16 @@ CHANGE_WINDOW_SAMPLES = 2 * max(CHANGE_LAGS_SAMPLES)
 MAX_SILENCE_S = 1.0
 """Time without samples after which a pass has ended [s]."""
 
-ROW_PASSED_RATIO = 0.6
+ROW_PASSED_RATIO = 0.8
 """Energy of the field relative to its last maximum from which a row of magnets is behind the array.
-A magnet at a distance r has r^-6 of it: at the usual height of 10 mm the array is 4 mm behind."""
+A magnet at a distance r has r^-6 of it: at the usual height of 10 mm the array is 3 mm behind."""
 
 RISE_RATIO = 1.5
 """Energy relative to its last minimum from which the next row approaches."""
 
-DECAY_RATIO = 0.1
+DECAY_RATIO = 0.3
 """Energy relative to that of the last attempt from which another one follows: the array has moved
-on by half its distance from the magnets."""
+on by a fifth of its distance from the magnets."""
 
 MIN_ROW_ENERGY = 200.0
 """Least energy of a maximum in units of the noise: a magnet explains 80 of several samples."""
@@ -264,7 +269,7 @@ class _RunningPass:
     peak, least : float
         Maximum of the energy while it rises, and minimum after that.
     attempt_energy, last_energy : float
-        Energies at the last early identification, and of the last sample.
+        Energies at the last early identification (0 if it was successful), and of the last sample.
     attempts : int
         Number of early identifications.
     early : EarlyTags or None
@@ -437,7 +442,7 @@ class _DeviceStream:
         if not np.isfinite(window.field_t).any():
             message = f"no sensor of {self.device} gives samples"
             return None, self._warn(self.last_ns, "no_samples", message)
-        preprocessed = preprocess(window)
+        preprocessed = preprocess(window, is_running=True)
         events: list[StreamEvent] = []
         for warning in preprocessed.warnings:
             # The numbers in parentheses are those of the window.
@@ -497,41 +502,28 @@ class _DeviceStream:
         running = self.running
         if running is None or not self.designs or self.noise_t is None:
             return []
-        events: list[StreamEvent] = []
-        if running.has_passed_row(bar_energy(field_t, running.level_t, self.noise_t)):
-            running.attempts += 1
-            preprocessed, events = self._preprocess(running.first - HISTORY_SAMPLES)
-            part, path_m = self._running_part(running, preprocessed)
-            if preprocessed is not None and part is not None:
-                known = len(self.reported) + 1
-                least = known * min(tags.magnets for tags in self.designs)
-                running.early = identify_running(preprocessed, part, self.designs, path_m, least)
-                running.checked = NEVER_NS
+        is_passed = running.has_passed_row(bar_energy(field_t, running.level_t, self.noise_t))
         number = self.samples.stop
-        if running.early is not None and number >= running.checked + CHECK_PERIOD_SAMPLES:
-            running.checked = number
-            preprocessed, more = self._preprocess(running.first - HISTORY_SAMPLES)
-            events += more
-            part, path_m = self._running_part(running, preprocessed)
-            if preprocessed is None or part is None:
-                return events
-            if is_beyond_doubt(running.early, preprocessed, part, path_m):
-                for observation in running.early.result.observations:
-                    events += self._report_tag(preprocessed.samples, observation)
-                running.early = None
-        return events
-
-    def _running_part(
-        self, running: _RunningPass, preprocessed: PreprocessedSamples | None
-    ) -> tuple[PassRange | None, Array | None]:
-        """Return the range of the running pass in a window, and the path if it is known."""
-        if preprocessed is None:
-            return None, None
+        is_check = running.early is not None and number >= running.checked + CHECK_PERIOD_SAMPLES
+        if not (is_passed or is_check):
+            return []
+        preprocessed, events = self._preprocess(running.first - HISTORY_SAMPLES)
+        if preprocessed is None or number - running.first < MIN_SAMPLES:
+            return events
         count = len(preprocessed.samples)
-        part = PassRange(count - (self.samples.stop - running.first), count)
-        if part.stop - part.first < MIN_SAMPLES:
-            return None, None
-        return part, known_path(self._given_path(preprocessed.samples.time_ns), part)
+        part = PassRange(count - (number - running.first), count)
+        path_m = known_path(self._given_path(preprocessed.samples.time_ns), part)
+        if is_passed:
+            running.attempts += 1
+            known = len(self.reported)
+            running.early = identify_running(preprocessed, part, self.designs, path_m, known)
+        running.checked = number
+        early = running.early
+        if early is not None and is_beyond_doubt(early, preprocessed, part, path_m):
+            running.early, running.attempt_energy = None, 0.0
+            for observation in early.result.observations:
+                events += self._report_tag(preprocessed.samples, early.result, observation)
+        return events
 
     def _given_path(self, time_ns: NDArray[np.int64]) -> Array | None:
         """Return the distance (n,) moved at samples, by speed or odometry; None without either."""
@@ -608,7 +600,7 @@ class _DeviceStream:
         for observation in current.observations:
             if observation.refused and is_cut:
                 observation = replace(observation, refused="pass_too_long")
-            events += self._report_tag(samples, observation)
+            events += self._report_tag(samples, current, observation)
         return events
 
     # ---- results
@@ -640,7 +632,9 @@ class _DeviceStream:
             )
         return events
 
-    def _report_tag(self, samples: Samples, observation: TagObservation) -> list[StreamEvent]:
+    def _report_tag(
+        self, samples: Samples, current: IdentifiedPass, observation: TagObservation
+    ) -> list[StreamEvent]:
         """Return the detection of a tag with its fix and heading correction, once in a pass."""
         tag_id, tags, time_ns = observation.tag_id, observation.tags, observation.magnets.time_ns
         if tag_id is None or tags is None:
@@ -668,7 +662,7 @@ class _DeviceStream:
             return events + self._warn(time_ns, "tag_not_on_site", message, message)
         if poses is None:
             return events
-        events.append(self._fix(poses))
+        events.append(self._fix(current.magnets, poses))
         if self.first_tag is None:
             events += self._correct_heading(time_ns, tag_id, pose)
             self.last_tag = (tag_id, pose, poses.select(slice(-1, None)))
@@ -695,10 +689,12 @@ class _DeviceStream:
         poses = None if pose is None else poses_over_tag(samples, observation, pose)
         return poses if poses is not None and len(poses.time_ns) else None
 
-    def _fix(self, poses: PlanarPoses) -> Fix:
-        """Return the last pose that is about as well determined as the best one."""
+    def _fix(self, magnets: DetectedMagnets, poses: PlanarPoses) -> Fix:
+        """Return the pose of a pass that serves a filter best (see the module)."""
         variance = poses.covariance[:, 0, 0] + poses.covariance[:, 1, 1]
         row = int(np.flatnonzero(variance <= MAX_VARIANCE_RATIO * variance.min())[-1])
+        if not magnets.is_path_estimated:
+            row = int(np.abs(poses.time_ns - magnets.time_ns).argmin())
         return Fix(
             device=self.device,
             frame=self._frame,

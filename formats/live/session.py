@@ -17,7 +17,7 @@ from itertools import groupby
 from typing import Any
 
 from locatk.core.errors import LocatkError
-from locatk.core.solution import SolverWarning
+from locatk.core.solution import SolverWarning, add_counts
 from locatk.core.streaming.events import (
     ArtifactUpdate,
     LiveEvent,
@@ -492,11 +492,18 @@ class LiveSession:
                 }
                 for each in sinks
             ],
-            "rejected": {}
-            if self._localizer is None
-            else getattr(self._localizer.stream, "rejected", {}),
+            "rejected": self._rejected(),
             "warnings": list(self._warnings),
         }
+
+    def _rejected(self) -> dict[str, int]:
+        """Return the observations that the stream did not use, and the fixes refused, by reason."""
+        if self._localizer is None:
+            return {}
+        own = getattr(self._localizer.stream, "rejected", {})
+        names = ("refused_fixes", "late_fixes", "bad_motions", "odometry_jumps")
+        counts = [health.counts for health in self._localizer.health.values()]
+        return add_counts(own, *({name: count[name] for name in names} for count in counts))
 
     @property
     def devices(self) -> dict[str, DeviceStatus]:

@@ -15,6 +15,7 @@ from locatk.formats.sinks.addresses import SinkAddress
 from locatk.formats.sinks.interface import LiveMessage
 from locatk.formats.sinks.mavlink_messages import Encoder, timesync_requests
 from locatk.formats.sinks.queued import QueuedSink
+from locatk.formats.sinks.udp import open_socket
 
 MIN_PERIOD_S = 0.02
 """Least time between two poses. ArduPilot drops those that come sooner (50 Hz)."""
@@ -169,14 +170,9 @@ class _UdpOut:
         self._receiver: Any = None
 
     def open(self) -> None:
-        found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)
-        found.sort(key=lambda each: each[0] != socket.AF_INET)
-        family, kind, protocol, _, receiver = found[0]
-        self._socket = socket.socket(family, kind, protocol)
+        self._socket, address = open_socket(self._host, self._port)
         self._socket.settimeout(READ_TIMEOUT_S)
-        if family == socket.AF_INET:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        self._begin(receiver)
+        self._begin(address)
 
     def _begin(self, address: Any) -> None:
         self._receiver = address

@@ -211,7 +211,8 @@ class Connection:
         greeting: Callable[[], list[Publication]],
         sink: QueuedSink,
     ) -> None:
-        from paho.mqtt.client import CallbackAPIVersion, Client
+        from paho.mqtt.client import Client
+        from paho.mqtt.enums import CallbackAPIVersion
 
         self.sent = self.dropped = 0
         self._greeting = greeting
@@ -231,7 +232,7 @@ class Connection:
             client.username_pw_set(broker.user, broker.password)
         if broker.uses_tls:
             client.tls_set(ca_certs=broker.ca)
-        client.on_socket_open = _limit_send_buffer
+        client.on_socket_open = _configure_socket
         client.on_connect = self._on_connect
         client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect
@@ -325,8 +326,10 @@ class Connection:
         self._is_accepted = False
 
 
-def _limit_send_buffer(client: Client, data: Any, opened: Any) -> None:
+def _configure_socket(client: Client, data: Any, opened: Any) -> None:
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+    # Nagle's algorithm holds a small message back until the one before is acknowledged.
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 Connect = Callable[[Publication, Callable[[], list[Publication]]], Connection]

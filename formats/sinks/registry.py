@@ -58,6 +58,12 @@ def create_sink(text: str) -> Sink:
     )
 
 
+def sink_summaries() -> dict[str, str]:
+    """Return the receiver of each sink by scheme, those of other packages included."""
+    foreign = {entry.name: entry.value for entry in entry_points(group=ENTRY_POINT_GROUP)}
+    return {**foreign, **{scheme: summary for scheme, (_, summary) in SINKS.items()}}
+
+
 def _create_foreign(factory: object, address: SinkAddress) -> Sink:
     if not callable(factory):
         raise InputError(f"the sink {address.scheme!r} is not callable")

@@ -535,7 +535,9 @@ class ServerSink:
                 await asyncio.wait_for(asyncio.shield(self._server.wait_closed()), rest_s)
         for client in self.clients:
             client.disconnect()
-        await asyncio.sleep(0)
+        deadline = loop.time() + CLOSE_TIMEOUT_S / 2
+        while self._clients and loop.time() < deadline:
+            await asyncio.sleep(0.001)
 
     async def _run_safely(self) -> None:
         try:
@@ -646,7 +648,9 @@ class ServerSink:
         is_health = path == "/health"
         if not (is_health or self.is_socket(path)):
             return _response(http.HTTPStatus.NOT_FOUND, "not found")
-        if not has_token and not (is_health and is_loopback(connection.remote_address[0])):
+        # Requests through a reverse proxy come from this machine, too.
+        is_local = not self._origins and is_loopback(connection.remote_address[0])
+        if not has_token and not (is_health and is_local):
             return _response(http.HTTPStatus.UNAUTHORIZED, "the token is missing or wrong")
         if is_health:
             health = self.health()

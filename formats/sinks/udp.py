@@ -6,6 +6,7 @@ import errno
 import math
 import socket
 import struct
+from typing import Any
 
 from locatk.core.streaming.events import LiveEvent, PoseEstimate, StateChange, TrackingState
 from locatk.formats.sinks.addresses import SinkAddress
@@ -52,18 +53,12 @@ class UdpSink(QueuedSink):
         self._is_packed = address.choice("format", "json", "packed") == "packed"
         super().__init__(address, f"udp://{address.host_and_port}")
         self._socket: socket.socket | None = None
-        self._receiver: tuple[object, ...] = ()
+        self._receiver: Any = None
         self._sequence = 0
 
     def start(self) -> None:
         """Resolve the name of the host."""
-        found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_DGRAM)
-        # IPv4 first: most receivers of udp://localhost listen there, and few on ::1.
-        found.sort(key=lambda each: each[0] != socket.AF_INET)
-        family, kind, protocol, _, self._receiver = found[0]
-        self._socket = socket.socket(family, kind, protocol)
-        if family == socket.AF_INET:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._socket, self._receiver = open_socket(self._host, self._port)
 
     def send(self, message: LiveMessage) -> int:
         """Send one datagram; a packed one only for poses and lost devices."""
@@ -88,6 +83,24 @@ class UdpSink(QueuedSink):
         """Close the socket."""
         if self._socket is not None:
             self._socket.close()
+
+
+def open_socket(host: str, port: int) -> tuple[socket.socket, Any]:
+    """Return a socket for datagrams to a host, also a broadcast address, and its address.
+
+    Raises
+    ------
+    OSError
+        The name of the host cannot be resolved.
+    """
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    # IPv4 first: most receivers on localhost listen there, and few on ::1.
+    found.sort(key=lambda each: each[0] != socket.AF_INET)
+    family, kind, protocol, _, address = found[0]
+    opened = socket.socket(family, kind, protocol)
+    if family == socket.AF_INET:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+    return opened, address
 
 
 def pack(event: LiveEvent, sequence: int) -> bytes | None:

@@ -76,6 +76,7 @@ class ZenohSink(QueuedSink):
         super().__init__(address, self._endpoint or "zenoh peers")
         self._session: Session | None = None
         self._node_token: Any = None
+        self._next_check_s = 0.0
         self._topics: dict[str, _Topic] = {}
 
     def prepare(self) -> None:
@@ -121,6 +122,10 @@ class ZenohSink(QueuedSink):
 
     def tick(self) -> float | None:
         """Look for a router or peer."""
+        pause_s = self._next_check_s - time.monotonic()
+        if pause_s > 0:
+            return pause_s
+        self._next_check_s = time.monotonic() + CHECK_PERIOD_S
         assert self._session is not None
         info = self._session.info
         self.clients = len(list(info.routers_zid())) + len(list(info.peers_zid()))
@@ -128,15 +133,9 @@ class ZenohSink(QueuedSink):
         return CHECK_PERIOD_S
 
     def stop(self) -> None:
-        """Withdraw the publishers, and close the session."""
-        if self._session is None:
-            return
-        for topic in self._topics.values():
-            topic.token.undeclare()
-            topic.publisher.undeclare()
-        if self._node_token is not None:
-            self._node_token.undeclare()
-        self._session.close()  # type: ignore[no-untyped-call]
+        """Close the session, with its publishers and tokens."""
+        if self._session is not None:
+            self._session.close()
 
     def _absence(self) -> str:
         return f"no router at {self._endpoint}" if self._endpoint else "no peer"
@@ -178,4 +177,5 @@ class ZenohSink(QueuedSink):
         topic.sequence += 1
         attachment = ATTACHMENT.pack(topic.sequence, time.time_ns(), 16, topic.identifier)
         topic.publisher.put(content, attachment=attachment)
-        return topic.publisher.matching_status.matching
+        status: Any = topic.publisher.matching_status
+        return bool(status.matching)

@@ -139,9 +139,10 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
         estimates = estimate_positions(rotor_angles(epochs), *stations, floor_z=floor_z)
         epochs, estimates, restored = restore_swapped_sweeps(epochs, estimates, stations, floor_z)
         gate = inlier_gate(estimates)
-        ideal = correct_angles(rotor_angles(epochs), stations[2])
-        estimates, repaired = leave_out_worst_station(ideal, estimates, stations, floor_z, gate)
-        rejected["station_contradicts_others"] += repaired
+        if len(selected) > 2:
+            ideal = correct_angles(rotor_angles(epochs), stations[2])
+            estimates, repaired = leave_out_worst_station(ideal, estimates, stations, floor_z, gate)
+            rejected["station_contradicts_others"] += repaired
 
     is_unsolved = ~np.isfinite(estimates.position[:, 0])
     is_inconsistent = ~is_unsolved & (estimates.max_residual > gate)

@@ -11,7 +11,7 @@ A single station over a floor whose scene has a floor homography uses that inste
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,7 +284,13 @@ def estimate_floor_positions(
     PositionEstimates
         The redundancy is 0 or less: nothing checks these positions.
     """
-    return project_on_floor(ideal_angles(angles[:, 0], calibration), calibration, floor_map, floor_z)
+    corrected = ideal_angles(angles[:, 0], calibration)
+    is_observed = np.isfinite(angles)
+    return replace(
+        project_on_floor(corrected, calibration, floor_map, floor_z),
+        residual=np.where(is_observed, 0.0, np.nan),
+        redundancy=np.count_nonzero(is_observed, axis=(1, 2)) - 2,
+    )
 
 
 def project_on_floor(

@@ -76,7 +76,7 @@ NOISE_FIXES = 512
 """Number of fixes from which noise and gate are estimated."""
 
 MIN_NOISE_FIXES = 30
-"""Fewest fixes with redundancy from which noise and gate are estimated."""
+"""Fewest fixes with redundancy from which noise and gate are estimated, and fewest new ones."""
 
 INITIAL_SIGMA_RAD = MIN_INLIER_GATE_RAD / INLIER_GATE_SIGMAS
 """Standard deviation of an angle before it is estimated [rad]."""
@@ -197,6 +197,7 @@ class PhotodiodeFixes:
         self.rejected = [0] * len(known.stations)
         self.restored = 0
         self._noise: deque[tuple[Array, int]] = deque(maxlen=NOISE_FIXES)
+        self._new_fixes = 0
         self._period = [float(period_counts(s.channel)) for s in known.stations]
 
     # ---- sweeps
@@ -279,7 +280,9 @@ class PhotodiodeFixes:
             age_ns = now_ns - other_pairs[-1].time_ns[1]
             if MAX_FIX_SPAN_NS < age_ns <= EXPECTED_STATION_NS and other not in self.known.excluded:
                 return
-        if len(self._members(state, now_ns)) >= self.known.min_stations:
+        # A position from a single station is checked by nothing: another one is waited for.
+        needed = max(self.known.min_stations, min(2, len(self.known.stations)))
+        if len(self._members(state, now_ns)) >= needed:
             self._make_due(state, now_ns, flush)
 
     def advance(self, time_ns: int, flush: Callable[[], None]) -> None:
@@ -369,8 +372,8 @@ class PhotodiodeFixes:
 
     # ---- positions
 
-    def solve_due(self) -> list[Fix | None]:
-        """Estimate the due fixes; None for each that is rejected."""
+    def solve_due(self) -> list[Fix]:
+        """Estimate the due fixes, and return the accepted ones in order."""
         due, self.due = self.due, []
         if not due:
             return []
@@ -379,9 +382,9 @@ class PhotodiodeFixes:
         ideal = np.full((len(due), s, 2), np.nan)
         angles = np.full((len(due), s, 2), np.nan)
         for row, fix in enumerate(due):
-            for (station, _), pair in zip(fix.members, fix.angle, strict=True):
-                angles[row, station] = pair
-                ideal[row, station] = known.corrections[station].ideal(*pair)
+            for (station, _), angle in zip(fix.members, fix.angle, strict=True):
+                angles[row, station] = angle
+                ideal[row, station] = known.corrections[station].ideal(*angle)
         if known.floor_map is not None:
             calibration = known.stations[0].calibration
             estimates = project_on_floor(
@@ -409,9 +412,10 @@ class PhotodiodeFixes:
             distance = np.linalg.norm(estimates.position[:, None] - known.arrays[0], axis=2)
             is_inconsistent = max_residual > self.gate_rad
             is_out_of_range = distance.min(axis=1) > MAX_RANGE_M
-        fixes = []
+        fixes: list[Fix] = []
         for row, fix in enumerate(due):
             self._noise.append((estimates.residual[row], int(estimates.redundancy[row])))
+            self._new_fixes += 1
             reason = ""
             if not is_solved[row]:
                 reason = "moment_with_too_few_sweeps"
@@ -433,7 +437,6 @@ class PhotodiodeFixes:
                     self.rejected[station] += 2
             if reason:
                 self._reject(reason, 1)
-                fixes.append(None)
                 continue
             fixes.append(
                 Fix(
@@ -493,8 +496,11 @@ class PhotodiodeFixes:
 
     def update_noise(self) -> None:
         """Estimate the noise of an angle and the gate from the last fixes, as offline."""
+        if self._new_fixes < MIN_NOISE_FIXES:
+            return
         if sum(redundancy > 0 for _, redundancy in self._noise) < MIN_NOISE_FIXES:
             return
+        self._new_fixes = 0
         n = len(self._noise)
         estimates = PositionEstimates(
             np.zeros((n, 3)),

@@ -21,6 +21,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,8 +113,7 @@ WINDOW_OVERLAP = 2.0
 """Number of windows that share a sweep."""
 
 
-@dataclass(frozen=True)
-class PlaneRow:
+class PlaneRow(NamedTuple):
     """Sweep as the plane on which its photodiode was."""
 
     time_ns: int
@@ -141,7 +141,7 @@ class PoseState:
         return PoseState(
             time_ns,
             self.position + self.rate[:3] * seconds,
-            _rotation(self.rate[3:] * seconds) @ self.rotation,
+            _rotation((self.rate[3:] * seconds).tolist()) @ self.rotation,
             self.rate,
             self.margin,
         )
@@ -164,6 +164,7 @@ class DeviceState:
     name: str
     receiver: Receiver
     has_position: list[bool]
+    levers: list[list[float]]
     planes: dict[int, PlaneTracker] = field(default_factory=dict)
     angles: dict[tuple[int, int, int], tuple[int, float]] = field(default_factory=dict)
     rows: deque[PlaneRow] = field(default_factory=lambda: deque(maxlen=MAX_SWEEPS_PER_WINDOW))
@@ -228,8 +229,10 @@ class RigidFixes:
         device = self._devices.get(name)
         if device is None:
             receiver = self._receivers[name]
-            has_position = np.isfinite(receiver.position_m).all(axis=1).tolist()
-            device = self._devices[name] = DeviceState(name, receiver, has_position)
+            has_position = [bool(np.all(np.isfinite(row))) for row in receiver.position_m]
+            device = self._devices[name] = DeviceState(
+                name, receiver, has_position, receiver.position_m.tolist()
+            )
         if not (0 <= sensor < len(device.has_position) and device.has_position[sensor]):
             self._reject("sensor_unknown", 1)
             return []
@@ -286,7 +289,7 @@ class RigidFixes:
                     r[0][0] * a + r[0][1] * b + r[0][2] * c,
                     r[1][0] * a + r[1][1] * b + r[1][2] * c,
                     r[2][0] * a + r[2][1] * b + r[2][2] * c,
-                    *device.receiver.position_m[sensor].tolist(),
+                    *device.levers[sensor],
                     *self._positions[station],
                     r[0][2],
                     r[1][2],
@@ -441,7 +444,7 @@ class RigidFixes:
             if not (size_m < MAX_POSITION_STEP_M and size_rad < MAX_ROTATION_STEP_RAD):
                 return None
             state.position = state.position + step[:3]
-            state.rotation = _rotation(step[3:6]) @ state.rotation
+            state.rotation = _rotation(step[3:6].tolist()) @ state.rotation
             state.rate = state.rate + step[6:]
             if -float(gradient @ step) < CONVERGED_COST:
                 break
@@ -460,11 +463,11 @@ class RigidFixes:
             self._reject("moment_with_too_few_sweeps", 1)
             return None
         information = fit.information + WEAK_INFORMATION * np.eye(12)
-        unit = np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2
+        unit = np.asarray(np.linalg.inv(information)[:6, :6] / fit.sigma_rad**2, np.float64)
         lasting = device.lasting_rad**2 + self.known.calibration_sigma_rad**2
         noise = max(device.sigma_rad**2 - device.lasting_rad**2, ANGLE_SIGMA_RAD**2 / 4)
         members = sorted({row.station for row in window})
-        common = ROTATIONS_PER_WINDOW * lasting * unit
+        common: Array = ROTATIONS_PER_WINDOW * lasting * unit
         common += self.known.errors.pose_covariance(fit.state.position, members)
         motion = 0.5 * acceleration * (0.5e-9 * self._window_ns) ** 2 / 3
         covariance = WINDOW_OVERLAP * noise * unit + common + np.outer(motion, motion)
@@ -591,9 +594,9 @@ def _residuals(planes: Array, elapsed_s: Array, state: PoseState) -> tuple[Array
     return (scaled * point).sum(axis=1), scaled, arm
 
 
-def _rotation(vector: Array) -> Array:
+def _rotation(vector: list[float]) -> Array:
     """Return the matrix of one rotation vector (3,); faster than ``rotation_exp`` for one."""
-    x, y, z = vector.tolist()
+    x, y, z = vector
     squared = x * x + y * y + z * z
     angle = math.sqrt(squared)
     sine = math.sin(angle) / angle if angle > 1e-8 else 1.0

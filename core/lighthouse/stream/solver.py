@@ -127,6 +127,7 @@ class LighthouseStream:
         self._odometry = OdometryStore()
         self._next_attempt_ns = FIRST_ATTEMPT_NS
         self._is_task_due = self._is_task_running = False
+        self._detected_sweeps = 0
         if self._prior.stations:
             self._use_scene(self._prior)
             for note in self._prior.notes:
@@ -246,7 +247,7 @@ class LighthouseStream:
     def _flush(self) -> None:
         """Estimate the positions that are due, before any later event."""
         if self._known is not None and self._photodiodes.due:
-            self._events.extend(f for f in self._photodiodes.solve_due() if f is not None)
+            self._events.extend(self._photodiodes.solve_due())
 
     # ---- time
 
@@ -286,10 +287,12 @@ class LighthouseStream:
             self._rigid.forget(now_ns - FORGET_NS)
 
     def _detect(self, now_ns: int) -> None:
-        self._events.extend(
-            DetectionEvent("", now_ns, detection)
-            for detection in self._supervision.detections(self._photodiodes, self._rigid)
-        )
+        """Report the stations, if they were received since the last time."""
+        detections = self._supervision.detections(self._photodiodes, self._rigid)
+        total = sum(each.sweeps + each.rejected for each in detections)
+        if total != self._detected_sweeps:
+            self._detected_sweeps = total
+            self._events.extend(DetectionEvent("", now_ns, each) for each in detections)
 
     def _check_channels(self) -> None:
         """Look for channels with several stations in the last sweeps."""

@@ -117,7 +117,7 @@ class StationSupervision:
                     "site, or robots move too fast between sweeps",
                 )
             )
-        self._is_contradicted = is_contradicted
+        self._is_contradicted |= is_contradicted
         return warnings
 
     def _check_epochs(self) -> Sequence[SolverWarning]:

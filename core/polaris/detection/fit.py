@@ -684,8 +684,8 @@ class PassProblem:
             state.height_m,
         )
 
-    def clusters(self, state: PassState) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return two partitions (C, n) of the samples, by the number of the cluster.
+    def clusters(self, state: PassState) -> tuple[csr_array, csr_array]:
+        """Return two partitions of the samples, as matrices (clusters, C n) of ones.
 
         Samples of a cluster may have errors in common: a sensor over a stretch of the path (field
         of a magnet), and a sensor over the whole path (its gains and axes).
@@ -693,7 +693,12 @@ class PassProblem:
         length = CLUSTER_HEIGHTS * state.height_m
         stretch = np.floor((state.path_m - state.path_m.min()) / length).astype(np.intp)
         sensor = np.arange(self.shape[0])[:, None] // 3
-        return sensor * (int(stretch.max()) + 1) + stretch, sensor + 0 * stretch
+        partitions = (sensor * (int(stretch.max()) + 1) + stretch, sensor + 0 * stretch)
+        first, second = (
+            csr_array((np.ones(each.size), (each.ravel(), np.arange(each.size))))
+            for each in partitions
+        )
+        return first, second
 
     def local_step(self, state: PassState) -> Array:
         """Return the step (n,) of a sample period around each sample, by a running median."""
@@ -701,7 +706,9 @@ class PassProblem:
             return np.full(len(state.path_m), state.mean_step_m)
         steps = np.diff(state.path_m) / self.gaps
         padded = np.concatenate([steps[:1], steps[:1], steps, steps[-1:], steps[-1:]])
-        return np.median(np.lib.stride_tricks.sliding_window_view(padded, 4), axis=1)
+        # Sorting four values takes a quarter of the time of numpy's median, with the same result.
+        ascending = np.sort(np.lib.stride_tricks.sliding_window_view(padded, 4), axis=1)
+        return np.asarray((ascending[:, 1] + ascending[:, 2]) / 2)
 
     def project(self, state: PassState) -> ProjectedState:
         """Solve for the moments and backgrounds, given all other unknowns."""
@@ -1016,9 +1023,10 @@ def _test_nuisances(
     min_gain = MIN_EXPLAINED_FRACTION * max(excess, 0.0)
     base = solve_scaled(reduced.hessian, reduced.descent)
     evidence, changes = np.zeros(len(motions)), np.zeros((len(base), len(motions)))
+    clusters, sigmas = problem.clusters(state), motion.group_sigmas
     for k, name in enumerate(motions):
         evidence[k], changes[:, k] = _test_motion(
-            problem, projected, reduced, base, indices[name], motion.group_sigmas[name], min_gain
+            projected, reduced, base, indices[name], sigmas[name], min_gain, clusters
         )
     significant = None
     build_gains = {
@@ -1066,13 +1074,13 @@ def _build_gain(
 
 
 def _test_motion(
-    problem: PassProblem,
     projected: ProjectedState,
     reduced: ReducedEquations,
     base: Array,
     own: NDArray[np.intp],
     sigmas: Array,
     min_gain: float,
+    clusters: tuple[csr_array, ...],
 ) -> tuple[float, Array]:
     """Return the evidence for a motion, and the change (q,) of the unknowns by it.
 
@@ -1100,20 +1108,15 @@ def _test_motion(
         rows = changes[..., 1:] @ inverse_root.T * remaining[..., None]
         unit = max(
             1.0,
-            *(
-                float((cluster_sums(each, rows) ** 2).sum(axis=0).mean())
-                for each in problem.clusters(projected.state)
-            ),
+            *(float((cluster_sums(each, rows) ** 2).sum(axis=0).mean()) for each in clusters),
         )
         evidence = gain / unit - (occam - len(own) * np.log(unit))
     return evidence, solved[:, 0] - base
 
 
-def cluster_sums(clusters: NDArray[np.intp], rows: Array) -> Array:
-    """Return the sums (K, k) of rows (C, n, k) over the clusters (C, n) 0 to K - 1."""
-    index = clusters.ravel()
-    members = csr_array((np.ones(len(index)), (index, np.arange(len(index)))))
-    return np.asarray(members @ rows.reshape(len(index), -1))
+def cluster_sums(clusters: csr_array, rows: Array) -> Array:
+    """Return the sums (K, k) of rows (C, n, k) over K clusters."""
+    return np.asarray(clusters @ rows.reshape(clusters.shape[1], -1))
 
 
 def _nuisance_indices(
@@ -1172,7 +1175,7 @@ def _result(
 
 
 def _covariances(
-    tests: NuisanceTests, residual: Array, clusters: tuple[NDArray[np.intp], ...]
+    tests: NuisanceTests, residual: Array, clusters: tuple[csr_array, ...]
 ) -> dict[str, Any]:
     """Return the attributes of :class:`PassFit` that describe the accuracy.
 

@@ -202,11 +202,30 @@ class RunningPass:
     priors: PassPriors
     coarse: PassFit
 
-    @property
-    def magnet_count(self) -> int:
-        """Number of sources of the array's path that are as strong as magnets of one kind."""
-        moment = _horizontal_moments(self.coarse.state)
-        return int(np.count_nonzero(moment > MIN_MOMENT_RATIO * np.median(moment)))
+    def coarse_magnets(self) -> DetectedMagnets:
+        """Return the magnets of the coarse fit, without covariance, in its frame.
+
+        Raises
+        ------
+        DegenerateError
+            There are none under the bar.
+        """
+        state = self.coarse.state
+        chosen = _magnet_indices(self.prepared, self.coarse)
+        moment = state.moment_am2[chosen]
+        return DetectedMagnets(
+            time_ns=0,
+            first=self.prepared.first,
+            stop=self.prepared.first + self.prepared.sample_count,
+            path_m=state.path_m,
+            position_m=state.position_m[chosen],
+            angle_rad=np.arctan2(moment[:, 1], moment[:, 0]),
+            moment_am2=np.hypot(moment[:, 0], moment[:, 1]),
+            covariance=np.full((3 * len(chosen),) * 2, np.nan),
+            path_sigma_m=np.full(len(state.path_m), np.nan),
+            is_path_estimated=self.prepared.window.path_m is None,
+            height_m=state.height_m,
+        )
 
 
 def detect_magnets(

@@ -13,6 +13,7 @@ The frame of the floor is that of the bar at :attr:`Motion.middle_m`, except for
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -195,8 +196,7 @@ class Motion:
         unit = (path_m - self.middle_m) / self.half_length_m
         basis, _ = _direction_basis(unit)
         limit = max(1.0, float(np.abs(unit).max()))
-        grid = np.linspace(-limit, limit, GRID_POINTS)
-        grid_basis, _ = _direction_basis(grid)
+        grid_basis = _grid_basis(limit)
         direction, grid_direction = basis @ bend, grid_basis @ bend
         cos, sin = np.cos(grid_direction), np.sin(grid_direction)
         slopes = np.column_stack([cos, sin, -sin[:, None] * grid_basis, cos[:, None] * grid_basis])
@@ -289,6 +289,14 @@ def _rotations(roll_pitch_yaw: Array) -> Array:
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
         [-sp, cp * sr, cp * cr],
     ]).transpose(2, 0, 1)  # fmt: skip
+
+
+@functools.lru_cache(maxsize=16)
+def _grid_basis(limit: float) -> Array:
+    """Return the polynomials (points, k) on a grid from ``-limit`` to ``limit``."""
+    basis, _ = _direction_basis(np.linspace(-limit, limit, GRID_POINTS))
+    basis.flags.writeable = False
+    return basis
 
 
 def _direction_basis(unit: Array) -> tuple[Array, Array]:

@@ -40,6 +40,7 @@ from locatk.core.polaris.identification.evidence import (
     MAX_COINCIDENCE_PROBABILITY,
     lattice_ahead,
 )
+from locatk.core.polaris.identification.matching import match_tags
 from locatk.core.polaris.identification.tags import (
     IdentifiedPass,
     TagObservation,
@@ -84,7 +85,7 @@ def identify_running(
     part: PassRange,
     designs: Sequence[Tags],
     path_m: Array | None = None,
-    min_magnets: int = 0,
+    known: int = 0,
 ) -> EarlyTags | None:
     """Identify the tags of a pass that has not ended; None if they are incomplete or in doubt.
 
@@ -98,12 +99,12 @@ def identify_running(
         Designs that may be on the floor, the expected one first.
     path_m : (n,) ndarray, optional
         Distance that the array had moved at each sample of the recording.
-    min_magnets : int
-        Number of magnets below which there is nothing new.
+    known : int
+        Number of tags of the pass that were identified before; more are looked for.
     """
 
     def identify(path: Array | None, scale: float = 1.0) -> EarlyTags | None:
-        return _identify_with(preprocessed, part, designs, path, scale, min_magnets)
+        return _identify_with(preprocessed, part, designs, path, scale, known)
 
     early = identify(path_m)
     if path_m is None:
@@ -120,15 +121,17 @@ def _identify_with(
     designs: Sequence[Tags],
     path_m: Array | None,
     scale: float,
-    min_magnets: int,
+    known: int,
 ) -> EarlyTags | None:
     samples, tags = preprocessed.samples, designs[0]
     scaled = None if path_m is None else scale * path_m
     running = detect_running_pass(preprocessed, part, tags, scaled)
-    least = max(min_magnets, min(each.magnets for each in designs))
-    if running is None or running.magnet_count < least:
+    if running is None:
         return None
     try:
+        # The final fit of an incomplete tag would take as long as that of a complete one.
+        if _count_complete_grids(running.coarse_magnets(), designs) <= known:
+            return None
         hypothesis = refine_running_pass(samples, running)
     except DegenerateError:
         return None
@@ -140,6 +143,24 @@ def _identify_with(
         return None
     result = IdentifiedPass(magnets, observations)
     return EarlyTags(tags, hypothesis, result, path_m is not None, scale)
+
+
+def _count_complete_grids(magnets: DetectedMagnets, designs: Sequence[Tags]) -> int:
+    """Return the number of tags whose magnets may all be among those of a pass."""
+    used: frozenset[int] = frozenset()
+    count = 0
+    while True:
+        complete = (
+            match
+            for tags in designs
+            for match in match_tags(magnets, tags, used)
+            if len(match.cells) == tags.magnets
+        )
+        match = next(complete, None)
+        if match is None:
+            return count
+        used |= frozenset(match.magnets)
+        count += 1
 
 
 def _is_complete(observation: TagObservation) -> bool:

@@ -28,7 +28,7 @@
   let dirty = true, tableDue = 0;
   let version = 0;  // Increases when the artifact or the colors change.
   const view = { x: 0, y: 0, scale: 100, plane: 1, frame: "", follow: "", auto: true,
-                 labels: true, trail_s: 30, cursor: null };
+                 labels: true, trail_s: 30, cursor: null, isFrameChosen: false };
 
   // ---- messages
 
@@ -139,8 +139,13 @@
     let old = 0;
     while (old < trail.length && trail[old].t < pose.time_s - MAX_TRAIL_S) old++;
     if (old > 50) trail.splice(0, old);
-    if (!view.frame) setFrame(pose.frame);
-    if (device.name === view.follow && pose.frame !== view.frame) setFrame(pose.frame);
+    if (pose.frame !== view.frame && (device.name === view.follow || isFrameEmpty())) setFrame(pose.frame);
+  }
+
+  // Whether no device is in the frame of the map, which the user has not chosen.
+  function isFrameEmpty() {
+    return !view.isFrameChosen &&
+      ![...devices.values()].some((each) => each.pose && each.pose.frame === view.frame);
   }
 
   function takeState(message) {
@@ -162,6 +167,8 @@
     banner.hidden = state !== "lost";
     if (state === "lost") {
       $("health").hidden = true;
+      $("facts").replaceChildren(element("dt", "", "unknown without a connection"), element("dd"));
+      for (const device of devices.values()) device.rate = device.latency = null;
       banner.textContent = "Connection lost at " + clock(lostSince) +
         ". All positions are old. Trying again until locatk live answers" +
         (token ? "; after a restart it prints a new address." : ".");
@@ -232,6 +239,7 @@
     size.ratio = ratio;
     canvas.width = Math.round(size.width * ratio);
     canvas.height = Math.round(size.height * ratio);
+    if (view.auto) fit();
     dirty = true;
   }
 
@@ -255,7 +263,7 @@
     return low[0] <= high[0] ? { low, high } : null;
   }
 
-  const MARGIN = { left: 64, right: 56, top: 60, bottom: 52 };
+  const MARGIN = { left: 72, right: 64, top: 68, bottom: 60 };
 
   function fit() {
     const box = bounds();
@@ -276,7 +284,7 @@
     const [right, top] = toScreen(box.high[0], box.high[1], box.high[1]);
     const tooSmall = right - left < 0.4 * size.width && bottom - top < 0.4 * size.height &&
       Math.max(box.high[0] - box.low[0], box.high[1] - box.low[1]) > 0.1;
-    if (left < 20 || top < 40 || right > size.width - 20 || bottom > size.height - 30 || tooSmall) fit();
+    if (left < 20 || top < 50 || right > size.width - 20 || bottom > size.height - 30 || tooSmall) fit();
   }
 
   function zoom(factor, x, y) {
@@ -624,6 +632,8 @@
       c.globalAlpha = 1;
     }
     $("empty").hidden = shown.length > 0 || connection === "lost";
+    const hasPoses = [...devices.values()].some((device) => device.pose);
+    set($("empty"), hasPoses ? "No device is in this frame" : "Waiting for the first pose");
     document.body.dataset.drawn = Number(document.body.dataset.drawn || 0) + 1;
   }
 
@@ -792,8 +802,9 @@
       const pose = device.pose, [x, y] = toScreen(pose.x_m, pose.y_m, pose.z_m);
       if (x < -60 || y < -20 || x > size.width || y > size.height + 20) continue;
       const old = isOld(device, now);
-      const state = device.state !== "tracking" ? device.state
-        : old ? age((now - device.received) / 1000) + " old" : "";
+      const state = device.state === "lost" ? "lost"
+        : old ? age((now - device.received) / 1000) + " old"
+        : device.state === "tracking" ? "" : device.state;
       const name = device.name.length > 24 ? device.name.slice(0, 23) + "…" : device.name;
       const text = state ? `${name} · ${state}` : name;
       if (!isFree(x + 14, y - 14, 6.8 * text.length, 14)) continue;
@@ -995,7 +1006,7 @@
       }
       if ((key === "ok" && value === true) || (/error/.test(key) && !value) || value === null) continue;
       const isBad = key === "ok" || /error/.test(key) || (/dropped|lost/.test(key) && value > 0);
-      own.push(element("dt", "", key.replaceAll("_", " ")));
+      own.push(element("dt", "", key.replace(/_(s|m|hz|rad)$/, " [$1]").replaceAll("_", " ")));
       own.push(element("dd", isBad ? "bad" : "", factText(value)));
     }
     if (heading && own.length) nodes.push(element("dt", "group", heading));
@@ -1108,7 +1119,11 @@
   $("fit").onclick = showAll;
   toggle($("plane"), (pressed) => { view.plane = pressed ? 2 : 1; view.auto = true; fit(); });
   toggle($("labels"), (pressed) => { view.labels = pressed; });
-  $("frame").onchange = (event) => { follow(""); setFrame(event.target.value); };
+  $("frame").onchange = (event) => {
+    follow("");
+    view.isFrameChosen = true;
+    setFrame(event.target.value);
+  };
   $("follow").onchange = (event) => follow(event.target.value);
   $("trail").onchange = (event) => { view.trail_s = Number(event.target.value); dirty = true; };
   $("detections").onchange = (event) => $("events").classList.toggle("no-detections", !event.target.checked);

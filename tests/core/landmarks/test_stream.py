@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import math
@@ -297,13 +298,13 @@ def test_wrong_floor_never_becomes_certain() -> None:
 
 @pytest.mark.slow
 def test_kidnapped_robot_is_found_again() -> None:
-    second = drive(OTHER_ROUTE, seed=2)
+    second = drive((), waypoints=((1.75, 1.83), (1.75, 1.6), (0.9, 1.6), (0.9, 1.0)), seed=2)
     samples, odometry = carried(drive(), second)
     events = live(LandmarksStream(FLOOR), in_time(samples, odometry))
     start_ns = int(samples.time_ns[np.flatnonzero(np.diff(samples.time_ns) > 4e8)[0]])
     after = [fix for fix in fixes(events) if fix.time_ns > start_ns]
     certain = [fix for fix in after if fix.probability >= PROVISIONAL_PROBABILITY]
-    shift_ns = int(samples.time_ns[len(drive().samples[0])])
+    shift_ns = int(samples.time_ns[len(drive().samples[0])] - second.samples[0].time_ns[0])
     assert certain
     for fix in certain:
         true = pose_at(second.truth[0], fix.time_ns - shift_ns)
@@ -312,20 +313,22 @@ def test_kidnapped_robot_is_found_again() -> None:
 
 @pytest.mark.slow
 def test_robot_that_returns_revises_its_visit() -> None:
-    """It leaves a landmark, and returns to it: one visit more, not two readings of it."""
-    one = drive(((2, 2), (2, 3), (2, 2), (2, 3), (2, 4), (2, 5)), stop_s=0.0)
-    events = live(LandmarksStream(FLOOR), in_time(one.samples[0], one.odometry[0]))
+    """It leaves a landmark and returns to it: the filter has one reading of it, as offline."""
+    one = drive((), waypoints=((0.3, 0.4), (0.68, 0.4), (0.52, 0.4), (1.3, 0.4)), stop_s=0.0)
+    visits = left_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
+    assert [visit.is_revised for visit in visits].count(True) >= 1
+    stream = LandmarksStream(FLOOR)
+    events = live(stream, in_time(one.samples[0], one.odometry[0]))
     offline = solve(one.samples, FLOOR, odometry=one.odometry)
-    expected = [each.cell for each in offline.detections if each.cell is not None]
-    cells = [each.cell for each in detections(events) if each.cell is not None]
-    assert cells[-1] == expected[-1]
-    assert set(cells) <= set(expected)
-    wrong = [
-        fix
-        for fix in fixes(events)
-        if np.abs(difference(pose_of(fix), pose_at(one.truth[0], fix.time_ns)))[:2].max() > 0.01
-    ]
-    assert not wrong
+    assert len(detections(events)) > len(offline.detections)
+    cells = stream._robots["robot"].cells
+    assert cells is not None
+    assert len(cells.model.visits) == len(offline.detections)
+    expected = [each.cell for each in offline.detections]
+    assert all(each.cell in expected for each in detections(events) if each.cell is not None)
+    for fix in fixes(events):
+        error = difference(pose_of(fix), pose_at(one.truth[0], fix.time_ns))
+        assert np.abs(error[:2]).max() < 0.01
 
 
 # ---- cuts and interleaving
@@ -397,32 +400,29 @@ def test_visits_do_not_depend_on_cuts_and_interleaving(seed: int) -> None:
 @settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_events_do_not_depend_on_cuts_and_interleaving(seed: int) -> None:
-    one, stream, events = drive(), LandmarksStream(FLOOR), []
-    for piece in random_pieces(
-        one.samples[0],
-        one.odometry[0],
-        seed,
-        lambda time_ns: events.extend(stream.advance(time_ns)),
-    ):
-        events += stream.push(piece)
+    one, stream = drive(), LandmarksStream(FLOOR)
+    events: list[StreamEvent] = []
+
+    def advance(time_ns: int) -> None:
+        events.extend(stream.advance(time_ns))
+
+    for piece in random_pieces(one.samples[0], one.odometry[0], seed, advance):
+        events.extend(stream.push(piece))
     events += stream.finish()
     assert exact(events) == exact(list(live_drive()))
 
 
+@pytest.mark.slow
 def test_advance_releases_a_visit_without_later_samples() -> None:
     """After the sensors fell silent, odometry shows that the robot has left."""
-    one = drive()
+    one = drive(((2, 2), (2, 3)), stop_s=0.0)
     samples, odometry = one.samples[0], one.odometry[0]
     whole = left_visits(new_visit_stream(), in_time(samples, odometry))
-    # Silent as soon as the fields of the first landmark have ended.
-    strongest = np.abs(samples.field_t).max(axis=1) > 9.5e-4
-    count = int(np.flatnonzero(strongest[:-1] & ~strongest[1:])[-1]) + 1
-    first_ns = whole[0].segment.time_ns[-1]
-    count = int(np.searchsorted(samples.time_ns, first_ns))
+    count = whole[0].segment.stop  # The first landmark has just been left.
     stream = new_visit_stream()
     stream.push_samples(part(samples, 0, count))
     stream.push_odometry(odometry)
-    assert not list(stream.visits())
+    assert not list(stream.visits())  # Another sample may follow.
     released = list(stream.visits(int(odometry.time_ns[-1])))
     assert [visit.segment.first for visit in released] == [whole[0].segment.first]
 
@@ -444,6 +444,7 @@ def test_robots_do_not_influence_each_other() -> None:
 # ---- segments
 
 
+@pytest.mark.slow
 def test_segments_begin_as_offline() -> None:
     one = drive()
     recording = preprocess(one.samples[0], one.odometry[0])
@@ -489,6 +490,7 @@ def test_statistics_agree_with_the_offline_preprocessing() -> None:
     assert not statistics.is_silent.any()
 
 
+@pytest.mark.slow
 def test_statistics_follow_an_offset_that_drifts() -> None:
     sensors = drive().samples[0].sensors
     statistics, random = SensorStatistics(sensors), np.random.default_rng(3)
@@ -548,14 +550,14 @@ def test_lag_of_the_odometry_is_removed() -> None:
 
 @pytest.mark.slow
 def test_wrong_order_of_the_sensors_is_named_by_a_task() -> None:
-    one = drive(faults=Faults(swapped=(("front", "left"),)))
+    one = drive(((2, 2), (2, 4), (4, 4)), faults=Faults(swapped=(("front", "left"),)))
     stream = LandmarksStream(FLOOR)
     events = [
         event for piece in in_time(one.samples[0], one.odometry[0]) for event in stream.push(piece)
     ]
     assert not [fix for fix in fixes(events) if fix.probability >= PROVISIONAL_PROBABILITY]
-    task = stream.background_task()
-    assert task is not None
+    tasks = list(iter(stream.background_task, None))
+    (task,) = [each for each in tasks if each.name == "sensors of robot"]
     function, arguments = pickle.loads(pickle.dumps((task.function, task.arguments)))
     with pytest.raises(InputError, match="wrong order") as error:
         function(*arguments)
@@ -573,15 +575,15 @@ def test_scale_of_the_readings_is_corrected_by_a_task() -> None:
     stream, events, tasks = LandmarksStream(FLOOR), [], 0
     for piece in in_time(samples, one.odometry[0]):
         events += stream.push(piece)
-        task = stream.background_task()
-        if task is not None:
-            tasks += 1
+        for task in iter(stream.background_task, None):
+            tasks += task.name == "sensors of robot"
             events += stream.complete(task, task.function(*task.arguments))
     assert warning_codes(events).count("sensor_scale") == 1
     assert fixes(events)[-1].probability >= PROVISIONAL_PROBABILITY
-    assert tasks <= 3
+    assert tasks == 1
 
 
+@pytest.mark.slow
 def test_opposite_polarity_is_reported_by_a_task() -> None:
     visits = tuple(
         stream_module.IdentifiedVisit(None, visit)  # type: ignore[arg-type]
@@ -664,7 +666,7 @@ def test_memory_does_not_grow_on_a_long_drive(monkeypatch: pytest.MonkeyPatch) -
     known = _visits_of_the_drive()
 
     def detect(segment: Any, *_: Any) -> VisitHypotheses:
-        one = known[len(sizes) % len(known)]
+        one = copy.deepcopy(known[len(sizes) % len(known)])
         time_ns = int(segment.time_ns[segment.trace.reference])
         return replace(one, time_ns=time_ns, odometry=segment.origin)
 
@@ -683,7 +685,7 @@ def test_memory_does_not_grow_while_a_robot_stays_on_a_landmark(
     monkeypatch: pytest.MonkeyPatch, is_turning: bool
 ) -> None:
     monkeypatch.setattr(visit_stream, "MAX_ROWS", 2000)
-    count, random = 40_000, np.random.default_rng(4)
+    count, random = 16_000, np.random.default_rng(4)
     time_ns = np.arange(count) * 10_000_000
     sensors = drive().samples[0].sensors
     field = 0.01 + 1e-4 * random.standard_normal((count, 4))
@@ -707,10 +709,13 @@ def test_memory_does_not_grow_while_a_robot_stays_on_a_landmark(
         visits += len(list(stream.visits()))
         sizes.append(len(pickle.dumps(stream)))
     assert max(sizes) < 1.5e6
-    assert max(sizes[-200:]) <= 1.02 * max(sizes[200:-200])
+    assert max(sizes[-100:]) <= 1.02 * max(sizes[100:-100])
     assert (visits > 5) == is_turning
+    if not is_turning:
+        assert stream._rows.size < visit_stream.MAX_STEP_ROWS + 100
 
 
+@pytest.mark.slow
 def test_observations_that_wait_for_others_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(visit_stream, "MAX_WAITING_NS", 1_000_000_000)
     one = drive()

@@ -207,6 +207,26 @@ def test_keys_and_buttons_change_the_view(servers: ModuleType, browser: Any) -> 
         assert browser.console == []
 
 
+def test_the_map_shows_the_frame_with_poses(servers: ModuleType, browser: Any) -> None:
+    with servers.running(create, "web://:0", context()) as sink:
+        browser.open(sink.url)
+        browser.wait("document.body.dataset.connection === 'live'")
+        frame = "document.getElementById('frame')"
+        assert browser.evaluate(f"{frame}.value + {frame}.hidden") == "floortrue"
+        servers.offer(sink, servers.pose("b", frame="elsewhere"))
+        browser.wait(f"{frame}.value === 'elsewhere' && !{frame}.hidden")
+        servers.offer(sink, servers.pose("c", frame="floor"))
+        browser.wait(f"({ROW % 2}).includes('tracking')")
+        assert browser.evaluate(f"{frame}.value") == "elsewhere"
+        browser.evaluate(f"{frame}.value = 'floor'; {frame}.onchange({{target: {frame}}})")
+        servers.offer(sink, servers.pose("c", frame="third"))
+        text = "document.getElementById('empty')"
+        browser.wait(f"!{text}.hidden && {text}.innerText.includes('No device is in this frame')")
+        browser.wait(f"[...{frame}.options].some(each => each.value === 'third')")
+        assert browser.evaluate(f"{frame}.value") == "floor"
+        assert browser.console == []
+
+
 def test_a_phone_shows_all_without_scrolling_sideways(servers: ModuleType, browser: Any) -> None:
     with servers.running(create, "web://:0", context()) as sink:
         browser.open(sink.url, width=390, height=844)

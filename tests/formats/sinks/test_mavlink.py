@@ -224,6 +224,8 @@ def test_requests_in_a_stream_with_noise(dialect: Any) -> None:
         # Frames that are damaged, and bytes between frames without a start.
         broken = bytearray(new.timesync_encode(0, 10_000 + k).pack(new))
         broken[12] ^= 0x40
+        # The start of a frame that is none would take in the request after it.
+        broken += bytes([0xFD, 16, 0, 0, 0, 1, 1, mavlink_messages.TIMESYNC, 0, 0])
         stream += bytes(broken) + bytes(rng.randrange(0xF0) for _ in range(k % 5))
         expected.append(k)
     buffer, received = bytearray(), []
@@ -325,5 +327,9 @@ def test_bad_addresses_are_refused(text: str, words: str) -> None:
 
 
 def test_payload_sizes() -> None:
+    # Zeros at the end are left out, except for the first byte.
+    encoder = mavlink_messages.Encoder(1)
+    assert encoder.timesync(1, 0)[1] == 1
+    assert encoder.timesync(0, 0)[1] == 1
     assert mavlink_messages._ODOMETRY.size == 233
     assert mavlink_messages._VISION.size == 117

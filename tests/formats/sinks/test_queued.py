@@ -78,8 +78,12 @@ def test_many_devices_keep_a_pose_each(live: ModuleType, sink: Any) -> None:
     live.offer(sink, live.pose(0, "first"))
     assert sink.entered.wait(5)
     devices = queued.CAPACITY + 500
+    thinned = []
+    thin = sink._thin
+    sink._thin = lambda: (thinned.append(1), thin())
     for k in range(2):
         live.offer(sink, *(live.pose(k, f"robot{n}") for n in range(devices)))
+    assert len(thinned) < 5  # It takes time for so many.
     sink.gate.set()
     sink.close(5)
     assert {each.device for each in sink.received[1:] if each.position[0] == 1} == {
@@ -127,6 +131,34 @@ def test_busy_receiver_gets_everything_in_order(live: ModuleType, sink: Any) -> 
     sink.close(5)
     assert sink.received == events
     assert sink.status().error == ""
+
+
+def test_order_of_messages_that_come_while_others_are_refused(live: ModuleType, sink: Any) -> None:
+    sink.failure = queued.Busy()
+    sink.gate.clear()
+    sink.open(SinkContext("dots"))
+    events = [live.pose(k) for k in range(6)]
+    live.offer(sink, *events[:3])
+    assert sink.entered.wait(5)
+    live.offer(sink, *events[3:])
+    sink.gate.set()
+    live.wait_for(lambda: sink.attempts > 2)
+    sink.failure = None
+    sink.close(5)
+    assert sink.received == events
+
+
+def test_no_wake_up_is_missed(live: ModuleType, sink: Any) -> None:
+    calls: list[int] = []
+
+    def tick() -> None:
+        calls.append(1)
+        if len(calls) < 5:
+            sink.wake()  # as another thread does before the sink waits
+
+    sink.tick = tick
+    sink.open(SinkContext("dots"))
+    live.wait_for(lambda: len(calls) == 5)
 
 
 def test_receiver_that_comes_later(

@@ -167,6 +167,7 @@ def test_servers_end_with_a_hung_client_and_share_a_thread(servers: ModuleType, 
     for k in range(2000):
         servers.offer(second, servers.pose(k=k))
     second.close(0.5)
+    assert second.status().clients == 0
     assert threads() == 1
     assert servers.request(first, "/health")[0] in (200, 503)
     first.close(0.5)
@@ -328,6 +329,9 @@ def test_a_reverse_proxy_is_named_and_needs_a_token(servers: ModuleType, connect
         assert status_of(connect, with_token, origin="https://robots.example") == 101
         assert status_of(connect, with_token, origin="https://evil.example") == 403
         assert servers.request(sink, "/", {"Host": "robots.example"})[0] == 200
+        # What the proxy passes on comes from this machine, but is not of its users.
+        assert servers.request(sink, "/health")[0] == 401
+        assert servers.request(sink, f"/health?token={sink.token}")[0] == 503
 
 
 def test_health_has_the_status_of_the_session(servers: ModuleType) -> None:

@@ -116,6 +116,20 @@ def test_ipv6(live: ModuleType, receive: Any, opened: Any) -> None:
     assert sink.status().address.startswith("udp://[::1]:")
 
 
+def test_ipv4_comes_first(
+    live: ModuleType, receive: Any, opened: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    receiver = receive()
+    port = receiver.getsockname()[1]
+    answers = [
+        (socket.AF_INET6, socket.SOCK_DGRAM, 17, "", ("::1", port, 0, 0)),
+        (socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", port)),
+    ]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_options: list(answers))
+    live.offer(opened(f"udp://localhost:{port}"), live.pose(3))
+    assert json.loads(receiver.recv(65536))["x_m"] == 3
+
+
 def test_multicast(live: ModuleType, receive: Any, opened: Any) -> None:
     receiver = receive(host="0.0.0.0")
     group = socket.inet_aton("239.255.77.7") + socket.inet_aton("0.0.0.0")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from types import ModuleType
 from typing import Any
 
@@ -40,6 +41,7 @@ class Page:
     def __init__(self, sink: Any, servers: ModuleType) -> None:
         self._address = f"ws://127.0.0.1:{servers.port_of(sink)}/ws"
         self.messages: list[dict[str, Any]] = []
+        self._end_s = time.monotonic() + 30
 
     def __enter__(self) -> Page:
         connect = pytest.importorskip("websockets.sync.client").connect
@@ -52,6 +54,7 @@ class Page:
         self._connection.__exit__(*error)
 
     def read(self) -> dict[str, Any]:
+        assert time.monotonic() < self._end_s, "the expected message does not come"
         message: dict[str, Any] = json.loads(self._socket.recv(timeout=10))
         self.messages.append(message)
         return message
@@ -81,6 +84,7 @@ def test_the_first_messages_are_the_present_state(servers: ModuleType) -> None:
         assert page.health["type"] == "health"
 
 
+@pytest.mark.slow
 def test_updates_have_the_newest_pose_and_all_events(servers: ModuleType) -> None:
     with servers.running(create, "web://:0", CONTEXT) as sink, Page(sink, servers) as page:
         covariance = np.diag([4e-6, 1e-6, 9e-6, 1e-4, 1e-4, 1e-4])
@@ -112,6 +116,7 @@ def test_updates_have_the_newest_pose_and_all_events(servers: ModuleType) -> Non
         assert set(health["rates_hz"]) == {"a", "b"}
 
 
+@pytest.mark.slow
 def test_a_page_that_opens_later_has_path_state_and_events(servers: ModuleType) -> None:
     with servers.running(create, "web://:0", CONTEXT) as sink:
         with Page(sink, servers) as page:
@@ -141,6 +146,7 @@ def test_a_page_that_opens_later_has_path_state_and_events(servers: ModuleType) 
             assert messages == [str(k) for k in range(RECENT_EVENTS, 2 * RECENT_EVENTS)]
 
 
+@pytest.mark.slow
 def test_what_is_remembered_is_bounded(servers: ModuleType) -> None:
     sink = create(servers.parse_address("web://:0"))
     items = [servers.queued(servers.pose("a", 10 * k)) for k in range(2 * TRAIL_POSES)]

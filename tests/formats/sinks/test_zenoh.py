@@ -22,7 +22,8 @@ from locatk.formats.sinks.interface import SinkContext
 from locatk.formats.sinks.registry import create_sink
 
 PEER = """
-import json, sys, time, zenoh
+import json, sys, threading, time, zenoh
+lock = threading.Lock()
 port, mode, key = sys.argv[1:]
 config = zenoh.Config()
 config.insert_json5("mode", json.dumps(mode))
@@ -35,13 +36,15 @@ session = zenoh.open(config)
 def show(kind, sample):
     attachment = sample.attachment.to_bytes().hex() if sample.attachment else ""
     content = sample.payload.to_bytes().hex()
-    print(json.dumps([kind, str(sample.kind), str(sample.key_expr), content, attachment]),
-          flush=True)
+    line = json.dumps([kind, str(sample.kind), str(sample.key_expr), content, attachment])
+    with lock:
+        print(line, flush=True)
 if key:
     tokens = session.liveliness().declare_subscriber(
         "@ros2_lv/**", lambda sample: show("token", sample), history=True)
     messages = session.declare_subscriber(key, lambda sample: show("message", sample))
-print('["ready"]', flush=True)
+with lock:
+    print('["ready"]', flush=True)
 time.sleep(100)
 """
 
