@@ -809,9 +809,11 @@
         : device.state === "tracking" ? "" : device.state;
       const name = device.name.length > 24 ? device.name.slice(0, 23) + "…" : device.name;
       const text = state ? `${name} · ${state}` : name;
-      if (!isFree(x + 14, y - 14, 6.8 * text.length, 14)) continue;
+      // Above to the right, else below.
+      const dy = [-9, 12].find((each) => isFree(x + 14, y + each - 6, 6.8 * text.length, 12));
+      if (dy === undefined) continue;
       c.font = "600 12px system-ui, sans-serif";
-      halo(c, text, x + 14, y - 9, old || device.state === "lost" ? colors.muted : colors.ink);
+      halo(c, text, x + 14, y + dy, old || device.state === "lost" ? colors.muted : colors.ink);
     }
   }
 
