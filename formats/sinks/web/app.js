@@ -129,8 +129,10 @@
         : device.latency + 0.1 * (pose.latency_s - device.latency);
     }
     const trail = device.trail, last = trail[trail.length - 1];
-    if (last && pose.time_s < last.t) trail.length = 0;  // The clock was set, or a replay began again.
-    if (!last || pose.time_s - last.t >= TRAIL_STEP_S || pose.time_s < last.t ||
+    // If the clock was set, or a replay began again.
+    const isBack = last && pose.time_s < last.t - 0.01;
+    if (isBack) trail.length = 0;
+    if (!last || isBack || pose.time_s - last.t >= TRAIL_STEP_S ||
         pose.state !== last.state || pose.reset_counter !== last.reset || pose.frame !== last.frame) {
       trail.push({ t: pose.time_s, x: pose.x_m, y: pose.y_m, z: pose.z_m, state: pose.state,
                    reset: pose.reset_counter, frame: pose.frame });
@@ -807,9 +809,11 @@
         : device.state === "tracking" ? "" : device.state;
       const name = device.name.length > 24 ? device.name.slice(0, 23) + "…" : device.name;
       const text = state ? `${name} · ${state}` : name;
-      if (!isFree(x + 14, y - 14, 6.8 * text.length, 14)) continue;
+      // Above to the right, else below.
+      const dy = [-9, 12].find((each) => isFree(x + 14, y + each - 6, 6.8 * text.length, 12));
+      if (dy === undefined) continue;
       c.font = "600 12px system-ui, sans-serif";
-      halo(c, text, x + 14, y - 9, old || device.state === "lost" ? colors.muted : colors.ink);
+      halo(c, text, x + 14, y + dy, old || device.state === "lost" ? colors.muted : colors.ink);
     }
   }
 

@@ -176,8 +176,9 @@ class WebSink(ServerSink):
             record.trail_ns = pose.time_ns
             x, y, z = pose.position.round(4).tolist()
             state = list(TrackingState).index(pose.state)
-            time_s = round(pose.time_ns * 1e-9, 3)
-            record.trail.append([time_s, x, y, z, state, pose.reset_counter, pose.frame])
+            record.trail.append(
+                [pose.time_ns * 1e-9, x, y, z, state, pose.reset_counter, pose.frame]
+            )
 
     def greet(self, client: Client) -> Iterable[str]:
         """Yield the present state of all devices, the artifact and the health."""

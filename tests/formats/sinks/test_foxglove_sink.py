@@ -150,7 +150,7 @@ def test_poses_arrive_on_their_channels(servers: ModuleType, subprotocol: str) -
         assert transform.rotation.w == 0.8
         (_, _, other) = viewer.read_messages(1)[0]
         assert other.child_frame_id == "floor_body"
-        assert sink.status().sent == 4
+        servers.wait_until(lambda: sink.status().sent == 4)
 
 
 def test_clients_get_what_they_subscribed_to(servers: ModuleType) -> None:

@@ -98,9 +98,9 @@ def test_the_page_shows_devices_states_and_events(servers: ModuleType, browser: 
         assert browser.console == []
 
 
-def fraction(image: Any, color: str) -> float:
+def fraction(image: Any, color: str, tolerance: int = 12) -> float:
     channels = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
-    return float(np.mean(np.abs(image.astype(np.int16) - channels).max(axis=-1) < 12))
+    return float(np.mean(np.abs(image.astype(np.int16) - channels).max(axis=-1) < tolerance))
 
 
 def test_the_map_is_drawn_and_grey_when_poses_are_old(servers: ModuleType, browser: Any) -> None:
@@ -225,6 +225,29 @@ def test_the_map_shows_the_frame_with_poses(servers: ModuleType, browser: Any) -
         browser.wait(f"[...{frame}.options].some(each => each.value === 'third')")
         assert browser.evaluate(f"{frame}.value") == "floor"
         assert browser.console == []
+
+
+def test_a_page_that_is_opened_later_shows_the_path(servers: ModuleType, browser: Any) -> None:
+    with servers.running(create, "web://:0", context()) as sink:
+        browser.open(sink.url)
+        browser.wait("document.body.dataset.connection === 'live'")
+        for k in range(10):
+            # A path that turns; the poses differ by fractions of a millisecond from 0.1 s.
+            position = np.array([0.1 * k, 0.5 * (k % 2), 0.0])
+            time_ns = servers.START_NS + 100_000_000 * k + 600_000
+            servers.offer(sink, servers.pose("b", position=position, time_ns=time_ns))
+            at = f"{0.1 * k:.3f} {0.5 * (k % 2):.3f}"
+            browser.wait(f"({ROW % 1}).includes('{at}')")
+        # Paths are a little transparent.
+        before = fraction(browser.picture(), COLORS[1], 70)
+        browser.open("about:blank")
+        browser.wait("location.href === 'about:blank'")
+        browser.open(sink.url)
+        browser.wait("document.body.dataset.connection === 'live'")
+        position = np.array([0.9, 0.5, 0.0])
+        servers.offer(sink, servers.pose("b", position=position, time_ns=time_ns + 10_000))
+        browser.wait(f"({ROW % 1}).includes('tracking')")
+        servers.wait_until(lambda: fraction(browser.picture(), COLORS[1], 70) > 0.8 * before)
 
 
 def test_a_phone_shows_all_without_scrolling_sideways(servers: ModuleType, browser: Any) -> None:

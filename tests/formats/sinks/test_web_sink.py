@@ -122,7 +122,8 @@ def test_a_page_that_opens_later_has_path_state_and_events(servers: ModuleType) 
         with Page(sink, servers) as page:
             for k in range(40):
                 # Handed over one by one: the path has a pose each 0.1 s.
-                servers.offer(sink, servers.pose("a", 10 * k))
+                time_ns = servers.START_NS + 100_000_000 * k + 600_000
+                servers.offer(sink, servers.pose("a", 10 * k, time_ns=time_ns))
                 page.read_until("update")
             servers.offer(sink, StateChange("a", 1, TrackingState.LOST, "no light"))
             detection = StationDetection(0, 2, None, 960_000, "factory", 3, 0)
@@ -134,7 +135,8 @@ def test_a_page_that_opens_later_has_path_state_and_events(servers: ModuleType) 
         with Page(sink, servers) as later:
             (device,) = later.hello["devices"]
             assert device["device"] == "a"
-            assert device["pose"]["time_s"] == servers.pose(k=390).time_ns * 1e-9
+            # The path ends with the pose, and not after it: the page would begin a new one.
+            assert device["pose"]["time_s"] == device["trail"][-1][0] == time_ns * 1e-9
             # Its age is told, because it is not new; its latency was that of another time.
             assert device["age_s"] > 0
             assert "latency_s" not in device["pose"]
