@@ -66,6 +66,9 @@ not used, because the mean of a thousand is exact to a thirtieth of the noise.""
 MAX_WAITING_NS = 60_000_000_000
 """Time by which samples and odometry may be apart; older observations are not waited for."""
 
+MAX_SILENCE_NS = 30_000_000_000
+"""Time without samples after which a visit has ended."""
+
 SLACK_M = 0.02
 """Path that is kept in addition to the margin of a visit."""
 
@@ -116,6 +119,10 @@ class Rows:
         self.time_ns = self.time_ns[count : self.size].copy()
         self.values = self.values[count : self.size].copy()
         self.start, self.size = self.start + count, self.size - count
+
+    def clear(self) -> None:
+        """Remove all samples."""
+        self.start, self.size = self.stop, 0
 
     def column(self, which: int) -> Array:
         """Return one number (size,) of all samples."""
@@ -319,7 +326,30 @@ class VisitStream:
         if self.statistics is not None:
             yield from self._take_rows(times, field)
             yield from self._leave(pose)
+            yield from self._end_after_silence()
         self._drop_unused()
+
+    def _end_after_silence(self) -> Iterator[LeftVisit]:
+        """End a visit, and forget its samples, if no samples came for long.
+
+        The poses since a sample are kept; there must not be ever more of them.
+        """
+        if len(self._unjudged_ns):
+            newest_ns = int(self._unjudged_ns[-1])
+        elif self._rows.size:
+            newest_ns = int(self._rows.time_ns[self._rows.size - 1])
+        else:
+            return
+        if self.time_ns - newest_ns <= MAX_SILENCE_NS:
+            return
+        self._unjudged_ns, self._unjudged_t = self._unjudged_ns[:0], self._unjudged_t[:0]
+        self._context_t = self._context_t[:0]
+        if self._rows.stop > self._step_start:
+            yield from self._close_step(self._rows.stop)
+        yield from self._end_group()
+        self._kept_first = None
+        self._step_start, self._step_rows = self._rows.stop, 0
+        self._rows.clear()
 
     def _take_rows(
         self, time_ns: Times, field_t: Array, *, is_last: bool = False
@@ -560,6 +590,7 @@ class VisitStream:
                 kept = min(kept, self._kept_first) if is_recent else kept
             rows.drop_before(max(kept, rows.stop - 2 * MAX_ROWS))
         first_ns = rows.time_ns[0] if rows.size else self._path_ns[-1]
+        first_ns = min(first_ns, *self._unjudged_ns.tolist(), self._path_ns[-1])
         first = int(np.searchsorted(self._path_ns, first_ns)) - SPLINE_POSES
         if first > max(64, len(self._path_ns) // 2):
             self._path_ns, self._path = self._path_ns[first:].copy(), self._path[first:].copy()
