@@ -181,7 +181,8 @@ def test_results_come_before_the_end_of_the_pass(world: Any) -> None:
         if detections(list(stream.push(piece(samples, k, k + 1)))):
             break
     assert abs(x[k] - last_m) < 0.012
-    assert detections(list(stream.push(piece(samples, k + 1, len(samples))))) == []
+    rest = [*stream.push(piece(samples, k + 1, len(samples))), *stream.finish()]
+    assert detections(rest) == []
 
 
 @pytest.mark.slow
@@ -391,6 +392,16 @@ def test_an_array_that_falls_silent_ends_its_pass(world: Any) -> None:
     assert [d.refused for d in detections(list(stream.advance(time_ns + 1_100_000_000)))] == [
         "partial"
     ]
+
+
+@pytest.mark.slow
+def test_a_gap_of_the_samples_ends_the_pass(world: Any) -> None:
+    samples = world.record([tag_of(world, TAG_ID)], world.line(lateral=0.085, speed=0.2), rate=50.0)
+    stream = PolarisStream(TAGS)
+    assert detections(list(stream.push(piece(samples, 0, 45)))) == []
+    late = piece(samples, 0, 1)
+    events = list(stream.push(replace(late, time_ns=samples.time_ns[45:46] + 1_500_000_000)))
+    assert [d.refused for d in detections(events)] == ["partial"]
 
 
 def test_damaged_input(world: Any) -> None:
