@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import shutil
+import stat
 import sys
 import threading
 from collections import deque
@@ -43,6 +45,7 @@ class LiveText:
 
     def __init__(self, *, as_json: bool) -> None:
         self._is_json = as_json or not sys.stdout.isatty()
+        self._is_discarded = not as_json and _is_null_device(sys.stdout)
         self._lines = 0
         self._waiting: deque[Any] = deque(maxlen=MAX_WAITING)
         self._filled = threading.Event()
@@ -62,7 +65,7 @@ class LiveText:
 
     def offer(self, message: Any) -> None:
         """Take a message; see :class:`locatk.formats.sinks.interface.Sink`."""
-        if not self._is_json:
+        if not self._is_json or self._is_discarded:
             return
         if len(self._waiting) == MAX_WAITING:
             self._dropped += 1
@@ -114,7 +117,9 @@ class LiveText:
         """Report that inputs and sinks are open."""
         self._say(f"Localizing {', '.join(ports)}; Ctrl-C ends it.")
         for sink in sinks:
-            self._say(f"Sending to {sink.status().address or sink.address}")
+            # The address of a server for its clients contains the token.
+            address = getattr(sink, "url", "") or sink.status().address or sink.address
+            self._say(f"Sending to {address}")
 
     def waiting(self, why: str) -> None:
         """Report a port that is not available yet."""
@@ -161,6 +166,15 @@ class LiveText:
                 console.result(
                     f"{sink['address']}: {sink['sent']} sent, {sink['dropped']} dropped{error}"
                 )
+
+
+def _is_null_device(stream: Any) -> bool:
+    """Return whether a stream discards everything, as that of a service."""
+    try:
+        status = os.fstat(stream.fileno())
+        return stat.S_ISCHR(status.st_mode) and status.st_rdev == os.stat(os.devnull).st_rdev
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def device_lines(devices: dict[str, Any], columns: int) -> list[str]:

@@ -37,6 +37,8 @@ from locatk.core.solution import Solution
 from locatk.core.streaming.events import DetectionEvent
 from locatk.core.streaming.localizer import LiveLocalizer
 from locatk.core.trajectory import Trajectory
+from locatk.formats.artifacts.scene import SCENE
+from locatk.formats.artifacts.sheets import MANIFEST
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
 from locatk.formats.benchmarks.landmarks.faults import drive_over, random_cells
 from locatk.formats.benchmarks.landmarks.global_localization import standard_floor
@@ -134,7 +136,7 @@ def run_live(arguments: Sequence[str]) -> LiveRun:
     receiver.settimeout(0.2)
     address = f"udp://127.0.0.1:{receiver.getsockname()[1]}"
     process = subprocess.Popen(
-        locatk("live", *arguments, "--to", address, "--json"),
+        locatk("live", *arguments, "--to", address),
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=ENVIRONMENT, text=True,
     )  # fmt: skip
     errors: list[str] = []
@@ -273,7 +275,7 @@ def lighthouse_figures(duration_s: float = LIVE_S, robots: int = 10) -> list[Fig
             "-o", str(session),
         )  # fmt: skip
         run("solve", str(session), "-o", str(solved))
-        _save_artifact(solved, "scene.toml", scene)
+        _save_artifact(solved, SCENE.file, scene)
         port, recording = folder / "port", folder / "run.mcap"
         stack.enter_context(emulated(session, "dotbot-gateway", port))
         live = run_live(
@@ -309,7 +311,7 @@ def dots_figures(frames: int = DOTS_FRAMES, rate_hz: float = DOTS_HZ) -> list[Fi
             "simulate", "dots", "--frames", str(frames), "--rate", f"{rate_hz:g}", "--seed",
             str(FIRST_SEED), "-o", str(session),
         )  # fmt: skip
-        _save_artifact(session, "manifest.toml", sheet)
+        _save_artifact(session, MANIFEST.file, sheet)
         write_video(session, video, rate_hz)
         recording = folder / "run.mcap"
         live = run_live([f"camera:{video}", "--artifact", str(sheet), "--record", str(recording)])

@@ -44,12 +44,13 @@ class Intake(Protocol):
     ----------
     declared : sequence of (str, type)
         Topics that are certain to occur, with their messages.
-    system : str
-        System of the session, ``""`` while it is unknown.
     """
 
     declared: Sequence[tuple[str, type[Message]]]
-    system: str
+
+    @property
+    def system(self) -> str:
+        """System of the session, ``""`` while it is unknown."""
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
         """Return the messages of received data."""
@@ -147,6 +148,11 @@ class SerialIntake:
 
     def take(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
         """Return the messages of received data: first all raw ones, then the records."""
+        yield from self.chunks(arrived)
+        yield from self._packed(self.decode(arrived))
+
+    def chunks(self, arrived: Sequence[ReceivedData]) -> Iterator[StampedMessage]:
+        """Return the raw bytes of received data as messages."""
         for each in arrived:
             chunk = SerialChunk(
                 timestamp=messages.timestamp(each.time_ns),
@@ -159,7 +165,6 @@ class SerialIntake:
             self._offset += each.size
             self._stored += each.size
             yield StampedMessage(self.topic, chunk, each.time_ns, each.time_ns)
-        yield from self._packed(self.decode(arrived))
 
     def decode(self, arrived: Sequence[ReceivedData]) -> list[TimedBatch]:
         """Return the records of received data, without messages: for a solver that runs along."""
@@ -224,6 +229,10 @@ class SerialIntake:
         """
         self._opened = opened
         yield from self._packed(self.decode_restart())
+
+    def mark_opened(self) -> None:
+        """Mark the next bytes as the first ones since the port was opened."""
+        self._opened = True
 
     def decode_restart(self) -> list[TimedBatch]:
         """Return the records that were held back, and discard a partial frame."""

@@ -227,6 +227,7 @@ class GatewayDecoder:
         self.counts = Counts()
         self.remarks: list[str] = []
         self._hdlc = HdlcDecoder(self.counts)
+        lfsr.tables()  # They take 0.1 s, which is better spent before the first frame.
 
     def feed(self, data: bytes, *, pause: bool = False) -> list[Batch]:
         """Return the records of the frames that these bytes complete."""

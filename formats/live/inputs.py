@@ -45,6 +45,7 @@ from locatk.formats.live.observations import (
     RecordConverter,
     frame_observations,
 )
+from locatk.formats.live.recorded_input import RecordedInput
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.frames import SCHEMAS, TOPIC
 from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
@@ -170,6 +171,7 @@ class LiveInput:
         self._source = source
         self._thread: threading.Thread | None = None
         self._shared: SharedReader | None = None
+        self._recorded: RecordedInput | None = None
 
     # ---- reader and recorder
 
@@ -193,9 +195,12 @@ class LiveInput:
         else:
             files = create_files(self.request, self._source, self._clock)
             shared = self._shared = SharedReader(self._reader)
+            raw = self._source.intake
+            if isinstance(raw, SerialIntake) and isinstance(self._decoder, SerialIntake):
+                self._recorded = RecordedInput(raw, self._decoder)
             recorder = Recorder(
                 shared,
-                self._source.intake,
+                self._recorded or raw,
                 files,
                 self._clock,
                 self.request.limits,
@@ -328,7 +333,12 @@ class LiveInput:
         yield from self._converted(self._decoder.decode(received))
 
     def _converted(self, records: Sequence[TimedBatch]) -> Iterator[Observations | InputNotice]:
-        self.artifacts.add(self._decoder.artifacts())
+        own = self._decoder.artifacts()
+        self.artifacts.add(own)
+        if self._recorded is not None:
+            self._recorded.device_artifacts |= own
+            if self.is_recording:
+                self._recorded.add(records)
         yield from self._converter.observations(records)
         for remark in self._decoder.remarks():
             yield InputNotice(remark, is_connected=self.is_connected)
@@ -428,7 +438,6 @@ def open_inputs(
     inputs: list[LiveInput] = []
     try:
         for number, request in enumerate(requests):
-            # The recorder has an intake of its own: it goes on if the solver fails.
             request = _as_source(request)
             source = open_source(request, clock, stop, waiting=waiting)
             inputs.append(LiveInput(number, request, source, clock, queue))

@@ -46,7 +46,7 @@ from locatk.formats.sinks.interface import LiveMessage, Sink, SinkContext
 TICK_S = 0.05
 """Longest wait for data, and interval at which the stream learns how much time has passed."""
 
-MIN_INTERVAL_S = 0.002
+MIN_INTERVAL_S = 0.001
 """Shortest time between two calls of the solver: what arrives meanwhile is solved at once."""
 
 ARRIVAL_DELAY_NS = 500_000_000
@@ -174,6 +174,7 @@ class LiveSession:
         self._started_s = 0.0
         self._newest_ns = 0
         self._scene_version = 0
+        self._rejected: dict[str, int] = {}
         self.system = ""
 
     # ---- life
@@ -355,6 +356,7 @@ class LiveSession:
             self._solve(source, source.identify(self._clock.now()), now_s)
         for device in self._devices.values():
             device.count(now_s)
+        self._rejected = self._count_rejected()
         if self._localizer is None:
             return
         now_ns = self._newest_ns if self._is_replay else self._clock.now()
@@ -435,7 +437,7 @@ class LiveSession:
         """Return the health of the session for JSON.
 
         ``ok`` is false if an input is disconnected, a recording has failed, the solver is late, or
-        a sink does not work; lost devices do not count.
+        a sink does not work; lost devices do not count. Sinks call it in threads of their own.
         """
         sinks = [sink.status() for sink in self._sinks]
         inputs: list[dict[str, Any]] = [
@@ -480,7 +482,7 @@ class LiveSession:
                     "rate_hz": round(each.rate_hz, 2),
                     "latency_s": round(each.latency_s, 4),
                 }
-                for name, each in self._devices.items()
+                for name, each in self.devices.items()
             },
             "inputs": inputs,
             "sinks": [
@@ -493,11 +495,11 @@ class LiveSession:
                 }
                 for each in sinks
             ],
-            "rejected": self._rejected(),
-            "warnings": list(self._warnings),
+            "rejected": self._rejected,
+            "warnings": list(dict(self._warnings)),
         }
 
-    def _rejected(self) -> dict[str, int]:
+    def _count_rejected(self) -> dict[str, int]:
         """Return the observations that the stream did not use, and the fixes refused, by reason."""
         if self._localizer is None:
             return {}

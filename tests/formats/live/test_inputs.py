@@ -21,6 +21,7 @@ from locatk.formats.capture.reader_thread import ReceivedData, SourceEnded
 from locatk.formats.capture.setup import CaptureRequest, OpenSource, create_intake
 from locatk.formats.live import inputs
 from locatk.formats.live.inputs import Arrival, ArrivalQueue, InputNotice, LiveInput
+from locatk.formats.sessions.observations import read_odometry
 from locatk.formats.sessions.reader import Session
 
 LINES = "x_m,y_m,heading_rad\n" + "".join(f"{k}.0,0,0\n" for k in range(5))
@@ -197,13 +198,14 @@ def test_bytes_of_a_device_are_left_out_if_the_solver_is_late(
 def test_the_recording_has_every_byte_and_the_further_messages(begin: Any, tmp_path: Path) -> None:
     output = tmp_path / "run.mcap"
     live, queue = begin([LINES.encode()] * 3, output=output)
-    all_arrivals(queue)
+    observations_of(live, queue)
     live.stop_reading()
     live.stop_recording(5.0)
     assert live.recording is not None
     assert not live.recording.failed
     session = Session.open(output)
-    assert session.topics("/odometry/") == ("/odometry/robot",)
+    (odometry,) = read_odometry(session)
+    assert odometry.position[:, 0].tolist() == [0, 1, 2, 3, 4] * 3
     assert live.recording.totals.bytes == 3 * len(LINES)
 
 
