@@ -49,6 +49,11 @@ class Frame(NamedTuple):
     width: int
     height: int
 
+    @property
+    def size(self) -> int:
+        """Bytes of the image file."""
+        return len(self.image)
+
 
 class CameraPort:
     """Camera, stream or video file; see :func:`camera_port`."""

@@ -212,7 +212,7 @@ class PortReader:
         if not data:
             return 0
         self._attempts = 0
-        size = len(data) if isinstance(data, bytes) else sum(len(frame[1]) for frame in data)
+        size = len(data) if isinstance(data, bytes) else sum(item.size for item in data)
         recorded_ns: int | None = getattr(self._link, "time_ns", None)
         if recorded_ns is not None and isinstance(self._clock, ReplayClock):
             self._clock.set(recorded_ns)

@@ -15,7 +15,6 @@ from typing import Any
 
 from locatk.core.errors import InputError, LocatkError
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
-from locatk.formats.emulation.sources import select_source
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 
@@ -34,8 +33,7 @@ class ReplayPort:
     speed : float
         Factor on the speed of the recording; 0 is as fast as possible.
     keeps_time : bool
-        Its bytes have the times at which they were recorded, instead of those of the replay. A
-        session without raw bytes is encoded as a device would send it.
+        Its bytes have the times at which they were recorded, instead of those of the replay.
 
     Raises
     ------
@@ -70,7 +68,7 @@ class ReplayPort:
             ) from None
         self._topic = self._choose_topic(session)
         self._damage = session.damage
-        chunks = _chunks(session, self._topic) if self._topic else _encoded(session)
+        chunks = _chunks(session, self._topic)
         return ReplayLink(chunks, self._speed, keeps_time=self.keeps_time)
 
     def describe(self) -> dict[str, str]:
@@ -90,8 +88,6 @@ class ReplayPort:
         topics = session.topics("", SCHEMA)
         if self._topic in topics:
             return self._topic
-        if not topics and self.keeps_time and not self._topic:
-            return ""
         if len(topics) == 1 and not self._topic:
             return topics[0]
         if topics:
@@ -196,11 +192,3 @@ def _chunks(session: Session, topic: str) -> Generator[tuple[int, bytes], None, 
         raise LinkLost(f"{error}; `locatk recover` saves the rest") from error
     if session.damage is not None:
         raise LinkLost(f"{session.path}: {session.damage}")
-
-
-def _encoded(session: Session) -> Generator[tuple[int, bytes], None, None]:
-    """Yield the bytes of observations as a device would send them."""
-    try:
-        yield from select_source(session).packets()
-    except InputError as error:
-        raise LinkLost(str(error)) from error

@@ -161,6 +161,20 @@ def open_source(
     LocatkError
         As :func:`record`.
     """
+    content = check_request(request)
+    intake = create_intake(request, content)
+    port = _port(request, clock, stop)
+    return OpenSource(port, _open_port(port, request.wait_s, stop, waiting), intake, content)
+
+
+def check_request(request: CaptureRequest) -> dict[str, str]:
+    """Check name, output and artifacts of a request; return its attachments, name to text.
+
+    Raises
+    ------
+    LocatkError
+        One of them is invalid.
+    """
     _check_name(request.device_name)
     content = _artifacts(request)
     if request.output is not None:
@@ -171,9 +185,7 @@ def open_source(
             inputs=[*request.artifacts, *_replayed_paths(request.port)],
         )
         _check_disk(request.output.parent, request.limits.reserve_bytes)
-    intake = create_intake(request, content)
-    port = _port(request, clock, stop)
-    return OpenSource(port, _open_port(port, request.wait_s, stop, waiting), intake, content)
+    return content
 
 
 def create_files(request: CaptureRequest, source: OpenSource, clock: HostClock) -> RecordingFiles:
@@ -259,7 +271,9 @@ def _check_disk(folder: Path, reserve: int) -> None:
         )
 
 
-def create_intake(request: CaptureRequest, content: Mapping[str, str]) -> Intake:
+def create_intake(
+    request: CaptureRequest, content: Mapping[str, str]
+) -> SerialIntake | CameraIntake:
     """Return the conversion of received data to messages.
 
     Raises

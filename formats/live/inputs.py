@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import (
-    AUTO,
     CameraIntake,
     SerialIntake,
     StampedMessage,
@@ -33,12 +32,12 @@ from locatk.formats.capture.setup import (
     CAMERA,
     CaptureRequest,
     OpenSource,
+    check_request,
     create_files,
     create_intake,
     open_source,
 )
 from locatk.formats.capture.status import RecordingResult
-from locatk.formats.emulation.sources import select_source
 from locatk.formats.live.observations import (
     AttachedArtifacts,
     Observations,
@@ -46,9 +45,13 @@ from locatk.formats.live.observations import (
     frame_observations,
 )
 from locatk.formats.live.recorded_input import RecordedInput
+from locatk.formats.live.session_replay import (
+    ObservationsIntake,
+    ObservationsPort,
+    observation_topics,
+)
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.frames import SCHEMAS, TOPIC
-from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.reader import Session
 
 MAX_WAITING_BYTES = 8 << 20
@@ -57,6 +60,10 @@ two seconds of the fastest serial ports. A replayed file waits instead."""
 
 WAIT_S = 0.002
 """Interval at which a replayed file checks whether the solver has caught up."""
+
+
+Decoder = SerialIntake | CameraIntake | ObservationsIntake
+"""Decoder of the solver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +128,8 @@ class LiveInput:
     request : CaptureRequest
         With ``output`` if it is recorded.
     source : OpenSource
+    decoder : SerialIntake, CameraIntake or ObservationsIntake
+        Of the solver.
     clock : HostClock
     queue : ArrivalQueue
         Takes its events.
@@ -145,6 +154,7 @@ class LiveInput:
         number: int,
         request: CaptureRequest,
         source: OpenSource,
+        decoder: Decoder,
         clock: HostClock,
         queue: ArrivalQueue,
     ) -> None:
@@ -164,7 +174,7 @@ class LiveInput:
         self._is_dropping = self._is_stopping = False
         self._end_error: str | None = None
         self._frames = 0
-        self._decoder = create_intake(request, source.artifacts)
+        self._decoder = decoder
         self._converter = RecordConverter(self.artifacts)
         self._reader = PortReader(source.port, source.link, clock, deliver=self._deliver)
         self._stop_recorder = threading.Event()
@@ -196,8 +206,8 @@ class LiveInput:
             files = create_files(self.request, self._source, self._clock)
             shared = self._shared = SharedReader(self._reader)
             raw = self._source.intake
-            if isinstance(raw, SerialIntake) and isinstance(self._decoder, SerialIntake):
-                self._recorded = RecordedInput(raw, self._decoder)
+            if not isinstance(self._decoder, CameraIntake):
+                self._recorded = RecordedInput(raw, self._decoder)  # type: ignore[arg-type]
             recorder = Recorder(
                 shared,
                 self._recorded or raw,
@@ -303,12 +313,12 @@ class LiveInput:
                 yield InputNotice(f"connection lost: {event.why}", is_connected=False)
             elif isinstance(event, Reconnected):
                 self.is_connected = True
-                if isinstance(self._decoder, SerialIntake):
+                if not isinstance(self._decoder, CameraIntake):
                     yield from self._converted(self._decoder.decode_restart())
                 yield InputNotice(f"reconnected to {event.path}", is_connected=True)
             elif isinstance(event, SourceEnded):
                 self.is_connected, self.is_ended = False, True
-                if isinstance(self._decoder, SerialIntake):
+                if not isinstance(self._decoder, CameraIntake):
                     yield from self._converted(self._decoder.decode_finish())
                 if event.error is not None:
                     yield InputNotice(event.error, is_connected=False)
@@ -316,7 +326,7 @@ class LiveInput:
 
     def identify(self, now_ns: int) -> Iterator[Observations | InputNotice]:
         """Yield the observations of a device that is identified by the time that has passed."""
-        if isinstance(self._decoder, SerialIntake):
+        if not isinstance(self._decoder, CameraIntake):
             yield from self._converted(self._decoder.decode_identified(now_ns))
 
     def _observations(
@@ -329,7 +339,6 @@ class LiveInput:
                 yield from frame_observations(self.name, each.data, self._frames)
                 self._frames += len(each.data)
             return
-        assert isinstance(self._decoder, SerialIntake)
         yield from self._converted(self._decoder.decode(received))
 
     def _converted(self, records: Sequence[TimedBatch]) -> Iterator[Observations | InputNotice]:
@@ -438,9 +447,8 @@ def open_inputs(
     inputs: list[LiveInput] = []
     try:
         for number, request in enumerate(requests):
-            request = _as_source(request)
-            source = open_source(request, clock, stop, waiting=waiting)
-            inputs.append(LiveInput(number, request, source, clock, queue))
+            opened, source, decoder = _open(request, clock, stop, waiting)
+            inputs.append(LiveInput(number, opened, source, decoder, clock, queue))
     except LocatkError:
         for each in inputs:
             each.stop_reading()
@@ -448,21 +456,37 @@ def open_inputs(
     return inputs
 
 
-def _as_source(request: CaptureRequest) -> CaptureRequest:
-    """Return the request of a replay with the kind of its data: frames, or bytes of a device."""
-    if not (request.port.lower().startswith(REPLAY) and request.keeps_time):
-        return request
+def _open(
+    request: CaptureRequest,
+    clock: HostClock,
+    stop: threading.Event,
+    waiting: Callable[[str], None],
+) -> tuple[CaptureRequest, OpenSource, Decoder]:
+    """Open an input; a replay by its content: raw bytes, camera frames or decoded observations."""
+    session = _replayed_session(request)
+    if session is not None:
+        if any(session.topics(TOPIC, schema) for schema in SCHEMAS):
+            request = replace(request, port=f"{CAMERA}{session.path}")
+        elif observation_topics(session):
+            content = check_request(request)
+            port = ObservationsPort(request.port, session, request.speed)
+            intake = ObservationsIntake()
+            # RecordedInput needs only a part of an intake.
+            source = OpenSource(port, port.open(), intake, content)  # type: ignore[arg-type]
+            return request, source, intake
+    source = open_source(request, clock, stop, waiting=waiting)
+    # That of the recording is another one, which only keeps the bytes.
+    return request, source, create_intake(request, source.artifacts)
+
+
+def _replayed_session(request: CaptureRequest) -> Session | None:
+    """Return the session without raw bytes that a request replays; None if there is none."""
     file = request.port[len(REPLAY) :].removeprefix("//")
-    if not os.path.exists(file):
-        return request
-    session = Session.open(file, damaged_ok=True)
-    if any(session.topics("/serial/")):
-        recorded_by = session.metadata().get(CAPTURE_RECORD, {}).get("device")
-        return (
-            replace(request, device=recorded_by)
-            if recorded_by and request.device == AUTO
-            else request
-        )
-    if any(session.topics(TOPIC, schema) for schema in SCHEMAS):
-        return replace(request, port=f"{CAMERA}{file}")
-    return replace(request, device=select_source(session).device)
+    is_replay = request.port.lower().startswith(REPLAY) and request.keeps_time
+    if not (is_replay and os.path.exists(file)):
+        return None
+    try:
+        session = Session.open(file, damaged_ok=True)
+    except LocatkError:
+        return None  # Opening it as a port reports the error with a hint.
+    return None if session.topics("/serial/") else session

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from locatk.formats.capture import reader_thread as receiver_module
+from locatk.formats.capture.camera import Frame
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.links import Overruns, SourceError
 from locatk.formats.capture.reader_thread import (
@@ -294,7 +295,7 @@ def test_frames_of_a_camera_count_by_their_pictures(
     port: Any, receive: Callable[..., PortReader]
 ) -> None:
     receiver = receive()
-    port.then(lambda: [(1, b"abc"), (2, b"defgh")])
+    port.then(lambda: [Frame(1, b"abc", 1, 1), Frame(2, b"defgh", 1, 1)])
     port.settle()
     (event,) = all_events(receiver)
     assert isinstance(event, ReceivedData)

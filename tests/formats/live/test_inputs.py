@@ -80,7 +80,7 @@ def begin() -> Iterator[Any]:
             port or ListedPort(), ListedLink(pieces), create_intake(wanted, {}), artifacts or {}
         )
         queue = ArrivalQueue()
-        live = LiveInput(0, wanted, source, HostClock(), queue)
+        live = LiveInput(0, wanted, source, create_intake(wanted, {}), HostClock(), queue)
         started.append(live)
         live.start(tell=lambda text: None, further=tuple)
         return live, queue
@@ -178,7 +178,7 @@ def test_bytes_of_a_device_are_left_out_if_the_solver_is_late(
     wanted = CaptureRequest("listed", "lines", None)
     source = OpenSource(port, Slow([b"x" * 80] * 5 + [b"late\n"]), create_intake(wanted, {}), {})
     queue = ArrivalQueue()
-    live = LiveInput(0, wanted, source, HostClock(), queue)
+    live = LiveInput(0, wanted, source, create_intake(wanted, {}), HostClock(), queue)
     live.start(tell=lambda text: None, further=tuple)
     until = time.monotonic() + 5
     while live.dropped_bytes < 320 and time.monotonic() < until:
@@ -217,7 +217,7 @@ def test_the_solver_goes_on_when_the_recording_fails(begin: Any, tmp_path: Path)
         ListedPort(), ListedLink([LINES.encode()] * 3), create_intake(wanted, {}), {}
     )
     queue = ArrivalQueue()
-    live = LiveInput(0, wanted, source, HostClock(), queue)
+    live = LiveInput(0, wanted, source, create_intake(wanted, {}), HostClock(), queue)
 
     def broken() -> Any:
         raise OSError("no space left on device")
