@@ -143,6 +143,8 @@ class LiveInput:
     keeps_time : bool
         Its bytes have the times of a recording.
     is_connected, is_ended : bool
+    newest_ns : int
+        Time of its newest observation.
     dropped_bytes : int
         Bytes that the solver did not take because it was late.
     recording : RecordingResult or None
@@ -164,6 +166,7 @@ class LiveInput:
         self.is_paced = source.port.can_reconnect
         self.keeps_time = getattr(source.port, "keeps_time", False)
         self.is_connected, self.is_ended = True, False
+        self.newest_ns = 0
         self.dropped_bytes = 0
         self.recording: RecordingResult | None = None
         self.artifacts = AttachedArtifacts(source.artifacts)

@@ -172,7 +172,7 @@ class LiveSession:
         self._is_late = False
         self._is_sink_open = False
         self._started_s = 0.0
-        self._newest_ns = 0
+        self._advanced_ns = 0
         self._scene_version = 0
         self._rejected: dict[str, int] = {}
         self.system = ""
@@ -322,10 +322,26 @@ class LiveSession:
         """Decode and solve what has arrived."""
         for number, group in groupby(arrivals, key=lambda arrival: arrival.source):
             batch = list(group)
-            received_s = batch[-1].received_s
             self._check_lateness(batch[0].received_s)
             source = self._inputs[number]
-            self._solve(source, source.decode([each.event for each in batch]), received_s)
+            # The results of a replay do not depend on how much of it is read at once.
+            pieces = [batch] if not self._is_replay else [[each] for each in batch]
+            for piece in pieces:
+                events = [each.event for each in piece]
+                self._solve(source, source.decode(events), piece[-1].received_s)
+                if self._is_replay:
+                    self._follow_replay()
+
+    def _follow_replay(self) -> None:
+        """Let the time of a replay pass, which is that of its observations."""
+        self._serve_background()
+        newest_ns = [each.newest_ns for each in self._inputs if not each.is_ended]
+        time_ns = min(newest_ns, default=0)
+        if time_ns - self._advanced_ns >= TICK_S * 1e9:
+            self._advanced_ns = time_ns
+            if self._localizer is not None and time_ns > ARRIVAL_DELAY_NS:
+                events = self._localizer.advance(time_ns - ARRIVAL_DELAY_NS)
+                self._publish(events, time.monotonic())
 
     def _solve(
         self,
@@ -347,7 +363,7 @@ class LiveSession:
             if system and system != self.system:
                 self._report_once("other_system", f"data of {system} are not used", received_s)
                 continue
-            self._newest_ns = max(self._newest_ns, _last_ns(each))
+            source.newest_ns = max(source.newest_ns, _last_ns(each))
             self._publish(self._localizer.push(each), received_s)
 
     def _advance(self, now_s: float) -> None:
@@ -357,10 +373,9 @@ class LiveSession:
         for device in self._devices.values():
             device.count(now_s)
         self._rejected = self._count_rejected()
-        if self._localizer is None:
+        if self._localizer is None or self._is_replay:
             return
-        now_ns = self._newest_ns if self._is_replay else self._clock.now()
-        time_ns = min(each.complete_ns(now_ns) for each in self._inputs)
+        time_ns = min(each.complete_ns(self._clock.now()) for each in self._inputs)
         if time_ns > ARRIVAL_DELAY_NS:
             self._publish(self._localizer.advance(time_ns - ARRIVAL_DELAY_NS), now_s)
 
