@@ -31,6 +31,7 @@ from locatk.core.landmarks.preprocessing import MIN_FIELD_THRESHOLDS
 from locatk.core.landmarks.stream import LandmarksStream
 from locatk.core.lighthouse.stream import LighthouseStream
 from locatk.core.polaris.array import Samples
+from locatk.core.polaris.results import TagDetection
 from locatk.core.polaris.solver import solve
 from locatk.core.polaris.stream import PolarisStream
 from locatk.core.solution import Solution
@@ -46,7 +47,12 @@ from locatk.formats.benchmarks.polaris.suite import read_runs
 from locatk.formats.benchmarks.timing import FIRST_SEED, machine_factor
 from locatk.formats.emulation.sources import write_simulated_session
 from locatk.formats.importers.polaris_csv import PUBLISHED_TAGS
-from locatk.formats.sessions.observations import read_sweeps
+from locatk.formats.sessions.observations import (
+    read_magnetometers,
+    read_odometry,
+    read_sweeps,
+    read_tags,
+)
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.solutions import read_trajectories
 
@@ -63,7 +69,10 @@ PROCESSOR_INTERVAL_S = 0.5
 
 MEMORY_HOURS = 10.0
 
-LANDMARK_DRIVES = 4
+LANDMARK_DRIVES = POLARIS_DRIVES = 4
+
+MAX_PASS_S = 4.0
+"""Longest time over one tag."""
 
 DOTS_HZ = 100.0
 DOTS_FRAMES = 2_000
@@ -368,36 +377,65 @@ def write_video(session: Path, video: Path, rate_hz: float) -> None:
 
 
 def polaris_figures(data: Path, duration_s: float = ROBOT_S) -> list[Figure]:
-    """Identify the tags of the published recordings, and of a simulated drive in real time."""
-    declared = Figure(
-        "polaris: id and pose after the last magnet, p99", None, "ms",
-        "published recordings, one sample at a time: the last magnet by the solver, plus waiting "
-        "for samples, plus computation", 200.0, workload="numpy",
+    """Identify the tags of the published recordings and of simulated sites."""
+    published = Figure(
+        "polaris: id and pose after the last magnet, published recordings, p99", None, "ms",
+        f"{_DELAY}; tags without positions, of which any id may follow", workload="numpy",
     )  # fmt: skip
 
-    def published() -> list[Figure]:
+    def measure_published() -> list[Figure]:
         runs = read_runs(data / "polaris")
-        delays_s, wrong = [], 0
-        for samples in (each for some in runs.values() for each in some):
-            offline = solve([samples], PUBLISHED_TAGS)
-            wanted = offline.detections
-            events = push_timed(PolarisStream(PUBLISHED_TAGS), _single_samples(samples))
-            found = [(t, e.detection) for t, e in events if isinstance(e, DetectionEvent)]
-            wrong += [d.tag_id for _, d in found] != [d.tag_id for d in wanted]
-            if not offline.poses:
-                continue
-            last_ns = last_magnet_ns(offline)
-            delays_s += [t - 1e-9 * last_ns for t, d in found if d.tag_id is not None]
-        how = f"{declared.how}; {len(delays_s)} tags"
-        value = percentile_ms(np.array(delays_s), 99)
-        return [
-            replace(declared, value=value, how=how, machine_factor=machine_factor("numpy")),
-            Figure("polaris: ids other than offline", wrong, "", how, 0.0),
-        ]
+        recordings = [(each, PUBLISHED_TAGS, None) for some in runs.values() for each in some]
+        return _tag_figures(published, recordings)
 
+    site, with_odometry = (
+        Figure(
+            f"polaris: id and pose after the last magnet, {name}, p99", None, "ms",
+            f"{_DELAY}; tags on a site", 200.0, workload="numpy",
+        )
+        for name in ("site", "site and odometry")
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        sessions = []
+        for seed in range(FIRST_SEED, FIRST_SEED + POLARIS_DRIVES):
+            path = Path(folder, f"{seed}.mcap")
+            write_simulated_session("polaris", path, seed=seed)
+            sessions.append(Session.open(path))
+        drives = [
+            (read_magnetometers(each)[0], read_tags(each), read_odometry(each)[0])
+            for each in sessions
+        ]
     return [
-        *measure_or_explain(published, declared),
+        *measure_or_explain(measure_published, published),
+        *_tag_figures(site, [(samples, tags, None) for samples, tags, _ in drives]),
+        *_tag_figures(with_odometry, drives),
         *_robot_figures("polaris", "locatk", duration_s),
+    ]
+
+
+_DELAY = (
+    "one sample at a time: the last magnet by the offline solver, plus waiting for samples, plus "
+    "computation"
+)
+
+
+def _tag_figures(declared: Figure, recordings: Sequence[tuple[Any, ...]]) -> list[Figure]:
+    """Measure the delay of each tag, and compare the ids with those of the offline solver."""
+    delays_s, wrong = [], 0
+    for samples, tags, odometry in recordings:
+        offline = solve([samples], tags, odometry=() if odometry is None else (odometry,))
+        events = push_timed(PolarisStream(tags), _interleaved(samples, odometry))
+        found = [(t, e.detection) for t, e in events if isinstance(e, DetectionEvent)]
+        found = [(t, d) for t, d in found if isinstance(d, TagDetection)]
+        wrong += [d.tag_id for _, d in found] != [d.tag_id for d in offline.detections]
+        for (time_s, detection), reference in zip(found, offline.detections, strict=False):
+            if detection.tag_id is not None and reference.tag_id is not None:
+                delays_s.append(time_s - 1e-9 * last_magnet_ns(offline, reference))
+    how = f"{declared.how}; {len(delays_s)} tags"
+    value = percentile_ms(np.array(delays_s), 99)
+    return [
+        replace(declared, value=value, how=how, machine_factor=machine_factor("numpy")),
+        Figure(f"{declared.name}: recordings with other ids than offline", wrong, "", how, 0.0),
     ]
 
 
@@ -474,31 +512,25 @@ def push_timed(stream: Any, pieces: Iterable[Any]) -> list[tuple[float, Any]]:
     return events
 
 
-def _single_samples(samples: Samples) -> Iterator[Samples]:
-    for k in range(len(samples)):
-        yield replace(
-            samples, time_ns=samples.time_ns[k : k + 1], field_t=samples.field_t[k : k + 1]
-        )
-
-
-def _interleaved(samples: HallSamples, odometry: Trajectory) -> Iterator[Any]:
+def _interleaved(samples: Samples | HallSamples, odometry: Trajectory | None) -> Iterator[Any]:
     """Yield single samples and poses of odometry in the order of their times."""
     pieces = [
-        *((int(odometry.time_ns[k]), 0, k) for k in range(len(odometry))),
+        *((int(t), 0, k) for k, t in enumerate([] if odometry is None else odometry.time_ns)),
         *((int(samples.time_ns[k]), 1, k) for k in range(len(samples))),
     ]
     for _, kind, k in sorted(pieces):
-        if kind == 0:
+        if odometry is not None and kind == 0:
             yield odometry.select(np.array([k]))
         else:
             part = slice(k, k + 1)
             yield replace(samples, time_ns=samples.time_ns[part], field_t=samples.field_t[part])
 
 
-def last_magnet_ns(solution: Solution) -> float:
-    """Return the time at which an array was over the last magnet of the last tag it read."""
+def last_magnet_ns(solution: Solution, detection: TagDetection) -> float:
+    """Return the time at which an array was over the last magnet of a tag."""
     (track,) = solution.trajectories
-    detection = solution.detections[-1]
+    near = np.abs(1e-9 * track.time_ns - detection.time_s) < MAX_PASS_S / 2
+    track = track.select(near)
     moment = int(np.argmin(np.abs(1e-9 * track.time_ns - detection.time_s)))
     heading = heading_from_quaternion(track.quaternion)
     forward = np.column_stack([np.cos(heading), np.sin(heading)])
@@ -509,9 +541,8 @@ def last_magnet_ns(solution: Solution) -> float:
         + magnets[:, :1] * forward[moment]
         + magnets[:, 1:] * left[moment]
     )
-    ahead_m = np.einsum("nmk,nk->nm", on_floor[None] - track.position[:, None, :2], forward).max(
-        axis=1
-    )
+    offset = on_floor[None] - track.position[:, None, :2]
+    ahead_m = np.einsum("nmk,nk->nm", offset, forward).max(axis=1)
     is_ahead = np.flatnonzero(ahead_m > 0)
     return float(track.time_ns[is_ahead[-1] if len(is_ahead) else 0])
 
