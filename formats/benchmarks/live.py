@@ -122,6 +122,19 @@ class LiveRun:
         """Return the messages of one type."""
         return [message for message in self.messages if message["type"] == kind]
 
+    def is_tracking(self, track: Trajectory) -> np.ndarray:
+        """Return which poses (n,) of a recorded track were published in state ``tracking``."""
+        times_s = np.sort(
+            [
+                pose["time_s"]
+                for pose in self.of_type("pose")
+                if pose["device"] == track.device and pose["state"] == "tracking"
+            ]
+        )
+        # Messages have the time as a float, to 0.2 microseconds.
+        wanted_s = 1e-9 * track.time_ns
+        return np.searchsorted(times_s, wanted_s - 1e-6) < np.searchsorted(times_s, wanted_s + 1e-6)
+
     def latency_s(self) -> np.ndarray:
         """Return the times (n,) from the last byte that a pose needed to its sending.
 
@@ -267,12 +280,20 @@ def compare(live: Sequence[Trajectory], solved: Sequence[Trajectory]) -> Agreeme
     return Agreement(np.concatenate(ratios), np.concatenate(distances))
 
 
-def agreement_figures(system: str, recording: Path, artifacts: Sequence[str]) -> list[Figure]:
-    """Solve a recording of ``locatk live`` offline, and compare."""
+def agreement_figures(
+    system: str, live: LiveRun, recording: Path, artifacts: Sequence[str]
+) -> list[Figure]:
+    """Solve a recording of ``locatk live`` offline, and compare the poses in state ``tracking``."""
     solved = recording.with_name("solved.mcap")
     run("solve", str(recording), *artifacts, "-o", str(solved), "--overwrite")
-    agreement = compare(read_trajectories(recording, "live"), read_trajectories(solved))
-    how = f"{len(agreement.ratio)} live poses against `locatk solve` of the recording"
+    tracking = [
+        each.select(live.is_tracking(each)) for each in read_trajectories(recording, "live")
+    ]
+    agreement = compare(tracking, read_trajectories(solved))
+    how = (
+        f"{len(agreement.ratio)} live poses in state tracking against `locatk solve` of the "
+        "recording"
+    )
     median = float(np.median(agreement.ratio)) if len(agreement.ratio) else None
     p95 = float(np.percentile(agreement.ratio, 95)) if len(agreement.ratio) else None
     return [
@@ -308,7 +329,7 @@ def lighthouse_figures(duration_s: float = LIVE_S, robots: int = 10) -> list[Fig
             [str(port), "--device", "dotbot-gateway", "--artifact", str(scene), "--record",
              str(recording), "--duration", f"{duration_s + 2:g}"]
         )  # fmt: skip
-        agreement = agreement_figures("lighthouse", recording, ["--artifact", str(scene)])
+        agreement = agreement_figures("lighthouse", live, recording, ["--artifact", str(scene)])
     latency_s = live.latency_s()
     how = (
         f"{robots} robots, one photodiode each, two stations: {len(latency_s)} poses in "
@@ -342,7 +363,7 @@ def dots_figures(frames: int = DOTS_FRAMES, rate_hz: float = DOTS_HZ) -> list[Fi
         write_video(session, video, rate_hz)
         recording = folder / "run.mcap"
         live = run_live([f"camera:{video}", "--artifact", str(sheet), "--record", str(recording)])
-        agreement = agreement_figures("dots", recording, ["--artifact", str(sheet)])
+        agreement = agreement_figures("dots", live, recording, ["--artifact", str(sheet)])
     latency_s = live.latency_s()
     lost = frames - len(live.of_type("pose"))
     how = (
@@ -476,7 +497,7 @@ def _robot_figures(system: str, device: str, duration_s: float) -> list[Figure]:
             [str(port), "--device", device, "--artifact", str(session), "--record",
              str(recording), "--duration", f"{duration_s:g}"]
         )  # fmt: skip
-        agreement = agreement_figures(system, recording, [])
+        agreement = agreement_figures(system, live, recording, [])
     latency_s = live.latency_s()
     how = (
         f"one robot, {len(latency_s)} poses in {duration_s:.0f} s from a pseudo-terminal, "
