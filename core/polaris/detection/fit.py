@@ -692,6 +692,9 @@ class PassProblem:
         """
         length = CLUSTER_HEIGHTS * state.height_m
         stretch = np.floor((state.path_m - state.path_m.min()) / length).astype(np.intp)
+        if stretch.max() >= len(stretch):
+            # The path of a fit that diverges may be kilometres long.
+            stretch = np.unique(stretch, return_inverse=True)[1]
         sensor = np.arange(self.shape[0])[:, None] // 3
         partitions = (sensor * (int(stretch.max()) + 1) + stretch, sensor + 0 * stretch)
         first, second = (

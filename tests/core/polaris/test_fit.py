@@ -238,3 +238,13 @@ def test_steps_are_limited_to_a_fraction_of_the_height(world: Any) -> None:
     change = np.abs(moved.position_m - start.position_m).max()
     assert change == pytest.approx(0.7 * start.height_m)
     assert 0.7 * start.height_m <= moved.height_m <= 1.4 * start.height_m
+
+
+def test_clusters_of_a_path_that_diverges_need_little_memory(world: Any) -> None:
+    window, truth, _ = posed(world, known=False)
+    problem = PassProblem(window, PassPriors(), sample_weights(window), truth)
+    far = np.where(np.arange(len(truth.path_m)) < 3, truth.path_m, 1e8 + truth.path_m)
+    stretches, sensors = problem.clusters(replace(truth, path_m=far))
+    assert stretches.shape[0] < 10_000
+    for clusters in (stretches, sensors):
+        assert np.all(clusters.sum(axis=0) == 1)
