@@ -128,6 +128,13 @@ def servers() -> ModuleType:
     return _load_module("live_servers")
 
 
+@pytest.fixture(scope="session")
+def live_sessions(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Short sessions for live localization: ``live_sessions.raw("polaris")``."""
+    module = _load_module("live_sessions")
+    return module.LiveSessions(tmp_path_factory.mktemp("live"))
+
+
 def _load_module(name: str) -> ModuleType:
     """Return a module of this folder."""
     if name in sys.modules:

@@ -169,9 +169,8 @@ def command(
     if port is not None:
         columns = given.pop("columns") or None
         requests.insert(0, live_config.single_input(port, columns=columns, **given))
-    elif any(given.values()):
-        name = next(name for name, value in given.items() if value)
-        raise click.UsageError(f"--{name} applies to PORT: give it, or write it in --input.")
+    elif unused := [name for name, value in given.items() if value not in (None, ())]:
+        raise click.UsageError(f"--{unused[0]} applies to PORT: give it, or write it in --input.")
     request = LiveRequest(
         _requests(
             (*settings.inputs, *requests),
@@ -205,8 +204,7 @@ def command(
         result = session.run(stop, ready=ready, waiting=text.waiting)
     text.summary(result)
     losses = [loss for each in result.recordings for loss in each.totals.losses()]
-    if result.failed:
-        losses += [each.ended for each in result.recordings if each.failed]
+    losses += result.recording_errors
     if losses:
         raise failures.Incomplete("; ".join(losses))
 

@@ -11,8 +11,10 @@ import multiprocessing
 import os
 import signal
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
+from locatk.core.errors import LocatkError
 from locatk.core.streaming.events import BackgroundTask
 
 NICENESS = 19
@@ -49,22 +51,39 @@ class BackgroundWorker:
             except Exception as error:
                 self._future.set_exception(error)
             return
+        try:
+            self._future = self._submit(task)
+        except BrokenProcessPool:  # Its process ended while it was idle.
+            self._discard_process()
+            self._future = self._submit(task)
+
+    def _submit(self, task: BackgroundTask) -> Future[Any]:
         if self._executor is None:
             self._executor = ProcessPoolExecutor(
                 1, multiprocessing.get_context("spawn"), _lower_priority
             )
-        self._future = self._executor.submit(task.function, *task.arguments)
+        return self._executor.submit(task.function, *task.arguments)
+
+    def _discard_process(self) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(wait=False)
+            self._executor = None
 
     def result(self) -> tuple[BackgroundTask, Any] | None:
-        """Return a finished task with its result or exception, once; None if there is none."""
+        """Return a finished task with its result or exception, once; None if there is none.
+
+        A task whose process was ended by the system (such as for want of memory) has a LocatkError.
+        """
         if self._task is None or self._future is None or not self._future.done():
             return None
         task, future = self._task, self._future
         self._task = self._future = None
         error = future.exception()
-        if error is not None and self._executor is not None and _is_broken(error):
-            self._executor.shutdown(wait=False)
-            self._executor = None
+        if isinstance(error, BrokenProcessPool):
+            self._discard_process()
+            error = LocatkError(
+                f"the process of the {task.name} was ended", hint="Free some memory"
+            )
         return task, future.result() if error is None else error
 
     def close(self) -> None:
@@ -76,12 +95,6 @@ class BackgroundWorker:
         for process in processes:
             with contextlib.suppress(Exception):
                 process.terminate()
-
-
-def _is_broken(error: BaseException) -> bool:
-    from concurrent.futures.process import BrokenProcessPool
-
-    return isinstance(error, BrokenProcessPool)
 
 
 def _lower_priority() -> None:

@@ -104,6 +104,45 @@ class ArrivalQueue:
         return [self._arrivals.popleft() for _ in range(len(self._arrivals))]
 
 
+class RecordedOrder:
+    """Merges the events of replayed inputs in the order of their times.
+
+    Which thread of a reader runs first does not matter: an event is held back until every other
+    input that has not ended has a later one.
+
+    Parameters
+    ----------
+    inputs : int
+        Number of inputs.
+    """
+
+    def __init__(self, inputs: int) -> None:
+        self._waiting: list[deque[Arrival]] = [deque() for _ in range(inputs)]
+        self._last_ns = [0] * inputs
+        self._ended: set[int] = set()
+
+    def merge(self, arrivals: Sequence[Arrival]) -> Iterator[Arrival]:
+        """Yield the events whose turn has come, after further ones."""
+        for arrival in arrivals:
+            self._waiting[arrival.source].append(arrival)
+        while all(queue or n in self._ended for n, queue in enumerate(self._waiting)):
+            times = [(self._time_ns(queue[0]), n) for n, queue in enumerate(self._waiting) if queue]
+            if not times:
+                return
+            time_ns, number = min(times)
+            arrival = self._waiting[number].popleft()
+            self._last_ns[number] = time_ns
+            if isinstance(arrival.event, SourceEnded):
+                self._ended.add(number)
+            yield arrival
+
+    def _time_ns(self, arrival: Arrival) -> int:
+        """Return the time of an event; the end of an input is at its last byte."""
+        if isinstance(arrival.event, SourceEnded):
+            return self._last_ns[arrival.source]
+        return arrival.event.time_ns
+
+
 @dataclass(frozen=True)
 class InputNotice:
     """Change of an input that its users must know.
@@ -143,12 +182,12 @@ class LiveInput:
     keeps_time : bool
         Its bytes have the times of a recording.
     is_connected, is_ended : bool
-    newest_ns : int
-        Time of its newest observation.
     dropped_bytes : int
         Bytes that the solver did not take because it was late.
     recording : RecordingResult or None
         Result of the recorder, once it has ended.
+    recording_error : str
+        Reason why the recording is incomplete; ``""`` if it is not.
     """
 
     def __init__(
@@ -166,9 +205,9 @@ class LiveInput:
         self.is_paced = source.port.can_reconnect
         self.keeps_time = getattr(source.port, "keeps_time", False)
         self.is_connected, self.is_ended = True, False
-        self.newest_ns = 0
         self.dropped_bytes = 0
         self.recording: RecordingResult | None = None
+        self.recording_error = ""
         self.artifacts = AttachedArtifacts(source.artifacts)
         self._clock, self._queue = clock, queue
         # Each is written by one thread only.
@@ -236,10 +275,13 @@ class LiveInput:
         try:
             self.recording = recorder.run(self._stop_recorder)
         except Exception as error:  # A fault of the recorder must not end the solver.
-            tell(f"the recording failed: {type(error).__name__}: {error}")
+            self.recording_error = f"{type(error).__name__}: {error}"
+            tell(f"the recording failed: {self.recording_error}")
             return
         finally:
             shared.detach()
+        if self.recording.failed:
+            self.recording_error = self.recording.ended
         if self.recording.failed and self.recording.ended != self._end_error:
             tell(f"the recording ended: {self.recording.ended}")
 
@@ -260,6 +302,8 @@ class LiveInput:
         self._stop_recorder.set()
         if self._thread is not None:
             self._thread.join(timeout_s)
+            if self._thread.is_alive():
+                self.recording_error = f"the disk is too slow: not finished after {timeout_s:g} s"
 
     def complete_ns(self, now_ns: int) -> int:
         """Return the time up to which everything that was received has been decoded."""

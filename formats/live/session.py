@@ -3,16 +3,22 @@
 There is one thread per input that only reads; one per recording; this one, which decodes and
 solves; and those of the sinks. A sink, a recorder or a background computation never delays the
 solver (docs/live.md).
+
+Replays are an exception. Their time is that of the recordings: events of all inputs are solved in
+the order of their times, the stream learns from them how much time has passed, and
+background computations are done at once. Hence the results do not depend on the speed of the
+replay, on threads, or on the machine.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
 
@@ -28,6 +34,7 @@ from locatk.core.streaming.events import (
 )
 from locatk.core.streaming.localizer import LiveLocalizer
 from locatk.formats.capture.clocks import HostClock, ReplayClock
+from locatk.formats.capture.reader_thread import SourceEnded
 from locatk.formats.capture.setup import CAMERA, CaptureRequest, is_session_address
 from locatk.formats.capture.status import RecordingResult
 from locatk.formats.live.background import BackgroundWorker
@@ -36,15 +43,18 @@ from locatk.formats.live.inputs import (
     ArrivalQueue,
     InputNotice,
     LiveInput,
+    RecordedOrder,
     open_inputs,
 )
 from locatk.formats.live.observations import Observations, system_of
 from locatk.formats.live.recorded_events import RecordedEvents
 from locatk.formats.live.streams import StreamOptions, create_stream, system_of_artifacts
-from locatk.formats.sinks.interface import LiveMessage, Sink, SinkContext
+from locatk.formats.sinks.interface import LiveMessage, Sink, SinkContext, SinkStatus
 
 TICK_S = 0.05
 """Longest wait for data, and interval at which the stream learns how much time has passed."""
+
+TICK_NS = int(1e9 * TICK_S)
 
 MIN_INTERVAL_S = 0.001
 """Shortest time between two calls of the solver: what arrives meanwhile is solved at once."""
@@ -103,8 +113,9 @@ class LiveResult:
     Attributes
     ----------
     ended : str
-        Reason of the end: ``"stopped"``, ``"duration"``, ``"end of the source"``, or an error.
-    failed : bool
+        Reason of the end: ``"stopped"``, ``"duration"`` or ``"end of the source"``.
+    recording_errors : list of str
+        Reasons why recordings are incomplete.
     system : str
     poses : dict of str to int
         Number of poses by device.
@@ -114,7 +125,7 @@ class LiveResult:
     """
 
     ended: str
-    failed: bool
+    recording_errors: list[str]
     system: str
     poses: dict[str, int]
     recordings: list[RecordingResult]
@@ -172,7 +183,9 @@ class LiveSession:
         self._is_late = False
         self._is_sink_open = False
         self._started_s = 0.0
-        self._advanced_ns = 0
+        self._replay: RecordedOrder | None = None
+        self._replayed_ns = 0
+        self._sink_errors: dict[int, str] = {}
         self._scene_version = 0
         self._rejected: dict[str, int] = {}
         self.system = ""
@@ -204,22 +217,23 @@ class LiveSession:
         """
         inputs = open_inputs(self._request.inputs, self._clock, stop, self._queue, waiting=waiting)
         self._inputs = inputs
-        ended, is_failed = "stopped", False
+        if all(each.keeps_time for each in inputs):
+            self._replay = RecordedOrder(len(inputs))
+            self._worker = BackgroundWorker(is_synchronous=True)
+        ended = ""
         try:
             self._prepare()
             self._open_sinks()
             self._start()
             ready()
             ended = self._work(stop)
-        except LocatkError:
-            is_failed = True
-            raise
         finally:
-            self._close(solve_rest=not is_failed)
+            # After an error of the solver, its next result would be wrong or another error.
+            self._close(solve_rest=bool(ended))
         recordings = [each.recording for each in inputs if each.recording is not None]
         return LiveResult(
             ended,
-            any(each.failed for each in recordings),
+            [each.recording_error for each in inputs if each.recording_error],
             self.system,
             {name: device.poses for name, device in self._devices.items()},
             recordings,
@@ -233,7 +247,6 @@ class LiveSession:
         system = system_of_artifacts(texts)
         if system:
             self._create_localizer(system)
-        self._worker = BackgroundWorker(is_synchronous=self._is_replay)
 
     def _create_localizer(self, system: str) -> None:
         stream, self._artifacts = create_stream(
@@ -250,16 +263,25 @@ class LiveSession:
             self._request.token,
             self.status,
         )
-        opened: list[Sink] = []
-        try:
-            for sink in self._sinks:
+        for index, sink in enumerate(self._sinks):
+            try:
                 sink.open(context)
-                opened.append(sink)
-        except LocatkError:
-            for sink in opened:
-                sink.close(0.0)
-            raise
+            except Exception as error:
+                for opened in self._sinks[:index]:
+                    self._close_sink(opened, 0.0)
+                if isinstance(error, LocatkError):
+                    raise
+                raise LocatkError(
+                    f"{sink.address} cannot be opened: {describe(error)}",
+                    hint="Omit it, or update its package",
+                ) from error
         self._is_sink_open = True
+
+    @staticmethod
+    def _close_sink(sink: Sink, timeout_s: float) -> None:
+        # Sinks of other packages may raise; there is nobody left to be told.
+        with contextlib.suppress(Exception):
+            sink.close(timeout_s)
 
     def _start(self) -> None:
         # Objects of the imports are no garbage: a search through them takes 13 ms.
@@ -272,25 +294,31 @@ class LiveSession:
             each.start(tell=self._tell, further=recorded.take)
 
     def _close(self, *, solve_rest: bool) -> None:
-        for each in self._inputs:
-            each.stop_reading()
-        if solve_rest:
-            self._take(self._queue.take(0.0))
-            if self._localizer is not None:
-                self._publish(self._localizer.finish(), time.monotonic())
-        self._worker.close()
-        for each in self._inputs:
-            each.stop_recording(RECORDING_TIMEOUT_S)
-        if self._is_sink_open:
-            closing = [
-                threading.Thread(target=sink.close, args=(CLOSE_TIMEOUT_S,), daemon=True)
-                for sink in self._sinks
-            ]
-            for thread in closing:
-                thread.start()
-            for thread in closing:
-                thread.join(CLOSE_TIMEOUT_S + 0.5)
-        gc.unfreeze()
+        try:
+            for each in self._inputs:
+                each.stop_reading()
+            if solve_rest:
+                self._take(self._queue.take(0.0))
+                if self._localizer is not None:
+                    self._publish(self._localizer.finish(), time.monotonic())
+        finally:
+            self._worker.close()
+            for each in self._inputs:
+                each.stop_recording(RECORDING_TIMEOUT_S)
+            if self._is_sink_open:
+                self._close_sinks()
+            gc.unfreeze()
+
+    def _close_sinks(self) -> None:
+        closing = [
+            threading.Thread(target=self._close_sink, args=(sink, CLOSE_TIMEOUT_S), daemon=True)
+            for sink in self._sinks
+        ]
+        for thread in closing:
+            thread.start()
+        until_s = time.monotonic() + CLOSE_TIMEOUT_S + 0.5
+        for thread in closing:
+            thread.join(max(0.0, until_s - time.monotonic()))
 
     # ---- solver
 
@@ -309,7 +337,8 @@ class LiveSession:
             if now_s - advanced_s >= TICK_S:
                 advanced_s = now_s
                 self._advance(now_s)
-            self._serve_background()
+            if self._replay is None:
+                self._serve_background()
             if stop.is_set():
                 return "stopped"
             duration_s = self._request.duration_s
@@ -320,28 +349,37 @@ class LiveSession:
 
     def _take(self, arrivals: Sequence[Arrival]) -> None:
         """Decode and solve what has arrived."""
-        for number, group in groupby(arrivals, key=lambda arrival: arrival.source):
-            batch = list(group)
-            self._check_lateness(batch[0].received_s)
-            source = self._inputs[number]
-            # The results of a replay do not depend on how much of it is read at once.
-            pieces = [batch] if not self._is_replay else [[each] for each in batch]
-            for piece in pieces:
-                events = [each.event for each in piece]
-                self._solve(source, source.decode(events), piece[-1].received_s)
-                if self._is_replay:
-                    self._follow_replay()
+        if self._replay is not None:
+            self._take_recorded(self._replay.merge(arrivals))
+            return
+        for _, group in groupby(arrivals, key=lambda arrival: arrival.source):
+            self._take_batch(list(group))
 
-    def _follow_replay(self) -> None:
-        """Let the time of a replay pass, which is that of its observations."""
-        self._serve_background()
-        newest_ns = [each.newest_ns for each in self._inputs if not each.is_ended]
-        time_ns = min(newest_ns, default=0)
-        if time_ns - self._advanced_ns >= TICK_S * 1e9:
-            self._advanced_ns = time_ns
-            if self._localizer is not None and time_ns > ARRIVAL_DELAY_NS:
-                events = self._localizer.advance(time_ns - ARRIVAL_DELAY_NS)
-                self._publish(events, time.monotonic())
+    def _take_recorded(self, arrivals: Iterable[Arrival]) -> None:
+        """Decode and solve events of a replay; time passes in steps between them."""
+        batch: list[Arrival] = []
+        for arrival in arrivals:
+            time_ns = arrival.event.time_ns
+            is_end = isinstance(arrival.event, SourceEnded)
+            is_step = not is_end and time_ns - self._replayed_ns >= TICK_NS
+            if batch and (is_step or arrival.source != batch[0].source):
+                self._take_batch(batch)
+                batch = []
+            if is_step:
+                # Only here, because batches depend on the threads of the readers.
+                self._serve_background()
+                self._replayed_ns = time_ns
+                self._pass_time(time_ns, arrival.received_s)
+            batch.append(arrival)
+        if batch:
+            self._take_batch(batch)
+
+    def _take_batch(self, batch: Sequence[Arrival]) -> None:
+        """Decode and solve successive events of one input."""
+        self._check_lateness(batch[0].received_s)
+        source = self._inputs[batch[0].source]
+        events = [each.event for each in batch]
+        self._solve(source, source.decode(events), batch[-1].received_s)
 
     def _solve(
         self,
@@ -363,26 +401,24 @@ class LiveSession:
             if system and system != self.system:
                 self._report_once("other_system", f"data of {system} are not used", received_s)
                 continue
-            source.newest_ns = max(source.newest_ns, _last_ns(each))
             self._publish(self._localizer.push(each), received_s)
 
     def _advance(self, now_s: float) -> None:
-        """Tell the stream that time has passed."""
-        for source in self._inputs:
-            self._solve(source, source.identify(self._clock.now()), now_s)
+        """Update the counts, and tell the stream that time has passed."""
         for device in self._devices.values():
             device.count(now_s)
         self._rejected = self._count_rejected()
-        if self._localizer is None or self._is_replay:
-            return
-        time_ns = min(each.complete_ns(self._clock.now()) for each in self._inputs)
-        if time_ns > ARRIVAL_DELAY_NS:
-            self._publish(self._localizer.advance(time_ns - ARRIVAL_DELAY_NS), now_s)
+        if self._replay is None:
+            now_ns = self._clock.now()
+            time_ns = min(each.complete_ns(now_ns) for each in self._inputs)
+            self._pass_time(time_ns, now_s)
 
-    @property
-    def _is_replay(self) -> bool:
-        """Return whether time is that of recordings, and stands still while the solver works."""
-        return all(each.keeps_time for each in self._inputs)
+    def _pass_time(self, time_ns: int, received_s: float) -> None:
+        """Tell decoders and stream that everything up to a time has been decoded."""
+        for source in self._inputs:
+            self._solve(source, source.identify(time_ns), received_s)
+        if self._localizer is not None and time_ns > ARRIVAL_DELAY_NS:
+            self._publish(self._localizer.advance(time_ns - ARRIVAL_DELAY_NS), received_s)
 
     def _serve_background(self) -> None:
         if self._localizer is None:
@@ -424,9 +460,27 @@ class LiveSession:
                 self._warnings[event.warning.message] += 1
             message = LiveMessage(event, received_s)
             for sink in self._sinks:
-                sink.offer(message)
+                try:
+                    sink.offer(message)
+                except Exception as error:  # Of another package: the others go on.
+                    self._note_sink_error(sink, error)
             for number in self._recorders_of(event):
                 self._recorded[number].add(event)
+
+    def _note_sink_error(self, sink: Sink, error: Exception) -> None:
+        """Report the first error of a sink, and keep the last one for the status."""
+        is_first = id(sink) not in self._sink_errors
+        self._sink_errors[id(sink)] = describe(error)
+        if is_first:
+            self._tell(f"{sink.address} failed: {describe(error)}")
+
+    def _sink_status(self, sink: Sink) -> SinkStatus:
+        error = self._sink_errors.get(id(sink), "")
+        try:
+            status = sink.status()
+        except Exception as failure:  # Of another package.
+            return SinkStatus(error=describe(failure), address=sink.address)
+        return status if status.error or not error else replace(status, error=error)
 
     def _recorders_of(self, event: LiveEvent) -> list[int]:
         """Return the inputs in whose recording an event belongs."""
@@ -454,7 +508,7 @@ class LiveSession:
         ``ok`` is false if an input is disconnected, a recording has failed, the solver is late, or
         a sink does not work; lost devices do not count. Sinks call it in threads of their own.
         """
-        sinks = [sink.status() for sink in self._sinks]
+        sinks = [self._sink_status(sink) for sink in self._sinks]
         inputs: list[dict[str, Any]] = [
             {
                 "name": each.name,
@@ -469,9 +523,7 @@ class LiveSession:
                 else {
                     "file": str(each.request.output),
                     "running": each.is_recording,
-                    "error": each.recording.ended
-                    if each.recording is not None and each.recording.failed
-                    else "",
+                    "error": each.recording_error,
                 },
             }
             for each in self._inputs
@@ -534,6 +586,8 @@ def _is_session(port: str) -> bool:
     return port.startswith(CAMERA) and is_session_address(port.removeprefix(CAMERA))
 
 
-def _last_ns(observations: Observations) -> int:
-    """Return the time of the newest observation."""
-    return int(observations.time_ns[-1]) if len(observations.time_ns) else 0
+def describe(error: Exception) -> str:
+    """Return an error of any kind on one line."""
+    if isinstance(error, LocatkError):
+        return str(error)
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
