@@ -15,7 +15,7 @@ from typing import Any
 
 from locatk.core.errors import InputError, LocatkError
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
-from locatk.formats.emulation.sources import select_source
+from locatk.formats.emulation.sources import replayed_source
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions.reader import Session
 
@@ -201,6 +201,6 @@ def _chunks(session: Session, topic: str) -> Generator[tuple[int, bytes], None, 
 def _encoded(session: Session) -> Generator[tuple[int, bytes], None, None]:
     """Yield the bytes of observations as a device would send them."""
     try:
-        yield from select_source(session).packets()
+        yield from replayed_source(session).packets()
     except InputError as error:
         raise LinkLost(str(error)) from error

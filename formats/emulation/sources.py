@@ -80,6 +80,22 @@ def select_source(session: Session, name: str | None = None) -> ByteSource:
     )
 
 
+def replayed_source(session: Session) -> ByteSource:
+    """Return the bytes that a replay of a session consists of.
+
+    They are those of :func:`select_source`, but a magnetometer array with odometry is encoded as
+    the device that sends both.
+
+    Raises
+    ------
+    InputError, FormatError
+        See :func:`select_source`.
+    """
+    has_odometry = bool(session.topics("/odometry/", "locatk.Odometry"))
+    is_array = _default_device(session) == "polaris-array"
+    return select_source(session, "locatk" if is_array and has_odometry else None)
+
+
 def _recorded_packets(session: Session, topic: str) -> Iterator[tuple[int, bytes]]:
     """Yield the bytes of each read of a recording, with its time."""
     for _, time_ns, payload in session.messages([topic]):

@@ -38,7 +38,7 @@ from locatk.formats.capture.setup import (
     open_source,
 )
 from locatk.formats.capture.status import RecordingResult
-from locatk.formats.emulation.sources import select_source
+from locatk.formats.emulation.sources import replayed_source
 from locatk.formats.live.observations import (
     AttachedArtifacts,
     Observations,
@@ -465,4 +465,4 @@ def _as_source(request: CaptureRequest) -> CaptureRequest:
         )
     if any(session.topics(TOPIC, schema) for schema in SCHEMAS):
         return replace(request, port=f"{CAMERA}{file}")
-    return replace(request, device=select_source(session).device)
+    return replace(request, device=replayed_source(session).device)

@@ -17,7 +17,12 @@ from locatk.core.polaris.array import Samples, SensorArray, bar
 from locatk.core.trajectory import Trajectory
 from locatk.formats import devices as wire
 from locatk.formats.devices.interface import Recording
-from locatk.formats.emulation.sources import SYSTEMS, select_source, write_simulated_session
+from locatk.formats.emulation.sources import (
+    SYSTEMS,
+    replayed_source,
+    select_source,
+    write_simulated_session,
+)
 from locatk.formats.schemas.serial_pb2 import SerialChunk
 from locatk.formats.sessions import field_samples, observations
 from locatk.formats.sessions.reader import Session
@@ -139,6 +144,14 @@ def test_streams_are_encoded(tmp_path: Path, recordings: list[Recording]) -> Non
     assert track.device == "bar"
     assert recordings[0].sweeps is None
     assert not recordings[0].halls
+
+
+def test_a_replay_keeps_the_odometry_of_an_array(tmp_path: Path) -> None:
+    session = of_samples(tmp_path / "run.mcap")
+    assert select_source(session).device == "polaris-array", "it sends no odometry"
+    assert replayed_source(session).device == "locatk"
+    assert replayed_source(of_sweeps(tmp_path / "sweeps.mcap")).device == "dotbot-gateway"
+    assert replayed_source(of_bytes(tmp_path / "bytes.mcap", "lines")).device == "lines"
 
 
 def test_all_streams_reach_the_device(tmp_path: Path, recordings: list[Recording]) -> None:
