@@ -1,8 +1,9 @@
 """Remake the pictures of the documentation from the outputs of commands.
 
 The ``sh`` blocks of a first-hour guide run in order in a temporary folder; other pictures are made
-by :data:`COMMANDS`. The outputs are cropped and scaled. ``locatk`` must be on the PATH, with
-``locatk[test]`` (for pypdfium2); HTML needs Chromium.
+by :data:`COMMANDS`. The outputs are cropped and scaled. Pictures of the page of ``locatk live`` are
+taken while it plays a session. ``locatk`` must be on the PATH, with ``locatk[test]`` (for
+pypdfium2); HTML needs Chromium.
 
 Examples
 --------
@@ -16,9 +17,12 @@ Examples
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import shutil
+import socket
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -39,6 +43,9 @@ CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 
 TIMEOUT_S = 60.0
 """Time limit of the browser, and of `locatk emulate` until its port exists."""
+
+LIVE_SIZE_PX = (1300, 850)
+"""Width and height of the window with the page of `locatk live`."""
 
 
 @dataclass(frozen=True)
@@ -67,20 +74,47 @@ class Picture:
     box: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
 
 
-PICTURES = {
+@dataclass(frozen=True)
+class LivePicture:
+    """Picture of the page of ``locatk live`` while it plays a session.
+
+    Attributes
+    ----------
+    name : str
+        As of :class:`Picture`.
+    command : str
+        ``locatk live replay:...``, without its sink.
+    pose : int
+        Number of poses of all devices after which the picture is taken.
+    width : int
+        Width in pixels.
+    """
+
+    name: str
+    command: str
+    pose: int
+    width: int = 900
+
+
+PICTURES: dict[str, tuple[Picture | LivePicture, ...]] = {
     "lighthouse": (
         Picture("first-hour-lighthouse", "report.png"),
         Picture("first-hour-lighthouse-report", "report.html", 800),
+        LivePicture(
+            "first-hour-lighthouse-live", "locatk live replay:run.mcap --artifact scene.toml", 150
+        ),
     ),
     "polaris": (
         Picture("first-hour-polaris", "report.png"),
         Picture("first-hour-polaris-tag", "tags.pdf", 480, box=(0.2, 0.06, 0.82, 0.475)),
         Picture("first-hour-polaris-report", "report.html", 800),
+        LivePicture("first-hour-polaris-live", "locatk live replay:tour.mcap", 550),
     ),
     "dots": (
         Picture("first-hour-dots", "report.png"),
         Picture("first-hour-dots-sheet", "floor.pdf", 640, box=(0.0, 0.935, 0.14, 0.99)),
         Picture("first-hour-dots-report", "report.html", 800),
+        LivePicture("first-hour-dots-live", "locatk live replay:sim.mcap", 110),
     ),
     "landmarks": (
         Picture("first-hour-landmarks", "report.png"),
@@ -89,6 +123,9 @@ PICTURES = {
             "first-hour-landmarks-template", "pack.pdf", 480, page=2, box=(0.04, 0.02, 1.0, 0.74)
         ),
         Picture("first-hour-landmarks-report", "report.html", 800),
+        LivePicture(
+            "first-hour-landmarks-live", "locatk live replay:drive.mcap --artifact halls.toml", 860
+        ),
     ),
     "demo": (Picture("demo", "demo/lighthouse.png", 1200),),
     "floor": (
@@ -171,6 +208,46 @@ def running(line: str, folder: Path) -> Iterator[None]:
         process.wait()
 
 
+# ---- page of a live session
+
+
+def live_page(picture: LivePicture, folder: Path) -> Image.Image:
+    """Play a session, and return the page once its poses are there.
+
+    Raises
+    ------
+    SystemExit
+        The session ended before.
+    """
+    sys.path.insert(0, str(DOCS.parent / "tests"))
+    from live_servers import Browser
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    url = f"http://127.0.0.1:{port}/"
+    browser = Browser(Path(tempfile.mkdtemp(dir=folder)))
+    command = f"{picture.command} --to web://:{port} --json"
+    print(f"  {command}")
+    process = subprocess.Popen(
+        command.split(), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        poses = 0
+        assert process.stdout is not None
+        for line in process.stdout:
+            if poses == 0:
+                browser.open(url, *LIVE_SIZE_PX)
+            poses += json.loads(line)["type"] == "pose"
+            if poses == picture.pose:
+                return Image.fromarray(browser.picture())
+        raise SystemExit(f"{command} ended after {poses} poses")
+    finally:
+        process.terminate()
+        process.wait()
+        browser.close()
+
+
 # ---- pictures
 
 
@@ -245,7 +322,9 @@ def main() -> None:
                 run_guide(DOCS / f"first-hour-{source}.md", folder)
             for picture in PICTURES[source]:
                 path = DOCS / "images" / f"{picture.name}.png"
-                write(read(picture, folder), path, picture.width)
+                is_live = isinstance(picture, LivePicture)
+                image = live_page(picture, folder) if is_live else read(picture, folder)
+                write(image, path, picture.width)
 
 
 if __name__ == "__main__":

@@ -52,6 +52,7 @@ from locatk.formats.live.session_replay import (
 )
 from locatk.formats.sessions.capture_statistics import CaptureStatistics
 from locatk.formats.sessions.frames import SCHEMAS, TOPIC
+from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.reader import Session
 
 MAX_WAITING_BYTES = 8 << 20
@@ -512,7 +513,11 @@ def _open(
     """Open an input; a replay by its content: raw bytes, camera frames or decoded observations."""
     session = _replayed_session(request)
     if session is not None:
-        if any(session.topics(TOPIC, schema) for schema in SCHEMAS):
+        if session.topics("/serial/"):
+            recorded_by = session.metadata().get(CAPTURE_RECORD, {}).get("device")
+            if recorded_by and request.device == AUTO:
+                request = replace(request, device=recorded_by)
+        elif any(session.topics(TOPIC, schema) for schema in SCHEMAS):
             request = replace(request, port=f"{CAMERA}{session.path}")
         elif observation_topics(session):
             content = check_request(request)
@@ -527,13 +532,12 @@ def _open(
 
 
 def _replayed_session(request: CaptureRequest) -> Session | None:
-    """Return the session without raw bytes that a request replays; None if there is none."""
+    """Return the session that a request replays; None if there is none."""
     file = request.port[len(REPLAY) :].removeprefix("//")
     is_replay = request.port.lower().startswith(REPLAY) and request.keeps_time
     if not (is_replay and os.path.exists(file)):
         return None
     try:
-        session = Session.open(file, damaged_ok=True)
+        return Session.open(file, damaged_ok=True)
     except LocatkError:
         return None  # Opening it as a port reports the error with a hint.
-    return None if session.topics("/serial/") else session

@@ -130,8 +130,6 @@ class LighthouseStream:
         self._detected_sweeps = 0
         if self._prior.stations:
             self._use_scene(self._prior)
-            for note in self._prior.notes:
-                self._warn(SolverWarning("scene_assumption", note))
         else:
             self._store = SweepStore()
 
@@ -216,6 +214,9 @@ class LighthouseStream:
         if self._now_ns is None:
             self._now_ns = self._start_ns = time_ns
             self._next_tick_ns = time_ns + TICK_NS
+            if self._known is not None:
+                for note in self._prior.notes:
+                    self._warn(SolverWarning("scene_assumption", note))
         self._advance_ticks(time_ns)
         if sensor > 0:
             self._multiple.add(name)

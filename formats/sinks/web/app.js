@@ -101,10 +101,26 @@
     addEvent(message);
   }
 
+  function remove(device) {
+    devices.delete(device.name);
+    device.row.remove();
+    for (const option of Array.from($("follow").options)) {
+      if (option.value === device.name) option.remove();
+    }
+  }
+
   function deviceOf(name) {
     let device = devices.get(name);
     if (device) return device;
-    device = { name, index: devices.size, pose: null, received: -Infinity, state: "", reason: "",
+    let index = devices.size;
+    // The devices behind a port, such as the robots of a gateway, replace its name.
+    for (const other of devices.values()) {
+      if (!other.pose && !other.state && name.startsWith(other.name + "-")) {
+        index = other.index;
+        remove(other);
+      }
+    }
+    device = { name, index, pose: null, received: -Infinity, state: "", reason: "",
                stateTime: -Infinity, detection: "", rate: null, latency: null, trail: [],
                appended: 0, painted: 0 };
     device.row = newRow(device);
@@ -926,6 +942,9 @@
     if (Array.isArray(d.cell)) parts.push("landmark " + d.cell.join(","));
     else if ("cell" in d && d.code != null) parts.push("landmark of unknown cell");
     else if ("cell" in d) parts.push("landmark not read");
+    if (d.turn_rad != null) {
+      parts.push(`heading corrected by ${(d.turn_rad * 180 / Math.PI).toFixed(1)}°, tag ${d.from} to ${d.to}`);
+    }
     if (d.refused) parts.push("refused: " + String(d.refused).replaceAll("_", " "));
     return parts.join(", ") || "detection";
   }

@@ -496,6 +496,16 @@ def test_what_a_scene_lacks_is_said_once() -> None:
     assert not fixes_of(events)
 
 
+def test_notes_of_a_scene_are_said_with_the_first_sweep() -> None:
+    session = simulated(PHOTODIODES)
+    scene = replace(session.true_scene, notes=("stations were measured by hand",))
+    stream = LighthouseStream(scene, {})
+    assert not stream.advance(int(session.sweeps.time_ns[0]))
+    events = [event for piece in cut(session.sweeps) for event in stream.push(piece)]
+    (note,) = [event for event in events if codes([event]) == ["scene_assumption"]]
+    assert note.time_ns == int(session.sweeps.time_ns[0])
+
+
 def test_an_error_of_the_program_is_not_hidden() -> None:
     task = BackgroundTask("scene", len)
     with pytest.raises(ZeroDivisionError):

@@ -98,6 +98,22 @@ def test_the_page_shows_devices_states_and_events(servers: ModuleType, browser: 
         assert browser.console == []
 
 
+def test_devices_behind_a_port_replace_its_name(servers: ModuleType, browser: Any) -> None:
+    inputs = SinkContext("lighthouse", {}, ("gateway", "red"))
+    with servers.running(create, "web://:0", inputs) as sink:
+        browser.open(sink.url)
+        browser.wait("document.querySelectorAll('#rows tr').length === 2")
+        for name in ("gateway-1", "gateway-2"):
+            servers.offer(sink, servers.pose(name))
+        browser.wait("document.getElementById('rows').innerText.includes('gateway-2')")
+        names = "[...document.querySelectorAll('#rows tr td')].map((each) => each.innerText)"
+        rows = [text.strip() for text in browser.evaluate(names)]
+        assert {"red", "gateway-1", "gateway-2"} <= set(rows)
+        assert "gateway" not in rows
+        browser.wait("document.body.innerText.includes('2 of 3 devices tracking')")
+        assert browser.console == []
+
+
 def fraction(image: Any, color: str, tolerance: int = 12) -> float:
     channels = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
     return float(np.mean(np.abs(image.astype(np.int16) - channels).max(axis=-1) < tolerance))
