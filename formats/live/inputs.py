@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from locatk.core.errors import LocatkError
 from locatk.formats.capture.clocks import HostClock
 from locatk.formats.capture.ingestion import (
+    AUTO,
     CameraIntake,
     SerialIntake,
     StampedMessage,
