@@ -20,7 +20,7 @@ from locatk.formats.live import session as live_session
 from locatk.formats.live.session import LiveRequest, LiveResult, LiveSession
 from locatk.formats.sinks.interface import LiveMessage, SinkContext, SinkStatus
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 8.0
 """Longer than anything here takes."""
 
 
