@@ -137,7 +137,7 @@ class LiveText:
             console.say(text)
 
     def _refresh(self) -> None:
-        while not self._stopping.wait(REFRESH_S):
+        while console.talks() and not self._stopping.wait(REFRESH_S):
             lines = device_lines(self._session.devices, shutil.get_terminal_size().columns)
             with self._lock:
                 self._wipe()
@@ -178,15 +178,20 @@ def _is_null_device(stream: Any) -> bool:
 
 
 def device_lines(devices: dict[str, Any], columns: int) -> list[str]:
-    """Return a line per device that fits into ``columns`` characters."""
-    return [
-        console.colour(line[: columns - 1], COLOURS[str(device.state)])
-        for name, device in sorted(devices.items())
-        for line in [f"{name:<10} {_device_text(device)}"]
-    ]
+    """Return a line per device that fits into ``columns`` characters.
+
+    On a narrow terminal, rate and latency are omitted before the state would be cut off.
+    """
+    lines = []
+    for name, device in sorted(devices.items()):
+        line = console.on_one_line(f"{name:<10} {_device_text(device)}")
+        if len(line) >= columns:
+            line = console.on_one_line(f"{name:<10} {_device_text(device, is_short=True)}")
+        lines.append(console.colour(line[: columns - 1], COLOURS[str(device.state)]))
+    return lines
 
 
-def _device_text(device: Any) -> str:
+def _device_text(device: Any, *, is_short: bool = False) -> str:
     pose = device.pose
     state = f"{device.state}" + (f": {device.reason}" if device.reason else "")
     if pose is None:
@@ -199,7 +204,5 @@ def _device_text(device: Any) -> str:
         qx, qy, qz, qw = pose.quaternion.tolist()
         yaw = math.degrees(math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)))
         heading = f" {yaw:7.1f} deg"
-    return (
-        f"{x} {y} {z} m{heading}  +-{1e3 * spread:.1f} mm  {device.rate_hz:5.1f}/s  "
-        f"{1e3 * device.latency_s:4.1f} ms  {state}"
-    )
+    rate = f"{device.rate_hz:5.1f}/s  {1e3 * device.latency_s:4.1f} ms  "
+    return f"{x} {y} {z} m{heading}  +-{1e3 * spread:.1f} mm  {'' if is_short else rate}{state}"
