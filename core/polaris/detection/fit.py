@@ -691,7 +691,9 @@ class PassProblem:
         of a magnet), and a sensor over the whole path (its gains and axes).
         """
         length = CLUSTER_HEIGHTS * state.height_m
-        stretch = np.floor((state.path_m - state.path_m.min()) / length).astype(np.intp)
+        stretch = np.floor((state.path_m - state.path_m.min()) / length)
+        # Numbers of stretches with samples: a jump of the odometry is many without any.
+        stretch = np.unique(stretch, return_inverse=True)[1]
         sensor = np.arange(self.shape[0])[:, None] // 3
         partitions = (sensor * (int(stretch.max()) + 1) + stretch, sensor + 0 * stretch)
         first, second = (
