@@ -42,6 +42,7 @@ from locatk.core.landmarks.preprocessing import (
     sensor_motion,
 )
 from locatk.core.landmarks.sensor_statistics import SensorStatistics
+from locatk.core.streaming.plausibility import is_plausible_odometry, plausible_fields
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -243,15 +244,18 @@ class VisitStream:
             self._waiting_t = self._context_t = self._unjudged_t = np.empty((0, count))
             self._rows = Rows.empty(count + 9)
         is_new = samples.time_ns > self._sampled_ns
+        field_t = plausible_fields(samples.field_t[is_new])
         self._waiting_ns = np.concatenate([self._waiting_ns, samples.time_ns[is_new]])
-        self._waiting_t = np.concatenate([self._waiting_t, samples.field_t[is_new]])
+        self._waiting_t = np.concatenate([self._waiting_t, field_t])
         self._sampled_ns = max(self._sampled_ns, *samples.time_ns[-1:].tolist())
 
     def push_odometry(self, odometry: Trajectory) -> None:
         """Take the next poses."""
-        heading = heading_from_quaternion(odometry.quaternion)
-        is_finite = np.isfinite(odometry.quaternion).all(axis=1)
-        pose = np.column_stack([odometry.position[:, :2], np.where(is_finite, heading, np.nan)])
+        is_plausible = is_plausible_odometry(odometry)
+        with np.errstate(invalid="ignore", over="ignore"):
+            heading = heading_from_quaternion(odometry.quaternion)
+        pose = np.column_stack([odometry.position[:, :2], heading])
+        pose[~is_plausible] = np.nan
         self._odometry_ns = np.concatenate([self._odometry_ns, odometry.time_ns])
         self._odometry = np.concatenate([self._odometry, pose])
 

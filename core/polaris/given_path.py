@@ -36,6 +36,10 @@ MAX_COMPARED_SIGMA_M = 1e-3
 """Standard deviation of the path up to which a sample is compared [m]: far from the magnets, the
 samples do not determine the path."""
 
+MAX_GIVEN_PASS_M = 50.0
+"""Length of the given path of a pass from which odometry has jumped [m]. The field of a tag changes
+over less than a metre."""
+
 MIN_COMPARED_SAMPLES = 10
 """Number of samples that a comparison needs."""
 
@@ -74,10 +78,12 @@ def scale_to_apply(observation: TagObservation) -> float | None:
 
 
 def known_path(given_m: Array | None, part: PassRange) -> Array | None:
-    """Return the given path; None if it is unknown at a sample of a pass."""
-    if given_m is None or not np.isfinite(given_m[part.first : part.stop]).all():
+    """Return the given path; None if it is unknown at a sample of a pass, or jumps in it."""
+    if given_m is None:
         return None
-    return given_m
+    own_m = given_m[part.first : part.stop]
+    # The length is nan if a sample has no path.
+    return given_m if np.ptp(own_m) < MAX_GIVEN_PASS_M else None
 
 
 def compare_path(given_m: Array, observation: TagObservation) -> PathContradiction | None:

@@ -73,6 +73,7 @@ from locatk.core.streaming.events import (
     StreamEvent,
     WarningEvent,
 )
+from locatk.core.streaming.plausibility import is_plausible_odometry, plausible_fields
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -349,7 +350,8 @@ class _DeviceStream:
                 hint="Give each array a name of its own",
             )
         events: list[StreamEvent] = []
-        for time, field_t in zip(samples.time_ns.tolist(), samples.field_t, strict=True):
+        fields_t = plausible_fields(samples.field_t)
+        for time, field_t in zip(samples.time_ns.tolist(), fields_t, strict=True):
             if time < self.newest_ns:
                 message = "samples with a time before that of earlier ones were left out"
                 events += self._warn(self.newest_ns, "samples_out_of_order", message)
@@ -364,10 +366,9 @@ class _DeviceStream:
     def push_odometry(self, odometry: Trajectory) -> list[StreamEvent]:
         """Take poses of odometry, and return the results of samples that waited for them."""
         events: list[StreamEvent] = []
-        values = np.hstack([odometry.position[:, :2], odometry.quaternion])
         # Strictly ascending, also relative to earlier poses.
         latest = np.maximum.accumulate(np.append(self.odometry_ns, odometry.time_ns))[:-1]
-        is_valid = np.isfinite(values).all(axis=1) & (odometry.time_ns > latest)
+        is_valid = is_plausible_odometry(odometry) & (odometry.time_ns > latest)
         if not is_valid.all():
             message = (
                 "poses of the odometry that are not finite numbers, or not later than earlier "

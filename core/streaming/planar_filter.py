@@ -57,6 +57,9 @@ LOG_NOISE_PRIOR_INFORMATION, NOISE_MEMORY = 0.5, 0.98
 """Prior information of the logarithms of the factors of noise (a factor of 4 is one standard
 deviation), and the part of the information from fixes that remains at the next fix."""
 
+MAX_HEADING_VARIANCE_RAD2 = math.pi**2
+"""Largest variance of a step of the heading that an odometry reports: it is unknown then."""
+
 MAX_NOISE_FACTOR = 1000.0
 """Bound of these factors: 32 in the standard deviation."""
 
@@ -141,7 +144,7 @@ class PlanarFilter:
         distance = math.hypot(rx, ry)
         is_moving = distance > 0.0 or rotation != 0.0
         slip = (noise.slip_m, noise.slip_rad) if is_moving else (noise.rest_m, noise.rest_rad)
-        heading_variance = reported
+        heading_variance = min(reported, MAX_HEADING_VARIANCE_RAD2)
         if not reported > 0.0:
             heading_variance = noise.heading_rad**2 * distance + noise.rotation_rad**2 * abs(
                 rotation

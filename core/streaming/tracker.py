@@ -40,6 +40,11 @@ from locatk.core.streaming.inertial_filter import (
     InertialNoise,
 )
 from locatk.core.streaming.planar_filter import OdometryNoise, PlanarFilter
+from locatk.core.streaming.plausibility import (
+    MAX_ANGULAR_RATE_RAD_S,
+    MAX_COORDINATE_M,
+    MAX_SPECIFIC_FORCE_M_S2,
+)
 from locatk.core.trajectory import PROVISIONAL_PROBABILITY, Trajectory
 
 Array = NDArray[np.float64]
@@ -85,6 +90,9 @@ MAX_ODOMETRY_STEP_RAD = 0.5
 
 CONTRADICTION = "fix off the prediction"
 """Reason of a correction without a known source."""
+
+MAX_READINGS = np.repeat([MAX_SPECIFIC_FORCE_M_S2, MAX_ANGULAR_RATE_RAD_S], 3)
+"""Largest readings of accelerometer and gyroscope."""
 
 PROVISIONAL_REFUSALS = 3
 """Number of provisional fixes in a row that end a pose that was certain."""
@@ -299,8 +307,8 @@ class DeviceTracker:
             self._begin_odometry()
         assert self._history is not None
         before, before_ns = self._odometry_pose, self._history.motion_time_ns
-        is_finite = all(math.isfinite(value) for value in pose[:3])
-        if not is_finite or (before_ns is not None and time_ns <= before_ns):
+        is_plausible = all(abs(value) < MAX_COORDINATE_M for value in pose[:3])
+        if not is_plausible or (before_ns is not None and time_ns <= before_ns):
             self.counts["bad_motions"] += 1
             return []
         events = self._expire(time_ns)
@@ -331,9 +339,9 @@ class DeviceTracker:
             model = InertialFilter(self.settings.inertial)
             self._history = FilterHistory(model, INERTIAL_CAPACITY)
         before, before_ns = self._reading, self._history.motion_time_ns
-        if before is not None:
-            # A sensor that was not sampled keeps its reading.
-            reading = np.where(np.isfinite(reading), reading, before)
+        is_plausible = np.abs(reading) < MAX_READINGS
+        # A sensor that was not sampled keeps its reading.
+        reading = np.where(is_plausible, reading, np.nan if before is None else before)
         if not np.isfinite(reading).all() or (before_ns is not None and time_ns <= before_ns):
             self.counts["bad_motions"] += 1
             return []

@@ -54,7 +54,7 @@ from locatk.core.lighthouse.noise import (
 )
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.core.lighthouse.stream.known_scene import KnownScene
-from locatk.core.lighthouse.stream.recent_path import SPEED_SIGMA_M_S, RecentPath
+from locatk.core.lighthouse.stream.recent_path import MAX_LATENESS_NS, SPEED_SIGMA_M_S, RecentPath
 from locatk.core.streaming.events import Fix
 
 Array = NDArray[np.float64]
@@ -111,6 +111,8 @@ class PhotodiodeState:
     Attributes
     ----------
     name : str
+    newest_ns : int
+        Time of its newest sweep.
     lone : dict of int to (int, float, int, bool)
         By station: time, count, plane and label of a sweep that has no partner yet.
     pairs : dict of int to deque of Pair
@@ -119,6 +121,7 @@ class PhotodiodeState:
     """
 
     name: str
+    newest_ns: int = 0
     lone: dict[int, tuple[int, float, int, bool]] = field(default_factory=dict)
     pairs: dict[int, deque[Pair]] = field(default_factory=dict)
     path: RecentPath = field(default_factory=RecentPath)
@@ -214,8 +217,9 @@ class PhotodiodeFixes:
     ) -> None:
         """Take a sweep; ``flush`` is called before a photodiode with a due fix gets another."""
         state = self._states.get(name)
-        if state is None:
+        if state is None or time_ns < state.newest_ns - MAX_LATENESS_NS:
             state = self._states[name] = PhotodiodeState(name)
+        state.newest_ns = max(state.newest_ns, time_ns)
         lone = state.lone.get(station)
         sweep = (time_ns, count, plane, is_labelled)
         if lone is None:
@@ -227,9 +231,15 @@ class PhotodiodeFixes:
                 self._reject("repeated_in_rotation" if is_repeated else "plane_unknown", 1)
                 if not is_repeated and not last.uses and last.time_ns[0] == time_ns:
                     pairs.pop()
+                    if not pairs:
+                        del state.pairs[station]
                     self._reject("plane_unknown", 2)
                 return
             state.lone[station] = sweep
+            return
+        if time_ns < lone[0]:
+            # It is older than a sweep of which the pair is still open.
+            self._reject("plane_unknown", 1)
             return
         if lone[0] == time_ns and count < lone[1]:
             lone, sweep = sweep, lone

@@ -16,6 +16,10 @@ from locatk.core.lighthouse.plane_labels import LIKELY_ACCELERATION_RAD_S2
 Position = tuple[int, NDArray[np.float64], float]
 """Time in nanoseconds, position (3,) and its standard deviation in metres."""
 
+MAX_LATENESS_NS = 1_000_000_000
+"""Time by which a sweep may be earlier than the newest one of its device [ns]. If it is more, the
+clock was set back, and the device is found anew."""
+
 SPEED_SIGMA_M_S = 0.5
 """Standard deviation of the speed of a device whose motion is unknown [m/s]."""
 

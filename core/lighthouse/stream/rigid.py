@@ -67,7 +67,7 @@ from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN
 from locatk.core.lighthouse.stream.known_scene import KnownScene
 from locatk.core.lighthouse.stream.plane_tracking import PlaneTracker, Sweep
-from locatk.core.lighthouse.stream.recent_path import RecentPath
+from locatk.core.lighthouse.stream.recent_path import MAX_LATENESS_NS, RecentPath
 from locatk.core.robust import robust_sigma
 from locatk.core.streaming.events import Fix
 from locatk.core.trajectory import PROVISIONAL_PROBABILITY
@@ -169,6 +169,7 @@ class DeviceState:
     angles: dict[tuple[int, int, int], tuple[int, float]] = field(default_factory=dict)
     rows: deque[PlaneRow] = field(default_factory=lambda: deque(maxlen=MAX_SWEEPS_PER_WINDOW))
     pose: PoseState | None = None
+    newest_ns: int = 0
     next_ns: int | None = None
     next_seed_ns: int = 0
     seed_interval_ns: int = FIRST_SEED_INTERVAL_NS
@@ -227,12 +228,13 @@ class RigidFixes:
     ) -> list[Fix]:
         """Take a sweep of a device; return the fix that it makes due, if there is one."""
         device = self._devices.get(name)
-        if device is None:
+        if device is None or time_ns < device.newest_ns - MAX_LATENESS_NS:
             receiver = self._receivers[name]
             has_position = [bool(np.all(np.isfinite(row))) for row in receiver.position_m]
             device = self._devices[name] = DeviceState(
                 name, receiver, has_position, receiver.position_m.tolist()
             )
+        device.newest_ns = max(device.newest_ns, time_ns)
         if not (0 <= sensor < len(device.has_position) and device.has_position[sensor]):
             self._reject("sensor_unknown", 1)
             return []
@@ -306,7 +308,8 @@ class RigidFixes:
         rows = device.rows
         while rows and rows[0].time_ns <= now_ns - self._window_ns:
             rows.popleft()
-        window = list(rows)
+        # Sweeps that came out of order may be older than the window, or than its end.
+        window = [row for row in rows if now_ns - self._window_ns < row.time_ns <= now_ns]
         excluded = self.known.excluded
         active = [k for k, row in enumerate(window) if row.station not in excluded]
         if not _is_sufficient(window, active):

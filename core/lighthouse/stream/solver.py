@@ -67,6 +67,9 @@ MAX_TIME_STEP_NS = 60_000_000_000
 """Time by which a sweep may be later than the one before without being taken for a clock that was
 set [ns]; ticks in between are skipped."""
 
+PLANES = (UNKNOWN, 0, 1)
+"""Numbers of the planes of a sweep."""
+
 SCENE_TASK = "scene"
 
 
@@ -195,6 +198,9 @@ class LighthouseStream:
             is_in_period.tolist(),
             strict=True,
         ):
+            if row[4] not in PLANES:
+                self.rejected["plane_unknown"] += 1
+                continue
             if not usable:
                 reason = "count_above_period" if row[2] else "unknown_channel"
                 self.rejected[reason] += 1

@@ -691,10 +691,11 @@ class PassProblem:
         of a magnet), and a sensor over the whole path (its gains and axes).
         """
         length = CLUSTER_HEIGHTS * state.height_m
-        stretch = np.floor((state.path_m - state.path_m.min()) / length).astype(np.intp)
-        if stretch.max() >= len(stretch):
-            # The path of a fit that diverges may be kilometres long.
+        stretch = np.floor((state.path_m - state.path_m.min()) / length)
+        if not stretch.max() < len(stretch):
+            # Only stretches with samples: a fit that diverges has a path of kilometres.
             stretch = np.unique(stretch, return_inverse=True)[1]
+        stretch = stretch.astype(np.intp)
         sensor = np.arange(self.shape[0])[:, None] // 3
         partitions = (sensor * (int(stretch.max()) + 1) + stretch, sensor + 0 * stretch)
         first, second = (
