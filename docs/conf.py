@@ -31,7 +31,7 @@ html_show_search_summary = False
 MENU = {
     "First hour": ["first-hour-*", "crazyflie"],
     "Systems": ["lighthouse", "light", "lighthouse-signal", "dots", "polaris", "landmarks"],
-    "From port to viewer": ["capture", "live_page", "batch", "viewers"],
+    "From port to viewer": ["capture", "live", "live_page", "live_messages", "batch", "viewers"],
     "Reference": [
         "Python <python>",
         "Commands <commands>",

@@ -109,12 +109,15 @@ Values = dict[str, list[ast.expr]]
 
 
 def _modules(system: str) -> Iterator[ast.Module]:
-    """The module of a bench, and those of the package that it imports figures from."""
+    """The module of a bench, and those that it imports figures from, but not other benches."""
     package = "locatk.formats.benchmarks"
-    left, seen = [BENCHES[system].split(":")[0]], {f"{package}.timing"}
+    start = BENCHES[system].split(":")[0]
+    packages = {entry.split(":")[0].rpartition(".")[0] for entry in BENCHES.values()}
+    others = tuple(f"{each}." for each in packages - {package, start.rpartition(".")[0]})
+    left, seen = [start], {f"{package}.timing"}
     while left:
         name = left.pop()
-        if name in seen or not name.startswith(f"{package}."):
+        if name in seen or not name.startswith(f"{package}.") or name.startswith(others):
             continue
         seen.add(name)
         path = ROOT / Path(*name.split(".")[1:]).with_suffix(".py")

@@ -114,6 +114,10 @@ BIN_M = 2e-3
 
 MAX_BINS = 400
 
+MIN_POSE_INTERVAL_NS = 100_000
+"""Shortest time between two poses of the odometry [ns]: 10 kHz. Times of a recording are made to
+ascend by a nanosecond if its clock was corrected; the velocity between such poses is not real."""
+
 VELOCITY_SPAN_NS = 10_000_000
 """Time before and after which velocities are the mean of: about the spacing of odometry."""
 
@@ -253,12 +257,15 @@ def preprocess(samples: HallSamples, odometry: Trajectory | None) -> HallRecordi
 
 
 def valid_poses(odometry: Trajectory) -> NDArray[np.bool_]:
-    """Return which poses (n,) are finite and later than all finite ones before."""
+    """Return which poses (n,) are finite and later than all finite ones before.
+
+    Poses less than :data:`MIN_POSE_INTERVAL_NS` later are not.
+    """
     is_finite = np.isfinite(np.hstack([odometry.position[:, :2], odometry.quaternion]))
     is_valid = np.asarray(is_finite.all(axis=1))
     time_ns = odometry.time_ns[is_valid]
     is_later = np.ones(len(time_ns), bool)
-    is_later[1:] = time_ns[1:] > np.maximum.accumulate(time_ns)[:-1]
+    is_later[1:] = time_ns[1:] - np.maximum.accumulate(time_ns)[:-1] >= MIN_POSE_INTERVAL_NS
     is_valid[is_valid] = is_later
     return is_valid
 

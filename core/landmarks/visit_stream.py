@@ -31,6 +31,7 @@ from locatk.core.landmarks.preprocessing import (
     MIN_FIELD_SIGMAS,
     MIN_FIELD_THRESHOLDS,
     MIN_PEAK_THRESHOLDS,
+    MIN_POSE_INTERVAL_NS,
     SATURATION_FRACTION,
     STEP_M,
     VELOCITY_SPAN_NS,
@@ -305,7 +306,8 @@ class VisitStream:
     def _take_pose(self, time_ns: int, pose: Array) -> Iterator[LeftVisit]:
         """Take one pose of the odometry, and the samples up to its time."""
         is_first = not len(self._path_ns)
-        if not np.isfinite(pose).all() or not (is_first or time_ns > self._path_ns[-1]):
+        is_later = is_first or time_ns - self._path_ns[-1] >= MIN_POSE_INTERVAL_NS
+        if not (is_later and np.isfinite(pose).all()):
             self.notes["odometry_invalid"] += 1
             self._is_invalid_between = True
             return

@@ -35,7 +35,12 @@ from locatk.core.streaming.events import (
 from locatk.core.streaming.localizer import LiveLocalizer
 from locatk.formats.capture.clocks import HostClock, ReplayClock
 from locatk.formats.capture.reader_thread import SourceEnded
-from locatk.formats.capture.setup import CAMERA, CaptureRequest, is_session_address
+from locatk.formats.capture.setup import (
+    CAMERA,
+    CaptureRequest,
+    check_request,
+    is_session_address,
+)
 from locatk.formats.capture.status import RecordingResult
 from locatk.formats.live.background import BackgroundWorker
 from locatk.formats.live.inputs import (
@@ -46,7 +51,7 @@ from locatk.formats.live.inputs import (
     RecordedOrder,
     open_inputs,
 )
-from locatk.formats.live.observations import Observations, system_of
+from locatk.formats.live.observations import AttachedArtifacts, Observations, system_of
 from locatk.formats.live.recorded_events import RecordedEvents
 from locatk.formats.live.streams import StreamOptions, create_stream, system_of_artifacts
 from locatk.formats.sinks.interface import LiveMessage, Sink, SinkContext, SinkStatus
@@ -215,6 +220,7 @@ class LiveSession:
             An input, an artifact or a sink is invalid, or an artifact that the data require is
             missing.
         """
+        self._load()
         inputs = open_inputs(self._request.inputs, self._clock, stop, self._queue, waiting=waiting)
         self._inputs = inputs
         if all(each.keeps_time for each in inputs):
@@ -239,6 +245,13 @@ class LiveSession:
             recordings,
             self.status(),
         )
+
+    def _load(self) -> None:
+        """Load the solver before a port is open: bytes that wait in it have the time of reading."""
+        inputs = [AttachedArtifacts(check_request(each)) for each in self._request.inputs]
+        system = system_of_artifacts({k: v for each in inputs for k, v in each.texts.items()})
+        if system:
+            create_stream(system, inputs, self._request.stream)
 
     def _prepare(self) -> None:
         texts: dict[str, str] = {}
