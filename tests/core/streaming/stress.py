@@ -98,8 +98,12 @@ def case(name: str) -> Case:
         pieces = in_order(drive.samples[0], drive.odometry[0])
         return Case(lambda: LandmarksStream(floor), pieces)
     if name == "polaris":
-        options_of_pass = polaris_session.SimulationOptions(odometry=True)
-        session = polaris_session.simulate(None, options_of_pass)
+        car = polaris_session.CARS["mini"]
+        options_of_pass = polaris_session.SimulationOptions(
+            array=polaris_session.usual_bar(car.sensors, car.spacing_m, 100.0),
+            rate_hz=100.0, speed_mps=0.1, odometry=True,
+        )  # fmt: skip
+        session = polaris_session.simulate(car.tags, options_of_pass)
         recordings = [each for each in (session.samples, session.odometry) if each is not None]
         return Case(lambda: PolarisStream(session.tags), in_order(*recordings))
     if name == "dots":
