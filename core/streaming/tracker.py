@@ -92,7 +92,7 @@ CONTRADICTION = "fix off the prediction"
 """Reason of a correction without a known source."""
 
 MAX_READINGS = np.repeat([MAX_SPECIFIC_FORCE_M_S2, MAX_ANGULAR_RATE_RAD_S], 3)
-"""Largest readings of accelerometer and gyroscope."""
+"""Largest readings of accelerometer and gyroscope [m/s^2 and rad/s]."""
 
 PROVISIONAL_REFUSALS = 3
 """Number of provisional fixes in a row that end a pose that was certain."""
