@@ -17,6 +17,8 @@ from locatk.core.dots.frames import Frames
 from locatk.core.dots.simulation import session as dots_session
 from locatk.core.dots.solver import SolveOptions as DotsOptions
 from locatk.core.dots.stream import DotsStream
+from locatk.core.geometry import quaternion_from_heading
+from locatk.core.inertial import InertialSamples
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation import session as landmarks_session
 from locatk.core.landmarks.stream import LandmarksStream
