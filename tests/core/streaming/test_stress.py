@@ -520,3 +520,25 @@ def test_covariance_grows_without_fixes() -> None:
     variance = np.array([np.diagonal(pose.covariance)[[0, 1, 5]] for pose in poses])
     assert len(poses) > 40
     assert (np.diff(variance, axis=0) > 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", SEEDS)
+def test_common_errors_of_fixes_are_part_of_their_covariance(system: str) -> None:
+    session = case(system)
+    stream = session.stream()
+    events = [event for piece in session.pieces for event in stream.push(piece)]
+    fixes = [event for event in [*events, *stream.finish()] if isinstance(event, Fix)]
+    assert fixes
+    for fix in fixes:
+        check_covariance(fix.covariance)
+        if fix.common_covariance is None:
+            continue
+        known = np.flatnonzero(np.isfinite(np.diagonal(fix.covariance)))
+        index = known[:, None], known
+        sigma = np.sqrt(np.diagonal(fix.covariance)[known])
+        scale = np.outer(sigma, sigma)
+        common = fix.common_covariance[index] / scale
+        own = fix.covariance[index] / scale - common
+        assert np.linalg.eigvalsh(common)[0] > -1e-9
+        assert np.linalg.eigvalsh(own)[0] > -1e-9
