@@ -25,6 +25,11 @@ MAX_PENDING_FIXES = 64
 """Number of fixes newer than the newest motion that are kept: those of 0.25 s at 250 per second."""
 
 
+MIN_RATE_FRACTION, MIN_RATE_INTERVAL_S = 0.1, 0.002
+"""Time between two samples from which their motion tells a rate: this fraction of the time between
+those before, at most 2 ms, to which the times of received messages jitter."""
+
+
 class FilterModel(Protocol):
     """Equations of a filter: all of its knowledge is in a state vector and a covariance.
 
@@ -97,6 +102,7 @@ class FilterHistory:
         self._start = self._end = 0
         self._last_motion = -1
         self._last_rate: tuple[Array, float] | None = None
+        self._rate_ns = 0
         self._unknown = model.unknown_state()
 
     def __len__(self) -> int:
@@ -168,7 +174,7 @@ class FilterHistory:
         fraction = (time_ns - int(self._time_ns[row - 1])) / (time_ns - first_ns)
         self._motion[row] = self._model.part(motion, fraction) if fraction < 1 else motion
         changed, self._last_motion = self._last_motion + 1, row
-        self._last_rate = motion, (time_ns - first_ns) * 1e-9
+        self._measure_rate(time_ns, motion, (time_ns - first_ns) * 1e-9)
         self._extrapolate_pending()
         self._replay(changed)
         self._start = max(self._start, self._end - self._capacity)
@@ -249,6 +255,17 @@ class FilterHistory:
             last += 1
         first_ns, last_ns = int(self._time_ns[first]), int(self._time_ns[last])
         self._interpolation_s2[row] = 0.5e-18 * (time_ns - first_ns) * (last_ns - time_ns)
+
+    def _measure_rate(self, time_ns: int, motion: Array, duration_s: float) -> None:
+        """Take the motion between two samples as the rate of the newest motion.
+
+        Samples that arrive together may have nearly the same time, and then tell no rate.
+        """
+        if self._last_rate is not None:
+            least_s = min(MIN_RATE_FRACTION * self._last_rate[1], MIN_RATE_INTERVAL_S)
+            if (time_ns - self._rate_ns) * 1e-9 < least_s:
+                return
+        self._last_rate, self._rate_ns = (motion, duration_s), time_ns
 
     def _extrapolated(self, duration_s: float) -> Array:
         """Return the motion in a time after the newest sample, at the rate of the newest motion."""

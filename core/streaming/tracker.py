@@ -42,8 +42,8 @@ from locatk.core.streaming.inertial_filter import (
 from locatk.core.streaming.planar_filter import OdometryNoise, PlanarFilter
 from locatk.core.streaming.plausibility import (
     MAX_ANGULAR_RATE_RAD_S,
-    MAX_COORDINATE_M,
     MAX_SPECIFIC_FORCE_M_S2,
+    is_plausible_odometry,
 )
 from locatk.core.trajectory import PROVISIONAL_PROBABILITY, Trajectory
 
@@ -92,7 +92,7 @@ CONTRADICTION = "fix off the prediction"
 """Reason of a correction without a known source."""
 
 MAX_READINGS = np.repeat([MAX_SPECIFIC_FORCE_M_S2, MAX_ANGULAR_RATE_RAD_S], 3)
-"""Largest readings of accelerometer and gyroscope."""
+"""Largest readings of accelerometer and gyroscope [m/s^2 and rad/s]."""
 
 PROVISIONAL_REFUSALS = 3
 """Number of provisional fixes in a row that end a pose that was certain."""
@@ -259,11 +259,14 @@ class DeviceTracker:
     def odometry(self, odometry: Trajectory) -> list[LiveEvent]:
         """Return the events of odometry: poses in any frame that does not move."""
         events: list[LiveEvent] = []
+        is_plausible = is_plausible_odometry(odometry).tolist()
         for index, time_ns in enumerate(odometry.time_ns.tolist()):
-            x, y, _ = odometry.position[index].tolist()
-            heading = _heading(odometry.quaternion[index])
-            variance = float(odometry.covariance[index, 5, 5])
-            events += self._odometry_pose_at(time_ns, (x, y, heading, variance))
+            pose = None
+            if is_plausible[index]:
+                x, y, _ = odometry.position[index].tolist()
+                heading = _heading(odometry.quaternion[index])
+                pose = x, y, heading, float(odometry.covariance[index, 5, 5])
+            events += self._odometry_pose_at(time_ns, pose)
         return events
 
     def inertial(self, samples: InertialSamples) -> list[LiveEvent]:
@@ -302,13 +305,12 @@ class DeviceTracker:
         motion_ns = self._history.motion_time_ns if self._history is not None else None
         return motion_ns is not None and time_ns - motion_ns <= MAX_EXTRAPOLATION_S * 1e9
 
-    def _odometry_pose_at(self, time_ns: int, pose: tuple[float, ...]) -> list[LiveEvent]:
+    def _odometry_pose_at(self, time_ns: int, pose: tuple[float, ...] | None) -> list[LiveEvent]:
         if not self._is_planar:
             self._begin_odometry()
         assert self._history is not None
         before, before_ns = self._odometry_pose, self._history.motion_time_ns
-        is_plausible = all(abs(value) < MAX_COORDINATE_M for value in pose[:3])
-        if not is_plausible or (before_ns is not None and time_ns <= before_ns):
+        if pose is None or (before_ns is not None and time_ns <= before_ns):
             self.counts["bad_motions"] += 1
             return []
         events = self._expire(time_ns)

@@ -133,7 +133,8 @@ def parse_address(text: str) -> SinkAddress:
     """
     scheme, colon, rest = text.partition(":")
     if not (colon and scheme.isidentifier()):
-        raise InputError(f"{text!r} is no address of a sink", hint="Example: udp://localhost:9000")
+        shown = SinkAddress(text, scheme).public_text
+        raise InputError(f"{shown!r} is no address of a sink", hint="Example: udp://localhost:9000")
     if not rest.startswith("//"):
         return SinkAddress(text, scheme.lower(), path=rest)
     shown = SinkAddress(text, scheme).public_text

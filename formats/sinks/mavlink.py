@@ -141,7 +141,7 @@ class MavlinkSink(QueuedSink):
                 buffer += self._link.read()
                 for request_ns in timesync_requests(buffer):
                     self._write(partial(self._encoder.timesync, time.time_ns(), request_ns))
-            except (OSError, TypeError):  # The sender reports it. TypeError: closed while reading.
+            except Exception:  # The sender reports it; pyserial raises any if closed while reading.
                 self._is_ended.wait(READ_TIMEOUT_S)
 
 

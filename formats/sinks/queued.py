@@ -156,7 +156,11 @@ class QueuedSink:
         try:
             if self._attempt_start():
                 self._send_all()
+        except BaseException as error:  # A panic of a package in Rust is no Exception.
+            self.report_error(f"the sink has ended: {type(error).__name__}: {error}")
         finally:
+            with self._wake:
+                self._is_closing = True
             try:
                 self.stop()
             except Exception as error:  # Of any package: the session ends anyway.
@@ -231,7 +235,7 @@ class QueuedSink:
             count = self.send(message)
         except (Busy, OSError):
             raise
-        except Exception as error:  # Such a message would fail again.
+        except BaseException as error:  # Such a message would fail again. Panics: see _run().
             self.count(dropped=1)
             self.report_error(error)
         else:

@@ -11,7 +11,7 @@ import difflib
 import importlib
 from importlib.metadata import entry_points
 
-from locatk.core.errors import InputError
+from locatk.core.errors import InputError, LocatkError
 from locatk.formats.sinks.addresses import SinkAddress, parse_address
 from locatk.formats.sinks.interface import Sink
 
@@ -67,7 +67,15 @@ def sink_summaries() -> dict[str, str]:
 def _create_foreign(factory: object, address: SinkAddress) -> Sink:
     if not callable(factory):
         raise InputError(f"the sink {address.scheme!r} is not callable")
-    sink: Sink = factory(address)
+    try:
+        sink: Sink = factory(address)
+    except LocatkError:
+        raise
+    except Exception as error:  # Code of another package may raise anything.
+        raise InputError(
+            f"the sink {address.scheme!r} cannot be created ({error})",
+            hint="Check its address, or update its package",
+        ) from error
     return sink
 
 

@@ -313,8 +313,8 @@ class ServerSink:
         address.reject_unknown_options("origin")
         if address.path:
             example = f"{address.scheme}://:{self.default_port}"
-            raise InputError(f"{address.text} has a path", hint=f"Example: {example}")
-        self.address = address.text
+            raise InputError(f"{address.public_text} has a path", hint=f"Example: {example}")
+        self.address = address.public_text
         self.context = SinkContext("")
         self._host = address.host or LOOPBACK
         self._port = self.default_port if address.port is None else address.port

@@ -59,6 +59,9 @@ COLUMN_HEIGHTS = 0.5
 SIDE_MARGIN_HEIGHTS = 1.5
 """Distance beyond the last sensor up to which magnets are searched for, in heights."""
 
+MAX_ROWS = 100_000
+"""Number of rows of a pass beyond which a fit has diverged: those of 100 m at a height of 4 mm."""
+
 MIN_SENSORS_WITH_SHARED_FIELD = 5
 """Number of sensors from which a field that all share is separated from magnets: each magnet is
 out of range of some of them."""
@@ -514,7 +517,10 @@ class MatchedFilter:
         scaled = subtract_shared_field(by_sensor).swapaxes(0, 1).reshape(len(order), -1)
         # Strictly ascending, also while the array rests.
         path = path_m[order] + 1e-9 * np.arange(len(path_m))
-        count = max(int((path[-1] - path[0]) / self.row_m), 1)
+        length = (path[-1] - path[0]) / self.row_m
+        if not length < MAX_ROWS:
+            raise DegenerateError("the samples do not determine the path of the pass")
+        count = max(int(length), 1)
         edges = path[0] + self.row_m * np.arange(count + 1)
         middle = (path[1:] + path[:-1]) / 2
         borders = np.concatenate([[path[0]], middle, [path[-1]]])

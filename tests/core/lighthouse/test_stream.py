@@ -642,3 +642,46 @@ def test_odometry_gives_the_scale_of_an_estimated_scene() -> None:
     apart = np.linalg.norm(result.scene.stations[0].position - result.scene.stations[1].position)
     true = session.true_scene.stations
     assert apart == pytest.approx(np.linalg.norm(true[0].position - true[1].position), rel=0.05)
+
+
+# ---- damaged sweeps
+
+
+def sweeps_of(rows: Sequence[tuple[int, int, int, float]]) -> Sweeps:
+    """Return sweeps of one photodiode from rows of time, channel, plane and count."""
+    time_ns, channel, plane, count = (np.array(column) for column in zip(*rows, strict=True))
+    none = np.zeros(len(rows), np.int32)
+    return Sweeps(("robot",), time_ns, none, none, channel, none - 1, plane, count.astype(float))
+
+
+def test_three_sweeps_with_one_time_stamp_leave_no_pair() -> None:
+    session = simulated(PHOTODIODES)
+    stream = LighthouseStream(session.true_scene, {})
+    channel = session.true_scene.stations[0].channel
+    third = int(period_counts(channel) / 3)
+    at = 1_000_000_000
+    counts = [1000, 1000 + third, 1010 + third]
+    stream.push(sweeps_of([(at, channel, UNKNOWN, count) for count in counts]))
+    stream.advance(at + 10_000_000_000)
+    assert stream.rejected["plane_unknown"] == 3
+    later = session.sweeps
+    assert fixes_of(run(stream, [later]))
+
+
+def test_unknown_planes_are_counted() -> None:
+    session = simulated(DECKS)
+    stream = LighthouseStream(session.true_scene, receivers(session))
+    planes = np.full(len(session.sweeps), 2, np.int32)
+    assert not fixes_of(run(stream, [replace(session.sweeps, sweep=planes)]))
+    assert stream.rejected["plane_unknown"] == len(session.sweeps)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [PHOTODIODES, DECKS], ids=["photodiodes", "decks"])
+def test_fixes_go_on_after_a_clock_was_set_back(options: SimulationOptions) -> None:
+    session = simulated(options)
+    known = receivers(session) if options is DECKS else {}
+    stream = LighthouseStream(session.true_scene, known)
+    expected = len(fixes_of(stream.push(session.sweeps)))
+    earlier = replace(session.sweeps, time_ns=session.sweeps.time_ns - 3600 * 10**9)
+    assert len(fixes_of(stream.push(earlier))) > 0.9 * expected

@@ -211,6 +211,28 @@ def test_heartbeat_and_timesync(
     assert sequence == list(range(len(sequence)))
 
 
+def test_reader_survives_errors_of_the_link(
+    dialect: Any, live: ModuleType, autopilot: Any, opened: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sink = create_sink(f"mavlink:udpout:127.0.0.1:{autopilot.port}")
+    read, errors = sink._link.read, iter([ValueError("closed"), AttributeError("_overlapped")])
+
+    def failing_read() -> bytes:
+        error = next(errors, None)
+        if error is not None:
+            raise error
+        return read()
+
+    monkeypatch.setattr(sink._link, "read", failing_read)
+    sink.open(SinkContext("dots"))
+    live.wait_for(lambda: autopilot.of("HEARTBEAT"))
+    live.wait_for(lambda: next(errors, None) is None)
+    request = dialect.MAVLink(None).timesync_encode(0, 77).pack(dialect.MAVLink(None))
+    autopilot.socket.sendto(request, autopilot.sender)
+    live.wait_for(lambda: autopilot.of("TIMESYNC"))
+    sink.close(5)
+
+
 def test_requests_in_a_stream_with_noise(dialect: Any) -> None:
     rng = random.Random(4)
     new = dialect.MAVLink(None, srcSystem=1)

@@ -203,3 +203,28 @@ def test_close_ends_the_thread_of_a_receiver_that_is_gone(
     sink.close(0.05)
     live.wait_for(lambda: not sink._thread.is_alive())
     assert sink.status().dropped == 1
+
+
+class Panic(BaseException):
+    """Error of a package in Rust."""
+
+
+def test_a_panic_while_sending_costs_one_message(live: ModuleType, sink: Any) -> None:
+    sink.open(SinkContext("dots"))
+    sink.failure = Panic("index out of bounds")
+    live.offer(sink, live.pose(0))
+    live.wait_for(lambda: sink.status().dropped == 1)
+    assert "index out of bounds" in sink.status().error
+    sink.failure = None
+    live.offer(sink, live.pose(1))
+    live.wait_for(lambda: sink.status().sent == 1)
+
+
+def test_a_sink_that_ended_says_so_and_keeps_nothing(live: ModuleType, sink: Any) -> None:
+    sink.start_failure = Panic("no memory")
+    sink.open(SinkContext("dots"))
+    live.wait_for(lambda: "no memory" in sink.status().error)
+    live.wait_for(lambda: not sink._thread.is_alive())
+    live.offer(sink, live.pose(0), live.pose(1))
+    assert sink.status().dropped == 2
+    assert not sink._pending

@@ -51,7 +51,9 @@ def test_sinks_of_other_packages(monkeypatch: pytest.MonkeyPatch, live: ModuleTy
     assert sink.received[0].position[0] == 3
 
 
-@pytest.mark.parametrize("value", ["no_such_module:create", "math:no_such_name", "math:pi"])
+@pytest.mark.parametrize(
+    "value", ["no_such_module:create", "math:no_such_name", "math:pi", "math:sqrt"]
+)
 def test_broken_sinks_of_other_packages(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     add_entry(monkeypatch, "broken", value)
     with pytest.raises(InputError, match="the sink 'broken'"):
@@ -75,6 +77,12 @@ def test_passwords_are_masked(text: str, public: str) -> None:
     assert "secret" not in repr(address)
     with pytest.raises(InputError) as caught:
         registry.create_sink(f"x{text}")
+    assert "secret" not in f"{caught.value} {caught.value.hint}"
+
+
+def test_passwords_are_masked_in_what_is_no_address() -> None:
+    with pytest.raises(InputError, match="no address") as caught:
+        parse_address("my-mqtt://user:secret@host")
     assert "secret" not in f"{caught.value} {caught.value.hint}"
 
 

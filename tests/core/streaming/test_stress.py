@@ -1,13 +1,15 @@
-"""Faults of inputs for the streams of all systems, and promises that hold with any of them."""
+"""Streams of all systems with faults that inputs can have: no exception, and valid poses."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
@@ -15,6 +17,8 @@ from locatk.core.dots.frames import Frames
 from locatk.core.dots.simulation import session as dots_session
 from locatk.core.dots.solver import SolveOptions as DotsOptions
 from locatk.core.dots.stream import DotsStream
+from locatk.core.geometry import quaternion_from_heading
+from locatk.core.inertial import InertialSamples
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation import session as landmarks_session
 from locatk.core.landmarks.stream import LandmarksStream
@@ -24,8 +28,9 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.stream import LighthouseStream
 from locatk.core.polaris.simulation import session as polaris_session
 from locatk.core.polaris.stream import PolarisStream
-from locatk.core.streaming.events import LiveEvent, PoseEstimate, Stream, TrackingState
+from locatk.core.streaming.events import Fix, LiveEvent, PoseEstimate, Stream, TrackingState
 from locatk.core.streaming.localizer import LiveLocalizer
+from locatk.core.streaming.tracker import DeviceTracker
 from locatk.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -94,8 +99,12 @@ def case(name: str) -> Case:
         pieces = in_order(drive.samples[0], drive.odometry[0])
         return Case(lambda: LandmarksStream(floor), pieces)
     if name == "polaris":
-        options_of_pass = polaris_session.SimulationOptions(odometry=True)
-        session = polaris_session.simulate(None, options_of_pass)
+        car = polaris_session.CARS["mini"]
+        options_of_pass = polaris_session.SimulationOptions(
+            array=polaris_session.usual_bar(car.sensors, car.spacing_m, 100.0),
+            rate_hz=100.0, speed_mps=0.1, odometry=True,
+        )  # fmt: skip
+        session = polaris_session.simulate(car.tags, options_of_pass)
         recordings = [each for each in (session.samples, session.odometry) if each is not None]
         return Case(lambda: PolarisStream(session.tags), in_order(*recordings))
     if name == "dots":
@@ -114,9 +123,6 @@ def case(name: str) -> Case:
         lambda: LighthouseStream(sweeps.true_scene, receivers),
         in_order(sweeps.sweeps, *sweeps.imu),
     )
-
-
-SYSTEMS = ("landmarks", "polaris", "dots", "photodiodes", "rigid")
 
 
 # ---- faults
@@ -366,3 +372,173 @@ def size_of(root: Any) -> int:
             if is_dataclass(each):
                 todo += [getattr(each, one.name) for one in fields(each)]
     return total
+
+
+# ---- streams
+
+MAX_FAULTS = 6
+
+SEEDS = {
+    "landmarks": (66,),
+    "polaris": (4,),
+    "dots": (1, 2, 3),
+    "photodiodes": (1, 2),
+    "rigid": (8, 18),
+}
+"""Seeds of faults; those of landmarks, Polaris and rigid devices found errors."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("system", "seed"), [(system, seed) for system, seeds in SEEDS.items() for seed in seeds]
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_faults_of_the_input(system: str, seed: int) -> None:
+    session = case(system)
+    rng = np.random.default_rng(seed)
+    pieces = faulty(session.pieces, rng, int(rng.integers(1, MAX_FAULTS + 1)))
+    localizer = LiveLocalizer(session.stream())
+    play(localizer, pieces)
+    assert size_of(localizer) < MAX_BYTES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", SEEDS)
+def test_observations_after_their_time_was_complete(system: str) -> None:
+    """They may be left out, but later ones are used as before."""
+    session = case(system)
+    middle = len(session.pieces) // 4
+    localizer = LiveLocalizer(session.stream())
+    pieces = list(session.pieces)
+    ahead_ns = int(times(pieces[middle])[-1]) + 300_000_000
+    events = play(localizer, [*pieces[:middle], ahead_ns, *pieces[middle:]])
+    assert any(isinstance(event, PoseEstimate) for event in events)
+
+
+# ---- trackers
+
+
+def drive_of(times_ns: list[int], positions_m: list[float]) -> Trajectory:
+    n = len(times_ns)
+    position = np.zeros((n, 3))
+    position[:, 0] = positions_m
+    return Trajectory(
+        "robot",
+        "odom",
+        np.array(times_ns),
+        position,
+        quaternion_from_heading(np.zeros(n)),
+        np.full((n, 6, 6), np.nan),
+    )
+
+
+def fix_at(time_ns: int, x_m: float = 0.0) -> Fix:
+    covariance = np.full((6, 6), np.nan)
+    plane = np.array([0, 1, 5])
+    covariance[plane[:, None], plane] = np.diag([1e-6, 1e-6, 1e-4])
+    quaternion = np.array([0.0, 0.0, 0.0, 1.0])
+    return Fix("robot", "floor", time_ns, np.array([x_m, 0.0, 0.0]), quaternion, covariance)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e12, 1e200])
+@pytest.mark.parametrize("column", ["position", "quaternion"])
+def test_a_damaged_pose_of_the_odometry_is_left_out(value: float, column: str) -> None:
+    tracker = DeviceTracker("robot")
+    tracker.fix(fix_at(0))
+    damaged = drive_of([20_000_000], [0.01])
+    getattr(damaged, column)[0, 1] = value
+    tracker.odometry(drive_of([0, 10_000_000], [0.0, 0.005]))
+    assert tracker.odometry(damaged) == []
+    events = tracker.odometry(drive_of([30_000_000], [0.015]))
+    check_poses(events)
+    (pose,) = events
+    assert isinstance(pose, PoseEstimate)
+    assert pose.position[0] == pytest.approx(0.015, abs=2e-3)
+    assert tracker.counts["bad_motions"] == 1
+
+
+@pytest.mark.parametrize("variance", [np.inf, 1e200, 1e12])
+def test_an_unlimited_variance_of_the_heading_keeps_the_covariance_valid(variance: float) -> None:
+    tracker = DeviceTracker("robot")
+    tracker.fix(fix_at(0))
+    odometry = drive_of([0, 10_000_000, 20_000_000], [0.0, 0.005, 0.01])
+    odometry.covariance[:, 5, 5] = [0.0, 0.0, variance]
+    events = tracker.odometry(odometry)
+    assert len([event for event in events if isinstance(event, PoseEstimate)]) > 1
+    check_poses(events)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e6, -1e200])
+def test_a_damaged_reading_of_an_imu_keeps_the_last_one(value: float) -> None:
+    tracker = DeviceTracker("robot")
+    n = 30
+    samples = InertialSamples(
+        "robot",
+        10_000_000 * np.arange(n),
+        np.tile([0.0, 0.0, 9.80665], (n, 1)),
+        np.zeros((n, 3)),
+    )
+    samples.acceleration[15, 0] = value
+    samples.angular_rate[16, 2] = value
+    pose = dataclasses.replace(fix_at(50_000_000), covariance=np.diag([1e-6] * 3 + [1e-4] * 3))
+    events: list[Any] = []
+    for k in range(n):
+        events += tracker.inertial(
+            InertialSamples(
+                "robot",
+                samples.time_ns[k : k + 1],
+                samples.acceleration[k : k + 1],
+                samples.angular_rate[k : k + 1],
+            )
+        )
+        if k == 6:
+            events += tracker.fix(pose)
+    check_poses(events)
+    last = [event for event in events if isinstance(event, PoseEstimate)][-1]
+    assert last.time_ns == samples.time_ns[-1]
+    assert np.abs(last.position).max() < 0.1
+
+
+def test_extrapolation_of_samples_that_arrived_together_is_limited() -> None:
+    """Two samples a microsecond apart tell no speed."""
+    tracker = DeviceTracker("robot")
+    tracker.fix(fix_at(0))
+    tracker.odometry(drive_of([0, 100_000_000, 200_000_000, 200_001_000], [0, 0.01, 0.02, 0.03]))
+    events = tracker.fix(fix_at(300_000_000, 0.04))
+    check_poses(events)
+    (pose,) = (event for event in events if isinstance(event, PoseEstimate))
+    assert pose.position[0] == pytest.approx(0.04, abs=0.001)
+    assert tracker.counts["refused_fixes"] == 0
+
+
+def test_covariance_grows_without_fixes() -> None:
+    tracker = DeviceTracker("robot")
+    tracker.fix(fix_at(0))
+    times_ns = [20_000_000 * k for k in range(50)]
+    events = tracker.odometry(drive_of(times_ns, [0.005 * k for k in range(50)]))
+    poses = [event for event in events if isinstance(event, PoseEstimate)]
+    variance = np.array([np.diagonal(pose.covariance)[[0, 1, 5]] for pose in poses])
+    assert len(poses) > 40
+    assert (np.diff(variance, axis=0) > 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", SEEDS)
+def test_common_errors_of_fixes_are_part_of_their_covariance(system: str) -> None:
+    session = case(system)
+    stream = session.stream()
+    events = [event for piece in session.pieces for event in stream.push(piece)]
+    fixes = [event for event in [*events, *stream.finish()] if isinstance(event, Fix)]
+    assert fixes
+    for fix in fixes:
+        check_covariance(fix.covariance)
+        if fix.common_covariance is None:
+            continue
+        known = np.flatnonzero(np.isfinite(np.diagonal(fix.covariance)))
+        index = known[:, None], known
+        sigma = np.sqrt(np.diagonal(fix.covariance)[known])
+        scale = np.outer(sigma, sigma)
+        common = fix.common_covariance[index] / scale
+        own = fix.covariance[index] / scale - common
+        assert np.linalg.eigvalsh(common)[0] > -1e-9
+        assert np.linalg.eigvalsh(own)[0] > -1e-9
