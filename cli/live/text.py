@@ -53,6 +53,7 @@ class LiveText:
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
         self._sent = self._dropped = 0
+        self._error = ""
         self._session: Any = None
 
     # ---- sink
@@ -76,7 +77,7 @@ class LiveText:
         """Return the counts."""
         from locatk.formats.sinks.interface import SinkStatus
 
-        return SinkStatus(self._sent, self._dropped, None, "", self.address)
+        return SinkStatus(self._sent, self._dropped, None, self._error, self.address)
 
     def close(self, timeout_s: float) -> None:
         """Print what is waiting, and stop."""
@@ -97,7 +98,12 @@ class LiveText:
                 lines.append(json.dumps(event_to_json(message.event, message.latency_s())))
             if lines:
                 console.write_result("\n".join(lines) + "\n")
-                self._sent += len(lines)
+                lost = console.lost_results()
+                if lost is None:
+                    self._sent += len(lines)
+                else:
+                    self._dropped += len(lines)
+                    self._error = f"stdout cannot be written ({lost.strerror or lost})"
 
     # ---- terminal
 

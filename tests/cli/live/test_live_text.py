@@ -209,3 +209,14 @@ def test_nothing_is_printed_to_the_null_device(monkeypatch: pytest.MonkeyPatch) 
         asked.offer(LiveMessage(pose(), 0.0))
         asked.close(2.0)
         assert asked.status().sent == 1
+
+
+def test_a_reader_that_ended_is_an_error_of_the_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "lost_results", lambda: BrokenPipeError(32, "Broken pipe"))
+    monkeypatch.setattr("sys.stdout", io.StringIO())
+    text = LiveText(as_json=True)
+    text.open(SinkContext(""))
+    text.offer(LiveMessage(pose(), 0.0))
+    text.close(5.0)
+    assert text.status().error == "stdout cannot be written (Broken pipe)"
+    assert (text.status().sent, text.status().dropped) == (0, 1)
