@@ -191,7 +191,8 @@ def command(
         else None,
     )
     stop = threading.Event()
-    text = LiveText(as_json=as_json)
+    is_only_output = not (sinks or settings.sinks or record or settings.record)
+    text = LiveText(as_json=as_json, stop=stop.set if is_only_output else lambda: None)
     outputs = [create_sink(address) for address in (*settings.sinks, *sinks)]
     session = LiveSession(request, [text, *outputs], tell=text.tell)
     with contextlib.ExitStack() as stack:

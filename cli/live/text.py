@@ -11,7 +11,7 @@ import stat
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from locatk.cli import console
@@ -39,11 +39,14 @@ class LiveText:
     ----------
     as_json : bool
         Print JSON even on a terminal.
+    stop : callable, optional
+        Called when the reader of stdout has ended: nobody else gets the poses.
     """
 
     address = "stdout"
 
-    def __init__(self, *, as_json: bool) -> None:
+    def __init__(self, *, as_json: bool, stop: Callable[[], None] = lambda: None) -> None:
+        self._stop = stop
         self._is_json = as_json or not sys.stdout.isatty()
         self._is_discarded = not as_json and _is_null_device(sys.stdout)
         self._lines = 0
@@ -104,6 +107,7 @@ class LiveText:
                 else:
                     self._dropped += len(lines)
                     self._error = f"stdout cannot be written ({lost.strerror or lost})"
+                    self._stop()
 
     # ---- terminal
 

@@ -214,9 +214,11 @@ def test_nothing_is_printed_to_the_null_device(monkeypatch: pytest.MonkeyPatch) 
 def test_a_reader_that_ended_is_an_error_of_the_status(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, "lost_results", lambda: BrokenPipeError(32, "Broken pipe"))
     monkeypatch.setattr("sys.stdout", io.StringIO())
-    text = LiveText(as_json=True)
+    stopped: list[bool] = []
+    text = LiveText(as_json=True, stop=lambda: stopped.append(True))
     text.open(SinkContext(""))
     text.offer(LiveMessage(pose(), 0.0))
     text.close(5.0)
+    assert stopped
     assert text.status().error == "stdout cannot be written (Broken pipe)"
     assert (text.status().sent, text.status().dropped) == (0, 1)
