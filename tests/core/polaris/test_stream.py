@@ -20,6 +20,7 @@ from locatk.core.geometry import heading_from_quaternion, quaternion_from_headin
 from locatk.core.polaris import stream as stream_module
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.codec import layout_of
+from locatk.core.polaris.given_path import known_path
 from locatk.core.polaris.identification.tags import IdentifiedPass
 from locatk.core.polaris.localization import PLANAR_COMPONENTS
 from locatk.core.polaris.preprocessing import PassRange, preprocess
@@ -425,3 +426,13 @@ def test_a_tag_without_a_position_gives_no_fix(world: Any) -> None:
     assert [(d.tag_id, d.meaning) for d in detections(events)] == [(TAG_ID, "stop")]
     assert fixes(events) == []
     assert "tag_not_on_site" in codes(events)
+
+
+def test_given_path_that_jumps_or_is_unknown_in_a_pass_is_not_used() -> None:
+    path_m = np.linspace(0.0, 0.5, 100)
+    part = PassRange(20, 80)
+    assert known_path(path_m, part) is path_m
+    for value in (np.nan, np.inf, 1e6):
+        assert known_path(np.where(np.arange(100) < 50, path_m, value), part) is None
+        # Outside of the pass it does not matter.
+        assert known_path(np.where(np.arange(100) < 80, path_m, value), part) is not None
