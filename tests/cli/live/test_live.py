@@ -171,7 +171,7 @@ def test_a_server_whose_port_is_in_use(
         arguments = ("--to", "udp://127.0.0.1:9", "--to", address, "--record", path)
         result = locatk("live", "COM3", "--device", "lines", *arguments)
     one_line(result, 1, "in use", "Hint:")
-    assert not listed.opened
+    assert listed.closed == listed.opened == 1
     assert len(closed) == 1
     assert not path.exists()
 
