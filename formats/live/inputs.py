@@ -179,6 +179,8 @@ class LiveInput:
     ----------
     name : str
         Name of the device in topics.
+    devices : tuple of str
+        Devices that are known before data come: this one, or those of a replayed session.
     is_paced : bool
         Its bytes come in real time; otherwise it waits for the solver.
     keeps_time : bool
@@ -203,6 +205,7 @@ class LiveInput:
     ) -> None:
         self.number, self.request = number, request
         self.name = request.device_name
+        self.devices: tuple[str, ...] = getattr(source.port, "devices", (self.name,))
         self.port = source.port.name
         self.is_paced = source.port.can_reconnect
         self.keeps_time = getattr(source.port, "keeps_time", False)

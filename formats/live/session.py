@@ -272,7 +272,7 @@ class LiveSession:
         context = SinkContext(
             self.system,
             self._artifacts,
-            tuple(dict.fromkeys(each.name for each in self._inputs)),
+            tuple(dict.fromkeys(name for each in self._inputs for name in each.devices)),
             self._request.token,
             self.status,
         )

@@ -76,6 +76,14 @@ class ObservationsPort:
         self.name = name
         self._session, self._speed = session, speed
 
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Names of the devices in the session."""
+        topics = observation_topics(self._session).items()
+        return tuple(
+            dict.fromkeys(topic.removeprefix(TOPIC_PREFIXES[kind]) for topic, kind in topics)
+        )
+
     def open(self) -> ReplayLink:
         """Start at the first observation; see :class:`.links.Port`."""
         topics = observation_topics(self._session)

@@ -97,3 +97,8 @@ def test_a_session_without_observations_is_refused(tmp_path: Path) -> None:
         pass
     with pytest.raises(SourceError, match="no observations"):
         ObservationsPort("replay:empty.mcap", Session.open(path), 0.0).open()
+
+
+def test_its_devices_are_known_before_data_come(session: Path) -> None:
+    port = ObservationsPort("replay:run.mcap", Session.open(session), 0.0)
+    assert sorted(port.devices) == ["blue", "red"]
