@@ -181,6 +181,7 @@ def test_slow_poses_all_arrive(live: ModuleType, autopilot: Any, opened: Any) ->
     sink = opened(f"mavlink:udpout:127.0.0.1:{autopilot.port}?message=vision&frame=ned")
     for k in range(5):
         live.offer(sink, live.pose(k))
+        live.wait_for(lambda k=k: len(autopilot.of("VISION_POSITION_ESTIMATE")) == k + 1)
         time.sleep(0.025)
     live.wait_for(lambda: len(autopilot.of("VISION_POSITION_ESTIMATE")) == 5)
     assert [each.y for each in autopilot.of("VISION_POSITION_ESTIMATE")] == [0, 1, 2, 3, 4]
