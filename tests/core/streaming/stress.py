@@ -15,8 +15,6 @@ from locatk.core.dots.frames import Frames
 from locatk.core.dots.simulation import session as dots_session
 from locatk.core.dots.solver import SolveOptions as DotsOptions
 from locatk.core.dots.stream import DotsStream
-from locatk.core.inertial import InertialSamples
-from locatk.core.landmarks.halls import HallSamples
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation import session as landmarks_session
 from locatk.core.landmarks.stream import LandmarksStream
@@ -24,7 +22,6 @@ from locatk.core.lighthouse import simulation as lighthouse_session
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.stream import LighthouseStream
-from locatk.core.polaris.array import Samples
 from locatk.core.polaris.simulation import session as polaris_session
 from locatk.core.polaris.stream import PolarisStream
 from locatk.core.streaming.events import LiveEvent, PoseEstimate, Stream, TrackingState
@@ -69,8 +66,7 @@ def select(observations: Any, rows: NDArray[np.int64]) -> Any:
     columns = {
         each.name: value[rows]
         for each in fields(observations)
-        if isinstance(value := getattr(observations, each.name), np.ndarray)
-        and len(value) == count
+        if isinstance(value := getattr(observations, each.name), np.ndarray) and len(value) == count
     }
     return replace(observations, **columns)
 
@@ -105,9 +101,7 @@ def case(name: str) -> Case:
     if name == "dots":
         frames = dots_session.simulate(None, dots_session.SimulationOptions(frames=12))
         options_of_dots = DotsOptions(camera=Camera((188, 120), 348.7, (93.5, 59.5)))
-        return Case(
-            lambda: DotsStream(frames.manifest, options_of_dots), in_order(frames.frames)
-        )
+        return Case(lambda: DotsStream(frames.manifest, options_of_dots), in_order(frames.frames))
     is_rigid = name == "rigid"
     sweeps = lighthouse_session.simulate(
         lighthouse_session.SimulationOptions(
@@ -213,9 +207,7 @@ def _one_far_time(pieces: list[Any], rng: np.random.Generator) -> None:
 def _jitter(pieces: list[Any], rng: np.random.Generator) -> None:
     first, last = stretch(pieces, rng)
     step_ns = 10 ** rng.uniform(0, 8)
-    pieces[first:last] = [
-        shifted(each, int(step_ns * rng.normal())) for each in pieces[first:last]
-    ]
+    pieces[first:last] = [shifted(each, int(step_ns * rng.normal())) for each in pieces[first:last]]
 
 
 def _advance(pieces: list[Any], rng: np.random.Generator) -> None:
