@@ -59,6 +59,10 @@ COLUMN_HEIGHTS = 0.5
 SIDE_MARGIN_HEIGHTS = 1.5
 """Distance beyond the last sensor up to which magnets are searched for, in heights."""
 
+MIN_HEIGHT_M = 1e-3
+"""Least height of the sensors over the magnets in a fit that is continued [m]: below, they would be
+inside of the magnets of the published tags."""
+
 MAX_ROWS = 100_000
 """Number of rows of a pass beyond which a fit has diverged: those of 100 m at a height of 4 mm."""
 
@@ -283,11 +287,11 @@ def detect_running_pass(
     )
     # A slope would be taken from the field of magnets ahead.
     level = replace(prepared, window=replace(prepared.window, trend_terms=1))
-    guesses = _timed_guesses(level)
-    if not guesses:
-        return None
-    timed, guess = guesses[0]
     try:
+        guesses = _timed_guesses(level)
+        if not guesses:
+            return None
+        timed, guess = guesses[0]
         fit = _grow_coarse_fit(timed, guess)
     except DegenerateError:
         return None
@@ -741,6 +745,9 @@ def _separate_candidates(
 def _find_missed_sources(prepared: PreparedPass, fit: PassFit) -> list[MagnetCandidate]:
     """Return the sources that the residual of a fit still holds."""
     window, state = prepared.window, fit.state
+    if state.height_m < MIN_HEIGHT_M:
+        # The resolution of the filter follows the height: it would take hours.
+        raise DegenerateError("the samples do not determine the height of the sensors")
     matched_filter = MatchedFilter(window.sensors_m, window.noise_t, state.height_m)
     residual = np.nan_to_num(fit.residual / np.sqrt(window.counts)[:, None, None])
     candidates, _ = matched_filter.find_magnets(

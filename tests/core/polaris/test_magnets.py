@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from locatk.core.errors import DegenerateError
+from locatk.core.polaris.detection import magnets as magnets_module
 from locatk.core.polaris.detection.magnets import (
     MagnetCandidate,
     MagnetHypothesis,
@@ -162,3 +165,11 @@ def test_sources_at_given_positions(world: Any) -> None:
         again.position_m[:, None] - hypothesis.magnets.position_m[None], axis=2
     )
     assert distance.min(axis=1).max() < 1e-3
+
+
+def test_a_fit_whose_height_collapses_is_given_up() -> None:
+    """The rows of the matched filter follow the height: ten micrometres would take hours."""
+    prepared: Any = SimpleNamespace(window=SimpleNamespace())
+    fit: Any = SimpleNamespace(state=SimpleNamespace(height_m=1e-5))
+    with pytest.raises(DegenerateError, match="height"):
+        magnets_module._find_missed_sources(prepared, fit)
