@@ -133,7 +133,7 @@ def command(
 
     \b
     SINK is one of
-      web://:8080               a page for browsers (map, paths, table), and /health
+      web://:8080               a page for browsers (map, paths), and /health
       foxglove://:8765          Foxglove and Lichtblick
       jsonl:FILE                a file with one JSON object per line
       udp://HOST:PORT           datagrams, JSON or packed
@@ -148,10 +148,10 @@ def command(
 
     \b
     Examples:
-      locatk live /dev/ttyACM0 --device locatk --artifact map.toml --to web://:8080
+      locatk live /dev/ttyACM0 --artifact map.toml --to web://:8080
       locatk live /dev/ttyACM0 --artifact scene.toml --record run.mcap
       locatk live camera:0 --artifact sheet.toml --to udp://192.168.1.20:9000
-      locatk live replay:run.mcap --artifact tag.toml --speed 5 --to foxglove://:8765
+      locatk live replay:run.mcap --speed 5 --to foxglove://:8765
       locatk live COM3 --input 'COM4 device=lines name=robot' --artifact map.toml
       locatk live --config live.toml
     """

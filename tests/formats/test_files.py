@@ -129,6 +129,7 @@ MODULES_WITH_OTHER_FILES = {
     "capture/recording_files.py": "the recording that is written",
     "capture/port_listing.py": "files of /proc and /sys",
     "emulation/pseudo_terminal.py": "a terminal",
+    "sinks/jsonl.py": "the file that is written",
     "sessions/recovery/recover.py": "the output, which is read back",
 }
 

@@ -31,6 +31,9 @@ NAME = re.compile(r"(^|\W)(refused|rejected|reason)\b")
 RETURNING = {"_fit_reason", "_missing_reason", "_misplaced"}
 """Functions of core that return a reason code."""
 
+KEYED = {"RESTORATIONS"}
+"""Dictionaries of core whose keys are reason codes."""
+
 
 def reasons(system: str) -> set[str]:
     """Every reason code in the sources of a system."""
@@ -68,6 +71,9 @@ def reason_expressions(tree: ast.AST) -> Iterator[ast.AST]:
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             if any(NAME.search(ast.unparse(target)) for target in targets):
                 yield from (*targets, node.value)
+        elif isinstance(node, ast.AnnAssign) and ast.unparse(node.target) in KEYED:
+            assert isinstance(node.value, ast.Dict)
+            yield from (key for key in node.value.keys if key is not None)
         elif isinstance(node, ast.FunctionDef) and node.name in RETURNING:
             yield from (each for each in ast.walk(node) if isinstance(each, ast.Return))
 
