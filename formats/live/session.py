@@ -190,6 +190,7 @@ class LiveSession:
         self._started_s = 0.0
         self._replay: RecordedOrder | None = None
         self._replayed_ns = 0
+        self._stop = threading.Event()
         self._sink_errors: dict[int, str] = {}
         self._scene_version = 0
         self._rejected: dict[str, int] = {}
@@ -221,6 +222,7 @@ class LiveSession:
             missing.
         """
         self._load()
+        self._stop = stop
         inputs = open_inputs(self._request.inputs, self._clock, stop, self._queue, waiting=waiting)
         self._inputs = inputs
         if all(each.keeps_time for each in inputs):
@@ -372,6 +374,8 @@ class LiveSession:
         """Decode and solve events of a replay; time passes in steps between them."""
         batch: list[Arrival] = []
         for arrival in arrivals:
+            if self._stop.is_set():  # Nobody waits for the rest of a recording.
+                return
             time_ns = arrival.event.time_ns
             is_end = isinstance(arrival.event, SourceEnded)
             is_step = not is_end and time_ns - self._replayed_ns >= TICK_NS
