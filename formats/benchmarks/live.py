@@ -122,13 +122,13 @@ class LiveRun:
         """Return the messages of one type."""
         return [message for message in self.messages if message["type"] == kind]
 
-    def is_tracking(self, track: Trajectory) -> np.ndarray:
-        """Return which poses (n,) of a recorded track were published in state ``tracking``."""
+    def is_certain(self, track: Trajectory) -> np.ndarray:
+        """Return which poses (n,) of a recorded track were not published as ``provisional``."""
         times_s = np.sort(
             [
                 pose["time_s"]
                 for pose in self.of_type("pose")
-                if pose["device"] == track.device and pose["state"] == "tracking"
+                if pose["device"] == track.device and pose["state"] != "provisional"
             ]
         )
         # Messages have the time as a float, to 0.2 microseconds.
@@ -283,16 +283,14 @@ def compare(live: Sequence[Trajectory], solved: Sequence[Trajectory]) -> Agreeme
 def agreement_figures(
     system: str, live: LiveRun, recording: Path, artifacts: Sequence[str]
 ) -> list[Figure]:
-    """Solve a recording of ``locatk live`` offline, and compare the poses in state ``tracking``."""
+    """Solve a recording of ``locatk live`` offline, and compare the poses but provisional ones."""
     solved = recording.with_name("solved.mcap")
     run("solve", str(recording), *artifacts, "-o", str(solved), "--overwrite")
-    tracking = [
-        each.select(live.is_tracking(each)) for each in read_trajectories(recording, "live")
-    ]
-    agreement = compare(tracking, read_trajectories(solved))
+    certain = [each.select(live.is_certain(each)) for each in read_trajectories(recording, "live")]
+    agreement = compare(certain, read_trajectories(solved))
     how = (
-        f"{len(agreement.ratio)} live poses in state tracking against `locatk solve` of the "
-        "recording"
+        f"{len(agreement.ratio)} live poses that are not provisional against `locatk solve` of "
+        "the recording"
     )
     median = float(np.median(agreement.ratio)) if len(agreement.ratio) else None
     p95 = float(np.percentile(agreement.ratio, 95)) if len(agreement.ratio) else None
