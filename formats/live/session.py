@@ -372,24 +372,18 @@ class LiveSession:
 
     def _take_recorded(self, arrivals: Iterable[Arrival]) -> None:
         """Decode and solve events of a replay; time passes in steps between them."""
-        batch: list[Arrival] = []
         for arrival in arrivals:
             if self._stop.is_set():  # Nobody waits for the rest of a recording.
                 return
             time_ns = arrival.event.time_ns
             is_end = isinstance(arrival.event, SourceEnded)
-            is_step = not is_end and time_ns - self._replayed_ns >= TICK_NS
-            if batch and (is_step or arrival.source != batch[0].source):
-                self._take_batch(batch)
-                batch = []
-            if is_step:
-                # Only here, because batches depend on the threads of the readers.
+            if not is_end and time_ns - self._replayed_ns >= TICK_NS:
                 self._serve_background()
                 self._replayed_ns = time_ns
                 self._pass_time(time_ns, arrival.received_s)
-            batch.append(arrival)
-        if batch:
-            self._take_batch(batch)
+            # One by one: how many are there depends on the threads of the readers, and the times
+            # of records on those that are decoded together.
+            self._take_batch([arrival])
 
     def _take_batch(self, batch: Sequence[Arrival]) -> None:
         """Decode and solve successive events of one input."""
