@@ -184,7 +184,7 @@ class LiveSession:
         self._artifacts: dict[str, Any] = {}
         self._devices: dict[str, DeviceStatus] = {}
         self._warnings: Counter[str] = Counter()
-        self._lateness_s = 0.0
+        self._lateness_s = self._loaded_s = 0.0
         self._is_late = False
         self._is_sink_open = False
         self._started_s = 0.0
@@ -268,6 +268,7 @@ class LiveSession:
             system, [each.artifacts for each in self._inputs], self._request.stream
         )
         self.system = system
+        self._loaded_s = time.monotonic()
         self._localizer = LiveLocalizer(stream)
 
     def _open_sinks(self) -> None:
@@ -447,7 +448,9 @@ class LiveSession:
         if not received_s:
             return
         self._lateness_s = time.monotonic() - received_s
-        is_late = self._lateness_s > MAX_LATENESS_S and any(each.is_paced for each in self._inputs)
+        # Bytes that came while the solver was loaded say nothing about the speed of the computer.
+        is_late = self._lateness_s > MAX_LATENESS_S and received_s > self._loaded_s
+        is_late &= any(each.is_paced for each in self._inputs)
         if is_late and not self._is_late:
             text = f"the solver is {self._lateness_s:.1f} s behind: this computer is too slow"
             self._report("", "solver_late", text, time.monotonic())

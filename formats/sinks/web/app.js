@@ -920,6 +920,7 @@
   function distance(value) {
     if (value >= 1) return value.toFixed(2) + " m";
     if (value >= 0.1) return (100 * value).toFixed(0) + " cm";
+    if (value < 0.0001) return (1e6 * value).toFixed(0) + " µm";
     return (1000 * value).toFixed(value < 0.00995 ? 1 : 0) + " mm";
   }
 

@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -378,3 +379,24 @@ def test_the_recording_has_the_poses_and_the_events(
     logged = [json.loads(log.message) for _, log in session.decoded("/log", Log)
               if log.name == "locatk live"]  # fmt: skip
     assert "state" in {each["type"] for each in logged}
+
+
+# ---- lateness
+
+
+def test_a_late_solver_is_reported_once_until_it_has_caught_up() -> None:
+    told: list[str] = []
+    session = LiveSession(LiveRequest(()), [], tell=told.append)
+    session._inputs = [SimpleNamespace(is_paced=True, is_recording=False)]  # type: ignore[list-item]
+    now_s = time.monotonic()
+    session._loaded_s = now_s
+    session._check_lateness(now_s - 1)
+    assert not told, "these bytes came while the solver was loaded"
+    session._loaded_s = now_s - 10
+    session._check_lateness(now_s - 1)
+    session._check_lateness(now_s - 1)
+    assert len(told) == 1
+    assert "behind" in told[0]
+    session._check_lateness(time.monotonic())
+    session._check_lateness(now_s - 1)
+    assert len(told) == 2
