@@ -68,7 +68,7 @@ from locatk.core.landmarks.solver import (
     SolveOptions,
     common_lag,
 )
-from locatk.core.landmarks.visit_stream import LeftVisit, VisitStream
+from locatk.core.landmarks.visit_stream import CompletedVisit, VisitStream
 from locatk.core.solution import SolverWarning
 from locatk.core.streaming.events import (
     BackgroundTask,
@@ -287,7 +287,7 @@ class RobotStream:
                 events += self._warn(SolverWarning(code, message))
         return events
 
-    def _take(self, left: LeftVisit) -> list[StreamEvent]:
+    def _take(self, left: CompletedVisit) -> list[StreamEvent]:
         """Return the results of a visit that the robot has left."""
         if not left.is_revised:
             self.previous, self.current = self.current, None
@@ -323,7 +323,7 @@ class RobotStream:
         events += self._judge_sensors(left.recording)
         return events
 
-    def _detect(self, left: LeftVisit) -> StreamedVisit:
+    def _detect(self, left: CompletedVisit) -> StreamedVisit:
         """Detect the landmark of a visit, merged with the previous one if it is the same."""
         current = self.current
         if current is not None and current.is_merged:
@@ -347,7 +347,7 @@ class RobotStream:
             return visit
         return StreamedVisit(merged.segment, hypotheses, previous.before, is_merged=True)
 
-    def _detect_landmark(self, left: LeftVisit) -> VisitHypotheses:
+    def _detect_landmark(self, left: CompletedVisit) -> VisitHypotheses:
         """Return the hypotheses of a visit."""
         priors = replace(self.priors, noise_t=left.recording.noise_t)
         return detect_landmark(left.segment, left.recording, self.geometry, priors)
@@ -509,7 +509,7 @@ class RobotStream:
         recording = HallRecording(none, np.empty((0, 3)), np.zeros(len(sensors)), 0.0)
         if check.scale != 1:
             recording = recording.rescaled(check.scale)
-            self.visits.rescale(check.scale)
+            self.visits.correct_scale(check.scale)
         elif check.faulty_sensor is not None:
             recording = recording.without_sensor(check.faulty_sensor)
             self.visits.leave_out(check.faulty_sensor)

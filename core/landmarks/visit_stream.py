@@ -58,8 +58,9 @@ MAX_RETURN_M = 1.0
 """Path of the sensors after the last field beyond which a robot that returns to a landmark begins a
 new visit."""
 
-MAX_ROWS = 60_000
-"""Samples that are kept: five minutes at 200 Hz. A visit that is longer is divided."""
+MAX_VISIT_ROWS = 60_000
+"""Samples of the longest visit: five minutes at 200 Hz. Longer ones are divided; at most twice as
+many samples are kept."""
 
 MAX_STEP_ROWS = 1000
 """Samples of a step of :data:`.preprocessing.STEP_M` beyond which a robot rests: further ones are
@@ -158,7 +159,7 @@ class FieldGroup:
 
 
 @dataclass(frozen=True)
-class LeftVisit:
+class CompletedVisit:
     """Visit to a landmark that the robot has left.
 
     Attributes
@@ -262,7 +263,7 @@ class VisitStream:
 
     def visits(
         self, complete_ns: int | None = None, *, is_finished: bool = False
-    ) -> Iterator[LeftVisit]:
+    ) -> Iterator[CompletedVisit]:
         """Yield the visits that the observations complete.
 
         Parameters
@@ -303,7 +304,7 @@ class VisitStream:
             self.notes["samples_without_odometry"] += int(chosen.sum())
             self._waiting_ns, self._waiting_t = self._waiting_ns[~chosen], self._waiting_t[~chosen]
 
-    def _take_pose(self, time_ns: int, pose: Array) -> Iterator[LeftVisit]:
+    def _take_pose(self, time_ns: int, pose: Array) -> Iterator[CompletedVisit]:
         """Take one pose of the odometry, and the samples up to its time."""
         is_first = not len(self._path_ns)
         is_later = is_first or time_ns - self._path_ns[-1] >= MIN_POSE_INTERVAL_NS
@@ -331,14 +332,14 @@ class VisitStream:
         self._is_invalid_between = False
         if self.statistics is not None:
             yield from self._take_rows(times, field)
-            yield from self._leave(pose)
+            yield from self._check_departure(pose)
             yield from self._end_after_silence()
         self._drop_unused()
 
-    def _end_after_silence(self) -> Iterator[LeftVisit]:
+    def _end_after_silence(self) -> Iterator[CompletedVisit]:
         """End a visit, and forget its samples, if no samples came for long.
 
-        The poses since a sample are kept; there must not be ever more of them.
+        The poses since the last sample are kept; without an end, their number would grow.
         """
         if len(self._unjudged_ns):
             newest_ns = int(self._unjudged_ns[-1])
@@ -359,7 +360,7 @@ class VisitStream:
 
     def _take_rows(
         self, time_ns: Times, field_t: Array, *, is_last: bool = False
-    ) -> Iterator[LeftVisit]:
+    ) -> Iterator[CompletedVisit]:
         """Preprocess samples, and yield the visits that they complete.
 
         The newest sample is kept back until the next one is known, by which a spike is detected.
@@ -414,7 +415,7 @@ class VisitStream:
 
     def _append(
         self, time_ns: Times, field_t: Array, pose: Array, sensor_path: Array
-    ) -> Iterator[LeftVisit]:
+    ) -> Iterator[CompletedVisit]:
         """Append preprocessed samples, and yield the visits that they complete."""
         magnitude = np.nan_to_num(np.abs(field_t - self.offset_t))
         strongest = magnitude.max(axis=1)
@@ -442,33 +443,33 @@ class VisitStream:
             yield from self._close_step(first + edge)
         self._step_rows = self._rows.stop - self._step_start
 
-    def _leave(self, pose: Array) -> Iterator[LeftVisit]:
+    def _check_departure(self, pose: Array) -> Iterator[CompletedVisit]:
         """Yield the visit if the robot, which is at a pose by now, has left the landmark."""
         group = self._group
         if group is None:
             return
         motion_m = float(sensor_motion(self.sensors, np.vstack([self._last[:3], pose]))[0])
         since_field_m = float(self._last[3]) + motion_m - self._field_path
-        if since_field_m > LEAVING_PATH_M and not self._is_weak(group):
+        if since_field_m > LEAVING_PATH_M and not self._has_nothing_new(group):
             yield from self._close_step(self._rows.stop)
-            if self._group is group and not self._is_weak(group):
+            if self._group is group and not self._has_nothing_new(group):
                 yield self._report(group, self._rows.stop)
-        if since_field_m > MAX_RETURN_M or self._rows.stop - group.first > MAX_ROWS:
+        if since_field_m > MAX_RETURN_M or self._rows.stop - group.first > MAX_VISIT_ROWS:
             yield from self._end_group()
             self._kept_first = None
 
-    def _is_weak(self, group: FieldGroup) -> bool:
-        """Return whether no strong field was measured since the visit was reported."""
+    def _has_nothing_new(self, group: FieldGroup) -> bool:
+        """Return whether no strong field was measured since the visit began or was reported."""
         return group.new_peak_t < self._min_peak_t
 
     @property
     def _min_peak_t(self) -> float:
-        """Strongest field below which a visit does not determine a landmark."""
+        """Least peak field of a visit that determines a landmark."""
         return MIN_PEAK_THRESHOLDS * self.geometry.threshold_t
 
     # ---- groups of fields
 
-    def _close_step(self, stop: int) -> Iterator[LeftVisit]:
+    def _close_step(self, stop: int) -> Iterator[CompletedVisit]:
         """Add the fields up to a sample to the visit, or begin another one with them."""
         first, self._step_start = self._step_start, stop
         own = self._rows.values[first - self._rows.start : stop - self._rows.start]
@@ -488,12 +489,12 @@ class VisitStream:
         earliest = max((self._previous_stop + first) // 2, self._rows.start)
         self._group = FieldGroup(first, stop, position, power, earliest, peak_t)
 
-    def _end_group(self, next_first: int | None = None) -> Iterator[LeftVisit]:
+    def _end_group(self, next_first: int | None = None) -> Iterator[CompletedVisit]:
         """End a visit, to which the robot cannot return any more."""
         group = self._group
         if group is None:
             return
-        if not self._is_weak(group):
+        if not self._has_nothing_new(group):
             latest = self._rows.stop if next_first is None else (group.stop + next_first) // 2
             yield self._report(group, latest)
         self._group = None
@@ -501,29 +502,33 @@ class VisitStream:
             self._previous_stop = group.stop
             self._kept_first = self._reported_first
 
-    def _report(self, group: FieldGroup, latest: int) -> LeftVisit:
+    def _report(self, group: FieldGroup, latest: int) -> CompletedVisit:
         """Return the visit of a group, up to a sample at most."""
         distance, start = self._rows.column(-5), self._rows.start
         begin = np.searchsorted(distance, distance[group.first - start] - MARGIN_M)
         end = np.searchsorted(distance, distance[group.stop - 1 - start] + MARGIN_M, "right")
         first = max(group.earliest, int(begin) + start)
-        visit = self._left_visit(
+        visit = self._build_visit(
             first, min(latest, int(end) + start), group.centroid, is_revised=group.is_reported
         )
         group.is_reported, group.new_peak_t = True, 0.0
         self._reported_first = first
         return visit
 
-    def merged(self, first: VisitSegment, second: VisitSegment, centre: Array) -> LeftVisit | None:
+    def merged(
+        self, first: VisitSegment, second: VisitSegment, centre: Array
+    ) -> CompletedVisit | None:
         """Return two successive visits to the landmark at ``centre`` as one.
 
         None if their samples are not kept any more.
         """
         if first.first < self._rows.start:
             return None
-        return self._left_visit(first.first, second.stop, centre, is_revised=True)
+        return self._build_visit(first.first, second.stop, centre, is_revised=True)
 
-    def _left_visit(self, first: int, stop: int, centre: Array, *, is_revised: bool) -> LeftVisit:
+    def _build_visit(
+        self, first: int, stop: int, centre: Array, *, is_revised: bool
+    ) -> CompletedVisit:
         """Average the samples ``first`` to ``stop - 1``."""
         rows, count = self._rows, len(self.sensors)
         all_ns = rows.time_ns[: rows.size]
@@ -542,7 +547,7 @@ class VisitStream:
         shift = rows.start + low
         segment = average_samples(recording, first - shift, stop - shift, centre, self.drift)
         segment = VisitSegment(first, stop, segment.time_ns, segment.trace, segment.origin)
-        return LeftVisit(recording, segment, is_revised)
+        return CompletedVisit(recording, segment, is_revised)
 
     @property
     def offset_t(self) -> Array:
@@ -558,18 +563,18 @@ class VisitStream:
 
     # ---- memory
 
-    def rescale(self, scale: float) -> None:
-        """Divide all further readings by a factor."""
-        self.scale *= scale
+    def correct_scale(self, factor: float) -> None:
+        """Divide further readings by a factor more, and discard the visit in progress."""
+        self.scale *= factor
         self._restart()
 
     def leave_out(self, sensor: int) -> None:
-        """Do not use one sensor any more."""
+        """Use one sensor no more, and discard the visit in progress."""
         self.left_out.add(sensor)
         self._restart()
 
     def _restart(self) -> None:
-        """Forget the visit in progress, whose readings were others."""
+        """Discard the visit in progress, which used the previous scale or sensors."""
         self._group, self._kept_first = None, None
         self._previous_stop = self._step_start = self._rows.stop
 
@@ -592,9 +597,9 @@ class VisitStream:
             kept = rows.start + int(np.searchsorted(distance, reached_m - MARGIN_M - SLACK_M))
             kept = min(kept, self._step_start)
             if self._kept_first is not None:
-                is_recent = rows.stop - self._kept_first <= MAX_ROWS
+                is_recent = rows.stop - self._kept_first <= MAX_VISIT_ROWS
                 kept = min(kept, self._kept_first) if is_recent else kept
-            rows.drop_before(max(kept, rows.stop - 2 * MAX_ROWS))
+            rows.drop_before(max(kept, rows.stop - 2 * MAX_VISIT_ROWS))
         first_ns = rows.time_ns[0] if rows.size else self._path_ns[-1]
         first_ns = min(first_ns, *self._unjudged_ns.tolist(), self._path_ns[-1])
         first = int(np.searchsorted(self._path_ns, first_ns)) - SPLINE_POSES

@@ -114,7 +114,7 @@ class LiveLocalizer:
                 source = self._sources.pop(result.device, "")
                 events += self._tracker(result.device).fix(result, source)
             elif isinstance(result, StateChange):
-                events += self._tracker(result.device).report(result)
+                events += self._tracker(result.device).take_reason(result)
             else:
                 if isinstance(result, ArtifactUpdate):
                     for tracker in self._trackers.values():

@@ -54,7 +54,7 @@ class StateReason(StrEnum):
     """Reasons of states other than ``TRACKING`` that a tracker gives (streams give others)."""
 
     NO_FIX = "no fix yet"
-    SILENT = "no fix and no odometry"
+    SILENT = "no fix and no motion data"
     NO_RECENT_FIX = "no recent fix"
     AMBIGUOUS = "other positions are possible"
     UNCERTAIN = "sigma above the limit"
@@ -78,21 +78,21 @@ MAX_EARLY_FIXES = 8
 """Number of fixes before the first odometry that are kept."""
 
 MAX_EXTRAPOLATION_S = 0.25
-"""Time after the newest odometry up to which its motion is extrapolated to a fix [s]: a sample that
-is missing at 10 Hz."""
+"""Time after the newest motion (odometry or IMU) up to which it is extrapolated to a fix [s]: one
+sample is missing at 10 Hz, and its successor is late."""
 
-MAX_ODOMETRY_SPEED_M_S, MAX_ODOMETRY_RATE_RAD_S, MAX_ODOMETRY_STEP_M = 20.0, 30.0, 0.05
-"""Speeds above which a step of the odometry is a jump (a restart of its driver), unless the step is
-short: time stamps that jitter make short steps fast."""
+MAX_ODOMETRY_SPEED_M_S, MAX_ODOMETRY_RATE_RAD_S, MIN_JUMP_M = 20.0, 30.0, 0.05
+"""Speed and rate above which a step of the odometry is a jump (a restart of its driver), and the
+length up to which a step is none: time stamps that jitter make short steps fast."""
 
-MAX_ODOMETRY_STEP_RAD = 0.5
-"""The same of angles [rad]."""
+JUMP_MARGIN_RAD = 0.5
+"""Angle of a step beyond that of the largest rate from which it is a jump [rad]."""
 
-CONTRADICTION = "fix off the prediction"
+CONTRADICTION = "fix contradicts the prediction"
 """Reason of a correction without a known source."""
 
-MAX_READINGS = np.repeat([MAX_SPECIFIC_FORCE_M_S2, MAX_ANGULAR_RATE_RAD_S], 3)
-"""Largest readings of accelerometer and gyroscope [m/s^2 and rad/s]."""
+MAX_INERTIAL_READING = np.repeat([MAX_SPECIFIC_FORCE_M_S2, MAX_ANGULAR_RATE_RAD_S], 3)
+"""Limits (6,) of the readings of accelerometer and gyroscope [m/s^2 and rad/s]."""
 
 PROVISIONAL_REFUSALS = 3
 """Number of provisional fixes in a row that end a pose that was certain."""
@@ -113,12 +113,12 @@ class TrackerSettings:
     fix_timeout_s : float
         Age of the last fix from which on a pose is dead reckoning.
     lost_timeout_s : float
-        Time without fix and motion after which the device is lost.
+        Time without any fix or sample of odometry or IMU after which the device is lost.
     max_sigma_m : float
         Standard deviation of the position above which the device is lost.
     refusals_before_reset : int
         Number of fixes in a row that contradict the prediction after which the filter starts
-        anew from the last of them. 1 if a fix is not wrong by chance (its identity is decoded).
+        anew from the last of them. 1 if fixes are no outliers, because a code identifies them.
     odometry, inertial : OdometryNoise, InertialNoise
     """
 
@@ -190,7 +190,7 @@ class DeviceTracker:
         self._last_fix: Fix | None = None
         self._off_plane: _FixOffPlane | None = None
         self._frame: str | None = None
-        self._start_anew = ""
+        self._restart_reason = ""
         self._published_ns: int | None = None
         self._reset_counter = 0
         self._state: TrackingState | None = None
@@ -213,19 +213,19 @@ class DeviceTracker:
         if not _is_provisional(fix):
             self._stream_reason = ""
         if self._frame is not None and fix.frame != self._frame:
-            self._start_anew = f"frame {fix.frame}"
+            self._restart_reason = f"frame {fix.frame}"
             self._early_fixes.clear()
         is_other_frame = self._frame is not None and fix.frame != self._frame
         self._frame = fix.frame
         history = self._history
-        if history is None or not self._is_connected(fix.time_ns):
+        if history is None or not self._has_recent_motion(fix.time_ns):
             if history is None:
                 self._early_fixes.append(fix)
             else:
                 self._unfused = fix.time_ns, self._measurement(fix)
             self._use(fix)
-            if self._start_anew:
-                events.append(self._correct(None, None, fix, self._start_anew))
+            if self._restart_reason:
+                events.append(self._correct(None, None, fix, self._restart_reason))
             return events + self._publish(_estimate_of(fix))
         head_ns = history.time_ns
         assert head_ns is not None
@@ -237,19 +237,19 @@ class DeviceTracker:
             return events
         now_accepted, now_refused, now_resets = self._counters()
         self.counts["refused_fixes"] += max(now_refused - refused, 0)
-        # A fix in the order of time that the filter accepts is explained by its covariance.
-        is_usual = fix.time_ns >= head_ns and now_resets == resets and not self._start_anew
+        # A fix in the order of time without a reset is refused, or within the gate: no jump.
+        is_usual = fix.time_ns >= head_ns and now_resets == resets and not self._restart_reason
         predicted = None if is_usual else self._estimate(time_ns, before)
         if now_accepted > accepted:
             self._use(fix)
         estimate = self._estimate(time_ns)
         if predicted is not None and estimate is not None and not is_other_frame:
             is_jump = now_resets > resets or _is_beyond(predicted, estimate)
-            if is_jump or self._start_anew:
-                reason = self._start_anew or source or CONTRADICTION
+            if is_jump or self._restart_reason:
+                reason = self._restart_reason or source or CONTRADICTION
                 events.append(self._correct(predicted, estimate, fix, reason))
-        elif self._start_anew or now_resets > resets:
-            reason = self._start_anew or source or CONTRADICTION
+        elif self._restart_reason or now_resets > resets:
+            reason = self._restart_reason or source or CONTRADICTION
             events.append(self._correct(None, None, fix, reason))
         if estimate is None and self._last_fix is fix:
             # The heading is still unknown, so that odometry cannot carry the position.
@@ -266,7 +266,7 @@ class DeviceTracker:
                 x, y, _ = odometry.position[index].tolist()
                 heading = _heading(odometry.quaternion[index])
                 pose = x, y, heading, float(odometry.covariance[index, 5, 5])
-            events += self._odometry_pose_at(time_ns, pose)
+            events += self._take_odometry_pose(time_ns, pose)
         return events
 
     def inertial(self, samples: InertialSamples) -> list[LiveEvent]:
@@ -276,15 +276,18 @@ class DeviceTracker:
             return events
         readings = np.column_stack([samples.acceleration, samples.angular_rate])
         for time_ns, reading in zip(samples.time_ns.tolist(), readings, strict=True):
-            events += self._reading_at(time_ns, reading)
+            events += self._take_reading(time_ns, reading)
         return events
 
     def advance(self, time_ns: int) -> list[LiveEvent]:
-        """Return the events that follow from the time alone: no observation up to it is missing."""
+        """Return the events that follow from the time alone.
+
+        The caller has passed on all observations up to it.
+        """
         return self._expire(time_ns)
 
-    def report(self, change: StateChange) -> list[LiveEvent]:
-        """Take the reason of the system for a state. Timeouts decide on the state itself."""
+    def take_reason(self, change: StateChange) -> list[LiveEvent]:
+        """Use the reason of the system's stream; the tracker itself decides on the state."""
         is_tracking = change.state is TrackingState.TRACKING
         self._stream_reason = "" if is_tracking else change.reason
         if self._state is None:
@@ -296,16 +299,17 @@ class DeviceTracker:
     def use_artifact(self, update: ArtifactUpdate) -> None:
         """Start anew with the next fix, because later fixes refer to another artifact."""
         if self._frame is not None:
-            self._start_anew = f"scene version {update.version}"
+            self._restart_reason = f"scene version {update.version}"
 
     # ---- motion
 
-    def _is_connected(self, time_ns: int) -> bool:
+    def _has_recent_motion(self, time_ns: int) -> bool:
         """Return whether the motion up to a time is known, or can be extrapolated to it."""
         motion_ns = self._history.motion_time_ns if self._history is not None else None
         return motion_ns is not None and time_ns - motion_ns <= MAX_EXTRAPOLATION_S * 1e9
 
-    def _odometry_pose_at(self, time_ns: int, pose: tuple[float, ...] | None) -> list[LiveEvent]:
+    def _take_odometry_pose(self, time_ns: int, pose: tuple[float, ...] | None) -> list[LiveEvent]:
+        """Add the motion since the previous pose; None is a pose that is not plausible."""
         if not self._is_planar:
             self._begin_odometry()
         assert self._history is not None
@@ -319,8 +323,8 @@ class DeviceTracker:
             motion, duration_s = _twist(before, pose), (time_ns - before_ns) * 1e-9
             distance_m, angle = math.hypot(motion[0], motion[1]), abs(motion[2])
             if (
-                distance_m > max(MAX_ODOMETRY_STEP_M, MAX_ODOMETRY_SPEED_M_S * duration_s)
-                or angle > MAX_ODOMETRY_RATE_RAD_S * duration_s + MAX_ODOMETRY_STEP_RAD
+                distance_m > max(MIN_JUMP_M, MAX_ODOMETRY_SPEED_M_S * duration_s)
+                or angle > MAX_ODOMETRY_RATE_RAD_S * duration_s + JUMP_MARGIN_RAD
             ):
                 self.counts["odometry_jumps"] += 1
                 self._begin_odometry()
@@ -336,12 +340,13 @@ class DeviceTracker:
         self._history = FilterHistory(PlanarFilter(self.settings.odometry), ODOMETRY_CAPACITY)
         self._is_planar = True
 
-    def _reading_at(self, time_ns: int, reading: Array) -> list[LiveEvent]:
+    def _take_reading(self, time_ns: int, reading: Array) -> list[LiveEvent]:
+        """Add the motion since the previous reading (6,) of an IMU."""
         if self._history is None:
             model = InertialFilter(self.settings.inertial)
             self._history = FilterHistory(model, INERTIAL_CAPACITY)
         before, before_ns = self._reading, self._history.motion_time_ns
-        is_plausible = np.abs(reading) < MAX_READINGS
+        is_plausible = np.abs(reading) < MAX_INERTIAL_READING
         # A sensor that was not sampled keeps its reading.
         reading = np.where(is_plausible, reading, np.nan if before is None else before)
         if not np.isfinite(reading).all() or (before_ns is not None and time_ns <= before_ns):
@@ -364,7 +369,7 @@ class DeviceTracker:
             fix = self._early_fixes.popleft()
             history.add_fix(fix.time_ns, self._measurement(fix))
         if self._unfused is not None:
-            # Fixes during a silence of the odometry were published as they are.
+            # Of a silence of the odometry, only the latest fix is used; all were published.
             history.add_fix(*self._unfused)
             self._unfused = None
         head_ns = history.time_ns
@@ -404,7 +409,7 @@ class DeviceTracker:
         """Return a fix as the filter takes it: with errors that are independent of other fixes."""
         is_provisional = _is_provisional(fix)
         max_refusals = self.settings.refusals_before_reset
-        if self._start_anew:
+        if self._restart_reason:
             max_refusals = 0
         elif is_provisional:
             max_refusals = max(max_refusals, PROVISIONAL_REFUSALS)
@@ -444,7 +449,7 @@ class DeviceTracker:
 
     def _use(self, fix: Fix) -> None:
         """Remember an accepted fix if it is the newest."""
-        if self._last_fix is None or fix.time_ns >= self._last_fix.time_ns or self._start_anew:
+        if self._last_fix is None or fix.time_ns >= self._last_fix.time_ns or self._restart_reason:
             self._last_fix = fix
 
     def _correct(
@@ -456,7 +461,7 @@ class DeviceTracker:
     ) -> Correction:
         """Return the correction from a pose to another, and count the discontinuity."""
         self._reset_counter = (self._reset_counter + 1) % 256
-        self._start_anew = ""
+        self._restart_reason = ""
         displacement_m, rotation = np.full(3, np.nan), math.nan
         if predicted is not None and estimate is not None:
             displacement_m = estimate.position - predicted.position

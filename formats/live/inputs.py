@@ -60,12 +60,19 @@ MAX_WAITING_BYTES = 8 << 20
 """Received bytes that wait for the solver, beyond which those of a device are left out: more than
 two seconds of the fastest serial ports. A replayed file waits instead."""
 
-WAIT_S = 0.002
+REPLAY_POLL_S = 0.002
 """Interval at which a replayed file checks whether the solver has caught up."""
 
 
 Decoder = SerialIntake | CameraIntake | ObservationsIntake
 """Decoder of the solver."""
+
+
+@dataclass(frozen=True, slots=True)
+class BytesLeftOut:
+    """Bytes before this time were not queued, because too many were waiting."""
+
+    time_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +89,12 @@ class Arrival:
     """
 
     source: int
-    event: Event
+    event: Event | BytesLeftOut
     received_s: float
 
 
 class ArrivalQueue:
-    """Queue from the readers to the solver; bounded, without locks held while a reader waits."""
+    """Queue from the readers to the solver; :meth:`LiveInput._deliver` limits what waits in it."""
 
     def __init__(self) -> None:
         self._arrivals: deque[Arrival] = deque()
@@ -124,7 +131,7 @@ class RecordedOrder:
         self._ended: set[int] = set()
 
     def merge(self, arrivals: Sequence[Arrival]) -> Iterator[Arrival]:
-        """Yield the events whose turn has come, after further ones."""
+        """Add arrivals, and yield the events whose turn has come."""
         for arrival in arrivals:
             self._waiting[arrival.source].append(arrival)
         while all(queue or n in self._ended for n, queue in enumerate(self._waiting)):
@@ -227,7 +234,7 @@ class LiveInput:
         self._stop_recorder = threading.Event()
         self._source = source
         self._thread: threading.Thread | None = None
-        self._shared: SharedReader | None = None
+        self._shared: RecorderView | None = None
         self._recorded: RecordedInput | None = None
 
     # ---- reader and recorder
@@ -251,7 +258,7 @@ class LiveInput:
             self._reader.discard()
         else:
             files = create_files(self.request, self._source, self._clock)
-            shared = self._shared = SharedReader(self._reader)
+            shared = self._shared = RecorderView(self._reader)
             raw = self._source.intake
             if not isinstance(self._decoder, CameraIntake):
                 self._recorded = RecordedInput(raw, self._decoder)  # type: ignore[arg-type]
@@ -275,7 +282,7 @@ class LiveInput:
         self._reader.start()
 
     def _record(
-        self, recorder: Recorder, shared: SharedReader, tell: Callable[[str], None]
+        self, recorder: Recorder, shared: RecorderView, tell: Callable[[str], None]
     ) -> None:
         try:
             self.recording = recorder.run(self._stop_recorder)
@@ -303,7 +310,7 @@ class LiveInput:
     def stop_recording(self, timeout_s: float) -> None:
         """End the recording, and finish its files."""
         if self._shared is not None:
-            self._shared.release()
+            self._shared.release_end()
         self._stop_recorder.set()
         if self._thread is not None:
             self._thread.join(timeout_s)
@@ -328,22 +335,22 @@ class LiveInput:
             while not self.is_paced and self.waiting_bytes > MAX_WAITING_BYTES:
                 if self._is_stopping:
                     break
-                time.sleep(WAIT_S)
+                time.sleep(REPLAY_POLL_S)
             if self.is_paced and self.waiting_bytes + event.size > MAX_WAITING_BYTES:
                 self.dropped_bytes += event.size
                 self._is_dropping = True
                 return
             if self._is_dropping:
                 self._is_dropping = False
-                text = "the solver was late: bytes were left out"
-                self._queue.put(Arrival(self.number, ConnectionLost(event.time_ns, text), 0.0))
-                self._queue.put(Arrival(self.number, Reconnected(event.time_ns, ""), received_s))
+                self._queue.put(Arrival(self.number, BytesLeftOut(event.time_ns), received_s))
             self._delivered_bytes += event.size
         self._queue.put(Arrival(self.number, event, received_s))
 
     # ---- decoder, in the thread of the solver
 
-    def decode(self, events: Sequence[Event]) -> Iterator[Observations | InputNotice]:
+    def decode(
+        self, events: Sequence[Event | BytesLeftOut]
+    ) -> Iterator[Observations | InputNotice]:
         """Yield the observations and notices of successive events.
 
         Raises
@@ -355,18 +362,18 @@ class LiveInput:
         for event in events:
             if isinstance(event, ReceivedData):
                 received.append(event)
-                self._taken_bytes += event.size
-                self._decoded_ns = event.time_ns
                 continue
             yield from self._observations(received)
             received = []
-            if isinstance(event, ConnectionLost):
+            if isinstance(event, BytesLeftOut):
+                yield from self._restarted()
+                yield InputNotice("the solver was late: bytes were left out", is_connected=True)
+            elif isinstance(event, ConnectionLost):
                 self.is_connected = False
                 yield InputNotice(f"connection lost: {event.why}", is_connected=False)
             elif isinstance(event, Reconnected):
                 self.is_connected = True
-                if not isinstance(self._decoder, CameraIntake):
-                    yield from self._converted(self._decoder.decode_restart())
+                yield from self._restarted()
                 yield InputNotice(f"reconnected to {event.path}", is_connected=True)
             elif isinstance(event, SourceEnded):
                 self.is_connected, self.is_ended = False, True
@@ -376,8 +383,13 @@ class LiveInput:
                     yield InputNotice(event.error, is_connected=False)
         yield from self._observations(received)
 
+    def _restarted(self) -> Iterator[Observations | InputNotice]:
+        """Discard a partial frame, because bytes are missing; yield what was held back."""
+        if not isinstance(self._decoder, CameraIntake):
+            yield from self._converted(self._decoder.decode_restart())
+
     def identify(self, now_ns: int) -> Iterator[Observations | InputNotice]:
-        """Yield the observations of a device that is identified by the time that has passed."""
+        """Decide which device it is if the time for that is over; yield what was held back."""
         if not isinstance(self._decoder, CameraIntake):
             yield from self._converted(self._decoder.decode_identified(now_ns))
 
@@ -390,8 +402,11 @@ class LiveInput:
             for each in received:
                 yield from frame_observations(self.name, each.data, self._frames)
                 self._frames += len(each.data)
-            return
-        yield from self._converted(self._decoder.decode(received))
+        else:
+            yield from self._converted(self._decoder.decode(received))
+        # Only now, because the caller solves each observation before it asks for the next one.
+        self._taken_bytes += sum(each.size for each in received)
+        self._decoded_ns = received[-1].time_ns
 
     def _converted(self, records: Sequence[TimedBatch]) -> Iterator[Observations | InputNotice]:
         own = self._decoder.artifacts()
@@ -413,11 +428,11 @@ class LiveInput:
         return totals
 
 
-class SharedReader:
-    """Reader for a recorder that neither starts nor stops it, because the solver uses it as well.
+class RecorderView:
+    """View of a reader for a recorder, which cannot start or stop it: the solver uses it as well.
 
-    The end of the source is held back until :meth:`release`: the recording also contains the poses
-    of the last bytes. Attributes are those of :class:`.reader_thread.PortReader`.
+    The end of the source is held back until :meth:`release_end`: the recording also contains the
+    poses of the last bytes. Attributes are those of :class:`.reader_thread.PortReader`.
     """
 
     def __init__(self, reader: PortReader) -> None:
@@ -425,7 +440,7 @@ class SharedReader:
         self._is_released = False
         self._end: list[Event] = []
 
-    def release(self) -> None:
+    def release_end(self) -> None:
         """Let the recorder know the end of the source."""
         self._is_released = True
 
@@ -531,7 +546,7 @@ def _open(
             source = OpenSource(port, port.open(), intake, content)  # type: ignore[arg-type]
             return request, source, intake
     source = open_source(request, clock, stop, waiting=waiting)
-    # That of the recording is another one, which only keeps the bytes.
+    # The recording has an intake of its own, which only keeps the bytes.
     return request, source, create_intake(request, source.artifacts)
 
 

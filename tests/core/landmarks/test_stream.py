@@ -37,7 +37,7 @@ from locatk.core.landmarks.simulation.session import (
 )
 from locatk.core.landmarks.solver import SolveOptions, solve
 from locatk.core.landmarks.stream import LandmarksStream
-from locatk.core.landmarks.visit_stream import LeftVisit, VisitStream
+from locatk.core.landmarks.visit_stream import CompletedVisit, VisitStream
 from locatk.core.solution import Solution
 from locatk.core.streaming.events import (
     DetectionEvent,
@@ -315,7 +315,7 @@ def test_kidnapped_robot_is_found_again() -> None:
 def test_robot_that_returns_revises_its_visit() -> None:
     """It leaves a landmark and returns to it: the filter has one reading of it, as offline."""
     one = drive((), waypoints=((0.3, 0.4), (0.68, 0.4), (0.52, 0.4), (1.3, 0.4)), stop_s=0.0)
-    visits = left_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
+    visits = completed_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
     assert [visit.is_revised for visit in visits].count(True) >= 1
     stream = LandmarksStream(FLOOR)
     events = live(stream, in_time(one.samples[0], one.odometry[0]))
@@ -357,7 +357,7 @@ def random_pieces(
             advance(min(missing) - 1)
 
 
-def left_visits(stream: VisitStream, pieces: Iterator[Observations]) -> list[LeftVisit]:
+def completed_visits(stream: VisitStream, pieces: Iterator[Observations]) -> list[CompletedVisit]:
     visits = []
     for piece in pieces:
         if isinstance(piece, HallSamples):
@@ -375,7 +375,7 @@ def new_visit_stream() -> VisitStream:
 @functools.cache
 def visits_in_time() -> list[Any]:
     one = drive()
-    visits = left_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
+    visits = completed_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
     assert len(visits) >= 7
     return [exact(visit) for visit in visits]
 
@@ -391,7 +391,7 @@ def test_visits_do_not_depend_on_cuts_and_interleaving(seed: int) -> None:
         seed,
         lambda time_ns: early.extend(stream.visits(time_ns)),
     )
-    visits = left_visits(stream, pieces)
+    visits = completed_visits(stream, pieces)
     merged = sorted([*early, *visits], key=lambda visit: visit.segment.stop)
     assert [exact(visit) for visit in merged] == visits_in_time()
 
@@ -417,7 +417,7 @@ def test_advance_releases_a_visit_without_later_samples() -> None:
     """After the sensors fell silent, odometry shows that the robot has left."""
     one = drive(((2, 2), (2, 3)), stop_s=0.0)
     samples, odometry = one.samples[0], one.odometry[0]
-    whole = left_visits(new_visit_stream(), in_time(samples, odometry))
+    whole = completed_visits(new_visit_stream(), in_time(samples, odometry))
     count = whole[0].segment.stop  # The first landmark has just been left.
     stream = new_visit_stream()
     stream.push_samples(part(samples, 0, count))
@@ -449,7 +449,7 @@ def test_segments_begin_as_offline() -> None:
     one = drive()
     recording = preprocess(one.samples[0], one.odometry[0])
     offline = segment_visits(recording, FLOOR.geometry, OdometryDrift(), FLOOR.pitch_m)
-    visits = left_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
+    visits = completed_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0]))
     assert len(visits) == len(offline)
     for visit, expected in zip(visits, offline, strict=True):
         # Within a step of 5 mm, of the offset that was not yet known, and of the margin.
@@ -463,7 +463,7 @@ def test_poses_within_a_visit_are_those_of_the_offline_interpolation() -> None:
     """Only the last two intervals of the odometry are interpolated without their followers."""
     one = drive()
     recording = preprocess(one.samples[0], one.odometry[0])
-    for visit in left_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0])):
+    for visit in completed_visits(new_visit_stream(), in_time(one.samples[0], one.odometry[0])):
         times = visit.recording.samples.time_ns
         own = np.searchsorted(recording.samples.time_ns, times)
         error = visit.recording.pose - recording.pose[own]
@@ -684,7 +684,7 @@ def test_memory_does_not_grow_on_a_long_drive(monkeypatch: pytest.MonkeyPatch) -
 def test_memory_does_not_grow_while_a_robot_stays_on_a_landmark(
     monkeypatch: pytest.MonkeyPatch, is_turning: bool
 ) -> None:
-    monkeypatch.setattr(visit_stream, "MAX_ROWS", 2000)
+    monkeypatch.setattr(visit_stream, "MAX_VISIT_ROWS", 2000)
     count, random = 16_000, np.random.default_rng(4)
     time_ns = np.arange(count) * 10_000_000
     sensors = drive().samples[0].sensors

@@ -133,7 +133,7 @@ def test_states_follow_the_age_of_the_fix() -> None:
         (0.0, "lost", "no fix yet"),
         (0.05, "tracking", ""),
         (0.3, "dead reckoning", "no recent fix"),
-        (1.7, "lost", "no fix and no odometry"),
+        (1.7, "lost", "no fix and no motion data"),
         (5.5, "tracking", ""),
     ]
     reckoned = [pose for pose in poses(events) if pose.state is TrackingState.DEAD_RECKONING]
@@ -149,17 +149,17 @@ def test_without_motion_a_silent_device_is_lost() -> None:
     events += tracker.advance(START + SECOND)
     assert states(events) == [(0.0, "tracking", "")]
     events = tracker.advance(START + 2 * SECOND)
-    assert states(events) == [(1.0, "lost", "no fix and no odometry")]
+    assert states(events) == [(1.0, "lost", "no fix and no motion data")]
 
 
 def test_the_reason_of_the_stream_is_shown() -> None:
     tracker = DeviceTracker("robot")
     report = StateChange("robot", START, TrackingState.LOST, "off_sheet")
-    events = tracker.report(report)
+    events = tracker.take_reason(report)
     events += tracker.fix(make_fix(0.1))
-    events += tracker.report(replace(report, time_ns=START + SECOND // 5))
+    events += tracker.take_reason(replace(report, time_ns=START + SECOND // 5))
     events += tracker.advance(START + 3 * SECOND)
-    events += tracker.report(replace(report, time_ns=START + 4 * SECOND, reason="no_grid"))
+    events += tracker.take_reason(replace(report, time_ns=START + 4 * SECOND, reason="no_grid"))
     events += tracker.fix(make_fix(5.0))
     assert states(events) == [
         (0.0, "lost", "off_sheet"),
