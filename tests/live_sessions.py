@@ -17,10 +17,13 @@ from locatk.formats.sessions.mcap_file import CAPTURE_RECORD
 from locatk.formats.sessions.reader import Session
 from locatk.formats.sessions.writer import SessionWriter
 
-DEVICES = {"polaris": "locatk", "landmarks": "locatk", "lighthouse": "dotbot-gateway"}
-"""Device that sends the bytes of each system."""
-
-SYSTEMS = (*DEVICES, "dots")
+DEVICES = {
+    "polaris": "locatk",
+    "landmarks": "locatk",
+    "lighthouse": "dotbot-gateway",
+    "deck": "lighthouse-deck",
+}
+"""Device that sends the bytes of each session."""
 
 RECEIVER = """format = "locatk-lighthouse-receiver"
 format_version = 1
@@ -30,7 +33,7 @@ position_mm = [[0.0, 0.0, 0.0]]
 
 
 class LiveSessions:
-    """Sessions of 3 to 4 s, each made when it is needed.
+    """Sessions of 3 to 4 s, each made when it is needed: of each system, and of a rigid "deck".
 
     Parameters
     ----------
@@ -48,10 +51,10 @@ class LiveSessions:
         return path
 
     def artifacts(self, system: str) -> Path:
-        """Return a session with the artifacts; that of Lighthouse has an estimated scene."""
-        if system != "lighthouse":
+        """Return a session with the artifacts; those of Lighthouse have an estimated scene."""
+        if system not in ("lighthouse", "deck"):
             return self.decoded(system)
-        path = self.folder / "solved.mcap"
+        path = self.folder / f"{system}-solved.mcap"
         if not path.exists():
             locatk("solve", self.decoded(system), "-o", path)
         return path
@@ -88,6 +91,9 @@ class LiveSessions:
         receiver = self.folder / "receiver.toml"
         receiver.write_text(RECEIVER)
         locatk("simulate", "lighthouse", "--duration", 4, "--receiver", receiver, "-o", path)
+
+    def _deck(self, path: Path) -> None:
+        locatk("simulate", "lighthouse", "--duration", 4, "--3d", "--receiver", "deck", "-o", path)
 
     def _dots(self, path: Path) -> None:
         locatk("simulate", "dots", "--frames", 12, "-o", path)

@@ -612,7 +612,7 @@ def print_memory(hours: float) -> None:
     session, solved = (Session.open(path) for path in sys.argv[1:3])
     sweeps = read_sweeps(session)
     sweeps = sweeps.take(np.argsort(sweeps.time_ns, kind="stable"))
-    localizer = LiveLocalizer(LighthouseStream(SCENE.attached(solved), {}))
+    localizer = LiveLocalizer(LighthouseStream(SCENE.attached(solved)))
     start_ns = int(sweeps.time_ns[0])
     round_ns = int(sweeps.time_ns[-1]) - start_ns + 1_000_000_000
     rounds = int(np.ceil(3600e9 * hours / round_ns))

@@ -283,8 +283,7 @@ class LiveSession:
             try:
                 sink.open(context)
             except Exception as error:
-                for opened in self._sinks[:index]:
-                    self._close_sink(opened, 0.0)
+                self._close_sinks(self._sinks[:index])
                 if isinstance(error, LocatkError):
                     raise
                 raise LocatkError(
@@ -292,12 +291,6 @@ class LiveSession:
                     hint="Omit it, or update its package",
                 ) from error
         self._is_sink_open = True
-
-    @staticmethod
-    def _close_sink(sink: Sink, timeout_s: float) -> None:
-        # Sinks of other packages may raise; there is nobody left to be told.
-        with contextlib.suppress(Exception):
-            sink.close(timeout_s)
 
     def _start(self) -> None:
         # Objects of the imports are no garbage: a search through them takes 13 ms.
@@ -322,14 +315,17 @@ class LiveSession:
             for each in self._inputs:
                 each.stop_recording(RECORDING_TIMEOUT_S)
             if self._is_sink_open:
-                self._close_sinks()
+                self._close_sinks(self._sinks)
             gc.unfreeze()
 
-    def _close_sinks(self) -> None:
-        closing = [
-            threading.Thread(target=self._close_sink, args=(sink, CLOSE_TIMEOUT_S), daemon=True)
-            for sink in self._sinks
-        ]
+    @staticmethod
+    def _close_sinks(sinks: Sequence[Sink]) -> None:
+        def close(sink: Sink) -> None:
+            # Sinks of other packages may raise; there is nobody left to be told.
+            with contextlib.suppress(Exception):
+                sink.close(CLOSE_TIMEOUT_S)
+
+        closing = [threading.Thread(target=close, args=(sink,), daemon=True) for sink in sinks]
         for thread in closing:
             thread.start()
         until_s = time.monotonic() + CLOSE_TIMEOUT_S + 0.5

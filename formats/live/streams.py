@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,7 +33,6 @@ class StreamOptions:
     scene: str | None = None
     odometry_noise_rad: float | None = None
     odometry_lag_s: float | None = None
-    misread: float | None = None
 
 
 def system_of_artifacts(texts: Mapping[str, str]) -> str:
@@ -64,7 +63,7 @@ def create_stream(
         An artifact that the system requires is missing.
     """
     kind = INFRASTRUCTURE[system]
-    infrastructure = next(filter(None, (kind.attached(each) for each in inputs)), None)
+    infrastructure = _first(kind.attached(each) for each in inputs)
     artifacts = {} if infrastructure is None else {kind.file: infrastructure}
     stream: Stream
     if system == "lighthouse":
@@ -72,14 +71,18 @@ def create_stream(
         from locatk.core.lighthouse.stream import LighthouseStream
 
         lighthouse_options = LighthouseOptions(**_given(scene=options.scene))
-        stream = LighthouseStream(infrastructure, _Receivers(inputs), lighthouse_options)
+        stream = LighthouseStream(
+            infrastructure,
+            lambda device: _first(each.of_device(RECEIVER, device) for each in inputs),
+            lighthouse_options,
+        )
     elif system == "dots":
         from locatk.core.dots.solver import SolveOptions as DotsOptions
         from locatk.core.dots.stream import DotsStream
 
         if infrastructure is None:
             raise InputError("no manifest of the sheet", hint="Give it as --artifact sheet.toml")
-        camera = next(filter(None, (CAMERA.attached(each) for each in inputs)), None)
+        camera = _first(CAMERA.attached(each) for each in inputs)
         stream = DotsStream(infrastructure, DotsOptions(camera=camera))
     elif system == "polaris":
         from locatk.core.polaris.stream import PolarisStream
@@ -93,7 +96,6 @@ def create_stream(
             **_given(
                 odometry_noise=options.odometry_noise_rad,
                 odometry_lag_s=options.odometry_lag_s,
-                misread=options.misread,
             )
         )
         stream = LandmarksStream(infrastructure, landmark_options)
@@ -104,24 +106,5 @@ def _given(**values: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-class _Receivers(Mapping[str, Any]):
-    """Receivers by device; those that follow from a device are known once it has sent data."""
-
-    def __init__(self, inputs: Sequence[AttachedArtifacts]) -> None:
-        self._inputs = inputs
-        self._known: dict[str, Any] = {}
-
-    def __getitem__(self, device: str) -> Any:
-        if device not in self._known:
-            receivers = (each.of_device(RECEIVER, device) for each in self._inputs)
-            receiver = next(filter(None, receivers), None)
-            if receiver is None:
-                raise KeyError(device)
-            self._known[device] = receiver
-        return self._known[device]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._known)
-
-    def __len__(self) -> int:
-        return len(self._known)
+def _first(artifacts: Iterable[Any]) -> Any:
+    return next((each for each in artifacts if each is not None), None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -85,8 +85,8 @@ class LighthouseStream:
     scene : Scene, optional
         With stations: they are used as they are. Without, they are estimated in the background;
         markers, distances and calibrations of the scene are used for it.
-    receivers : mapping of str to Receiver
-        By device.
+    receiver_of : callable, optional
+        Returns the receiver of a device, or None; called at its first sweep.
     options : SolveOptions, optional
         ``scene`` and ``seed`` for the estimation of the scene.
 
@@ -105,16 +105,15 @@ class LighthouseStream:
     def __init__(
         self,
         scene: Scene | None,
-        receivers: Mapping[str, Receiver],
+        receiver_of: Callable[[str], Receiver | None] = lambda device: None,
         options: SolveOptions | None = None,
     ) -> None:
         self.rejected: Counter[str] = Counter()
         self.version = 0
         self._options = options or SolveOptions()
-        self._receivers = {
-            name: receiver for name, receiver in receivers.items() if len(receiver) >= MIN_SENSORS
-        }
-        self._multiple = {name for name, receiver in receivers.items() if len(receiver) > 1}
+        self._receiver_of = receiver_of
+        self._receivers: dict[str, Receiver] = {}
+        self._multiple: set[str] = set()
         self._prior = scene or Scene()
         self._known: KnownScene | None = None
         self._events: list[StreamEvent] = []
@@ -224,9 +223,11 @@ class LighthouseStream:
                 for note in self._prior.notes:
                     self._warn(SolverWarning("scene_assumption", note))
         self._advance_ticks(time_ns)
+        device = self._devices.get(name)
+        if device is None:
+            device = self._add_device(name)
         if sensor > 0:
             self._multiple.add(name)
-        device = self._devices.setdefault(name, len(self._devices))
         row = (time_ns, device, sensor, channel, polynomial, plane, count)
         self._recent.append(row)
         if channel in self._doubled:
@@ -250,6 +251,16 @@ class LighthouseStream:
         photodiode = f"{name}/{sensor}" if name in self._multiple else name
         is_labelled = polynomial != UNKNOWN
         self._photodiodes.push(photodiode, time_ns, station, plane, count, is_labelled, self._flush)
+
+    def _add_device(self, name: str) -> int:
+        """Return the number of a device that sends for the first time."""
+        receiver = self._receiver_of(name)
+        if receiver is not None:
+            if len(receiver) > 1:
+                self._multiple.add(name)
+            if len(receiver) >= MIN_SENSORS:
+                self._receivers[name] = receiver
+        return self._devices.setdefault(name, len(self._devices))
 
     def _flush(self) -> None:
         """Estimate the positions that are due, before any later event."""
@@ -348,7 +359,7 @@ class LighthouseStream:
         sweeps = self._store.sweeps()
         sweeps = sweeps.take(~np.isin(sweeps.channel, list(self._doubled)))
         arguments = (
-            sweeps, self._prior, self._options, self._odometry.tracks(), self._receivers
+            sweeps, self._prior, self._options, self._odometry.tracks(), dict(self._receivers)
         )  # fmt: skip
         return BackgroundTask(SCENE_TASK, estimate_live_scene, arguments)
 

@@ -122,8 +122,8 @@ def test_results_do_not_depend_on_how_sweeps_of_photodiodes_are_cut(data: st.Dat
     session = simulated(PHOTODIODES)
     n = len(session.sweeps)
     edges = sorted(data.draw(st.lists(st.integers(0, n), max_size=60)))
-    whole = run(LighthouseStream(session.true_scene, {}), [session.sweeps])
-    parts = run(LighthouseStream(session.true_scene, {}), cut(session.sweeps, edges))
+    whole = run(LighthouseStream(session.true_scene), [session.sweeps])
+    parts = run(LighthouseStream(session.true_scene), cut(session.sweeps, edges))
     assert len(fixes_of(whole)) > 100
     assert [everything(e) for e in parts] == [everything(e) for e in whole]
 
@@ -136,8 +136,8 @@ def test_results_do_not_depend_on_how_sweeps_of_devices_are_cut(data: st.DataObj
     n = len(session.sweeps)
     edges = sorted(data.draw(st.lists(st.integers(0, n), max_size=60)))
     known = receivers(session)
-    whole = run(LighthouseStream(session.true_scene, known), [session.sweeps])
-    parts = run(LighthouseStream(session.true_scene, known), cut(session.sweeps, edges))
+    whole = run(LighthouseStream(session.true_scene, known.get), [session.sweeps])
+    parts = run(LighthouseStream(session.true_scene, known.get), cut(session.sweeps, edges))
     assert len(fixes_of(whole)) > 40
     assert [everything(e) for e in parts] == [everything(e) for e in whole]
 
@@ -145,9 +145,9 @@ def test_results_do_not_depend_on_how_sweeps_of_devices_are_cut(data: st.DataObj
 @pytest.mark.slow
 def test_each_sweep_alone_gives_the_same_as_all_at_once() -> None:
     session = simulated(PHOTODIODES)
-    whole = run(LighthouseStream(session.true_scene, {}), [session.sweeps])
+    whole = run(LighthouseStream(session.true_scene), [session.sweeps])
     single = run(
-        LighthouseStream(session.true_scene, {}), cut(session.sweeps, range(1, len(session.sweeps)))
+        LighthouseStream(session.true_scene), cut(session.sweeps, range(1, len(session.sweeps)))
     )
     assert [everything(e) for e in single] == [everything(e) for e in whole]
 
@@ -159,7 +159,7 @@ def test_each_sweep_alone_gives_the_same_as_all_at_once() -> None:
 def test_fixes_of_photodiodes_are_right_within_their_covariance() -> None:
     options = replace(PHOTODIODES, outliers=0.0, stations=2, duration_s=6.0, robots=3)
     session = simulated(options)
-    fixes = fixes_of(run(LighthouseStream(session.true_scene, {}), cut(session.sweeps)))
+    fixes = fixes_of(run(LighthouseStream(session.true_scene), cut(session.sweeps)))
     # Each pair of a station gives a fix: 50 and 50.2 rotations a second, two robots all the time.
     assert len(fixes) > 2 * 6.0 * 90
     errors = errors_of(session, fixes)
@@ -177,7 +177,7 @@ def test_fixes_of_photodiodes_are_right_within_their_covariance() -> None:
 def test_the_mean_of_successive_fixes_has_the_covariance_of_independent_ones() -> None:
     options = replace(PHOTODIODES, outliers=0.0, stations=2, duration_s=8.0, robots=4)
     session = simulated(options)
-    events = run(LighthouseStream(session.true_scene, {}), cut(session.sweeps))
+    events = run(LighthouseStream(session.true_scene), cut(session.sweeps))
     nees = []
     for device in session.sweeps.devices[1:]:
         fixes = fixes_of(events, device)
@@ -191,7 +191,7 @@ def test_the_mean_of_successive_fixes_has_the_covariance_of_independent_ones() -
 
 def test_a_fix_comes_with_the_last_sweep_that_it_needs() -> None:
     session = simulated(replace(PHOTODIODES, outliers=0.0, robots=1))
-    stream = LighthouseStream(session.true_scene, {})
+    stream = LighthouseStream(session.true_scene)
     delays_ns = []
     for piece in cut(session.sweeps, range(1, len(session.sweeps))):
         now_ns = int(piece.time_ns[0])
@@ -205,7 +205,7 @@ def test_a_fix_comes_with_the_last_sweep_that_it_needs() -> None:
 def test_motion_between_the_sweeps_of_a_fix_is_corrected() -> None:
     """Without it, a robot at 0.5 m/s would be off by millimetres."""
     session = simulated(replace(PHOTODIODES, outliers=0.0, noise_rad=0.0, stations=2, robots=2))
-    fixes = fixes_of(run(LighthouseStream(session.true_scene, {}), cut(session.sweeps)), "robot-2")
+    fixes = fixes_of(run(LighthouseStream(session.true_scene), cut(session.sweeps)), "robot-2")
     errors = np.linalg.norm(errors_of(session, fixes), axis=1)
     speed = np.linalg.norm(np.diff([f.position for f in fixes[::10]], axis=0), axis=1).max() / 0.1
     assert speed > 0.1
@@ -223,7 +223,7 @@ def assert_agrees_with_offline(sweeps: Sweeps, scene: Scene, min_share: float) -
     offline = solve(sweeps, scene)
     order = np.argsort(sweeps.time_ns, kind="stable")
     live = defaultdict(list)
-    for fix in fixes_of(run(LighthouseStream(scene, {}), cut(sweeps.take(order)))):
+    for fix in fixes_of(run(LighthouseStream(scene), cut(sweeps.take(order)))):
         live[fix.device].append(fix)
     ratio, number = [], 0
     for track in offline.trajectories:
@@ -265,7 +265,7 @@ def test_fixes_are_those_of_the_offline_solver_on_published_recordings(
 @pytest.mark.slow
 def test_outliers_are_rejected_and_counted() -> None:
     session = simulated(replace(PHOTODIODES, outliers=0.1, duration_s=3.0, robots=3))
-    stream = LighthouseStream(session.true_scene, {})
+    stream = LighthouseStream(session.true_scene)
     fixes = fixes_of(run(stream, cut(session.sweeps)))
     errors = np.linalg.norm(errors_of(session, fixes), axis=1)
     assert np.percentile(errors, 98) < 5e-3
@@ -281,7 +281,7 @@ def test_wrong_numbers_are_rejected_by_reason() -> None:
         channel=np.array([0, 17, 1, 16], np.int32),
         count=np.array([1.0, 1.0, 1e7, 5.0]),
     )
-    stream = LighthouseStream(session.true_scene, {})
+    stream = LighthouseStream(session.true_scene)
     assert stream.push(wrong) == []
     assert stream.rejected == {
         "unknown_channel": 2, "count_above_period": 1, "station_not_in_scene": 1,
@@ -308,7 +308,7 @@ def test_a_position_that_jumps_is_held_back_until_others_confirm_it() -> None:
             np.array(counts),
         )  # fmt: skip
 
-    stream = LighthouseStream(scene, {})
+    stream = LighthouseStream(scene)
     here, there = np.array([0.1, 0.0, 0.0]), np.array([0.6, 0.3, 0.0])
     number = [
         len(fixes_of(stream.push(report(0.1 * k, there if k in (5, 10, 11, 12, 13) else here))))
@@ -324,7 +324,7 @@ def test_a_hidden_station_does_not_stop_fixes() -> None:
     sweeps = session.sweeps.take(session.sweeps.device == 1)
     start_ns = int(sweeps.time_ns[0])
     kept = sweeps.take((sweeps.channel != 2) | (sweeps.time_ns < start_ns + int(1e9)))
-    events = run(LighthouseStream(session.true_scene, {}), cut(kept))
+    events = run(LighthouseStream(session.true_scene), cut(kept))
     fixes = fixes_of(events)
     late = [f for f in fixes if f.time_ns > start_ns + 1.1e9]
     assert len(late) / 4.9 > 45
@@ -339,7 +339,7 @@ def test_a_hidden_station_does_not_stop_fixes() -> None:
 
 def test_time_alone_completes_the_fix_of_the_stations_that_are_left() -> None:
     session = simulated(replace(PHOTODIODES, outliers=0.0, robots=1))
-    stream = LighthouseStream(session.true_scene, {})
+    stream = LighthouseStream(session.true_scene)
     half = len(session.sweeps) // 2
     first = session.sweeps.take(np.arange(half))
     stream.push(first)
@@ -359,7 +359,7 @@ def test_a_moved_station_is_found_and_left_out() -> None:
         PHOTODIODES, stations=4, outliers=0.0, robots=2, duration_s=16.0, station_turn_rad=turn
     )
     session = simulated(options)
-    stream = LighthouseStream(session.true_scene, {})
+    stream = LighthouseStream(session.true_scene)
     events: list[StreamEvent] = []
     rejected = []
     for piece in cut(session.sweeps):
@@ -390,7 +390,7 @@ def test_a_moved_station_is_found_and_left_out() -> None:
 @pytest.mark.slow
 def test_poses_of_devices_are_right_within_their_covariance() -> None:
     session = simulated(replace(DECKS, duration_s=4.0))
-    events = run(LighthouseStream(session.true_scene, receivers(session)), cut(session.sweeps))
+    events = run(LighthouseStream(session.true_scene, receivers(session).get), cut(session.sweeps))
     fixes = fixes_of(events, "robot-2")
     assert len(fixes) > 45 * 4.0
     errors = errors_of(session, fixes)
@@ -413,7 +413,7 @@ def test_poses_of_devices_are_right_within_their_covariance() -> None:
 @pytest.mark.slow
 def test_poses_of_devices_agree_with_the_offline_solver() -> None:
     session = simulated(DECKS)
-    events = run(LighthouseStream(session.true_scene, receivers(session)), cut(session.sweeps))
+    events = run(LighthouseStream(session.true_scene, receivers(session).get), cut(session.sweeps))
     offline = solve_devices(session.sweeps, receivers(session), session.true_scene)
     # Robot 1 is hidden while it is carried from marker to marker.
     track = next(t for t in offline.trajectories if t.device == "robot-2")
@@ -431,7 +431,7 @@ def test_a_reflected_station_is_left_out_of_poses() -> None:
     session = simulated(
         replace(DECKS, duration_s=12.0, reflections=0.08, occlusion=0.1, outliers=0.03, seed=2)
     )
-    stream = LighthouseStream(session.true_scene, receivers(session))
+    stream = LighthouseStream(session.true_scene, receivers(session).get)
     fixes = fixes_of(run(stream, cut(session.sweeps)))
     assert stream.rejected["sweep_contradicts_pose"] > 20
     assert len(fixes) > 800
@@ -448,7 +448,7 @@ def test_a_scene_is_estimated_after_the_first_seconds() -> None:
     session = simulated(
         replace(PHOTODIODES, outliers=0.0, planar=True, report_hz=10.0, duration_s=14.0, stations=2)
     )
-    stream = LighthouseStream(None, {})
+    stream = LighthouseStream(None)
     events: list[StreamEvent] = []
     tasks: list[BackgroundTask] = []
     for piece in cut(session.sweeps):
@@ -478,7 +478,7 @@ def test_what_a_scene_lacks_is_said_once() -> None:
     session = simulated(
         replace(PHOTODIODES, outliers=0.0, report_hz=10.0, stations=1, duration_s=12.0)
     )
-    stream = LighthouseStream(None, {})
+    stream = LighthouseStream(None)
     events: list[StreamEvent] = []
     attempts_ns = []
     for piece in cut(session.sweeps):
@@ -499,7 +499,7 @@ def test_what_a_scene_lacks_is_said_once() -> None:
 def test_notes_of_a_scene_are_said_with_the_first_sweep() -> None:
     session = simulated(PHOTODIODES)
     scene = replace(session.true_scene, notes=("stations were measured by hand",))
-    stream = LighthouseStream(scene, {})
+    stream = LighthouseStream(scene)
     assert not stream.advance(int(session.sweeps.time_ns[0]))
     events = [event for piece in cut(session.sweeps) for event in stream.push(piece)]
     (note,) = [event for event in events if codes([event]) == ["scene_assumption"]]
@@ -509,7 +509,7 @@ def test_notes_of_a_scene_are_said_with_the_first_sweep() -> None:
 def test_an_error_of_the_program_is_not_hidden() -> None:
     task = BackgroundTask("scene", len)
     with pytest.raises(ZeroDivisionError):
-        LighthouseStream(None, {}).complete(task, ZeroDivisionError("division"))
+        LighthouseStream(None).complete(task, ZeroDivisionError("division"))
 
 
 def test_a_later_scene_replaces_an_earlier_one_only_if_it_is_better() -> None:
@@ -525,7 +525,7 @@ def test_a_later_scene_replaces_an_earlier_one_only_if_it_is_better() -> None:
     assert not is_better(fewer, worse)
     assert is_better(worse, replace(scene, scale="unit"))
     assert not is_better(replace(scene, scale="unit"), worse)
-    stream = LighthouseStream(None, {})
+    stream = LighthouseStream(None)
     task = BackgroundTask("scene", len)
     assert [e.version for e in stream.complete(task, SceneResult(worse, ()))] == [1]  # type: ignore[union-attr]
     assert stream.complete(task, SceneResult(worse, ())) == []
@@ -582,7 +582,7 @@ def test_memory_does_not_grow_with_the_length_of_the_input(
 
     monkeypatch.setattr(scene_search, "MAX_SWEEPS", 4000)
     session = simulated(replace(PHOTODIODES, outliers=0.02, duration_s=2.0))
-    stream = LighthouseStream(session.true_scene if has_scene else None, {})
+    stream = LighthouseStream(session.true_scene if has_scene else None)
     grown = []
     for k, piece in enumerate(repeated(session.sweeps, 40, 2_500_000_000)):
         stream.push(piece)
@@ -595,7 +595,7 @@ def test_memory_does_not_grow_with_the_length_of_the_input(
 @pytest.mark.slow
 def test_devices_that_are_gone_are_forgotten() -> None:
     session = simulated(replace(PHOTODIODES, robots=1, outliers=0.0))
-    stream = LighthouseStream(session.true_scene, {})
+    stream = LighthouseStream(session.true_scene)
     for k in range(5):
         own = replace(session.sweeps.take(np.arange(60)), devices=(f"robot {k}",))
         stream.push(replace(own, time_ns=own.time_ns + k * 50_000_000_000))
@@ -625,7 +625,7 @@ def test_odometry_gives_the_scale_of_an_estimated_scene() -> None:
         replace(PHOTODIODES, outliers=0.0, planar=True, report_hz=10.0, duration_s=8.0, stations=2)
     )
     truth = session.truth[1]
-    stream = LighthouseStream(None, {})
+    stream = LighthouseStream(None)
     half = len(truth) // 2
     for rows in (slice(0, half), slice(half, None)):
         stream.push(
@@ -656,7 +656,7 @@ def sweeps_of(rows: Sequence[tuple[int, int, int, float]]) -> Sweeps:
 
 def test_three_sweeps_with_one_time_stamp_leave_no_pair() -> None:
     session = simulated(PHOTODIODES)
-    stream = LighthouseStream(session.true_scene, {})
+    stream = LighthouseStream(session.true_scene)
     channel = session.true_scene.stations[0].channel
     third = int(period_counts(channel) / 3)
     at = 1_000_000_000
@@ -670,7 +670,7 @@ def test_three_sweeps_with_one_time_stamp_leave_no_pair() -> None:
 
 def test_unknown_planes_are_counted() -> None:
     session = simulated(DECKS)
-    stream = LighthouseStream(session.true_scene, receivers(session))
+    stream = LighthouseStream(session.true_scene, receivers(session).get)
     planes = np.full(len(session.sweeps), 2, np.int32)
     assert not fixes_of(run(stream, [replace(session.sweeps, sweep=planes)]))
     assert stream.rejected["plane_unknown"] == len(session.sweeps)
@@ -681,7 +681,7 @@ def test_unknown_planes_are_counted() -> None:
 def test_fixes_go_on_after_a_clock_was_set_back(options: SimulationOptions) -> None:
     session = simulated(options)
     known = receivers(session) if options is DECKS else {}
-    stream = LighthouseStream(session.true_scene, known)
+    stream = LighthouseStream(session.true_scene, known.get)
     expected = len(fixes_of(stream.push(session.sweeps)))
     earlier = replace(session.sweeps, time_ns=session.sweeps.time_ns - 3600 * 10**9)
     assert len(fixes_of(stream.push(earlier))) > 0.9 * expected

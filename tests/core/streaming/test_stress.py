@@ -120,7 +120,7 @@ def case(name: str) -> Case:
     )  # fmt: skip
     receivers = dict.fromkeys(sweeps.sweeps.devices, DECK) if is_rigid else {}
     return Case(
-        lambda: LighthouseStream(sweeps.true_scene, receivers),
+        lambda: LighthouseStream(sweeps.true_scene, receivers.get),
         in_order(sweeps.sweeps, *sweeps.imu),
     )
 
