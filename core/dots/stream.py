@@ -45,10 +45,10 @@ from locatk.core.errors import InputError
 from locatk.core.geometry import quaternion_from_heading
 from locatk.core.solution import SolverWarning
 from locatk.core.streaming.events import (
-    BackgroundTask,
     DetectionEvent,
     Fix,
     StateChange,
+    Stream,
     StreamEvent,
     TrackingState,
     WarningEvent,
@@ -106,7 +106,7 @@ class _CameraState:
     warned: set[str] = field(default_factory=set)
 
 
-class DotsStream:
+class DotsStream(Stream):
     """Causal solver of printed dots for any number of cameras; see :class:`.events.Stream`.
 
     Each frame gives a fix and a detection, or is rejected. The reason of a rejection is reported
@@ -154,22 +154,6 @@ class DotsStream:
             for index in range(len(observations)):
                 events += self._localize(_single(observations, index))
         return events
-
-    def advance(self, time_ns: int) -> Sequence[StreamEvent]:
-        """Return nothing: frames do not wait for each other."""
-        return ()
-
-    def finish(self) -> Sequence[StreamEvent]:
-        """Return nothing: frames do not wait for each other."""
-        return ()
-
-    def background_task(self) -> BackgroundTask | None:
-        """Return None: there is no long computation."""
-        return None
-
-    def complete(self, task: BackgroundTask, result: Any) -> Sequence[StreamEvent]:
-        """Return nothing: there is no long computation."""
-        return ()
 
     # ---- one frame
 

@@ -75,6 +75,7 @@ from locatk.core.streaming.events import (
     DetectionEvent,
     Fix,
     StateChange,
+    Stream,
     StreamEvent,
     TrackingState,
     WarningEvent,
@@ -154,7 +155,7 @@ def check_polarity(
     return warn_of_opposite_polarity(device, visits, floor, misread=misread, drift=drift)
 
 
-class LandmarksStream:
+class LandmarksStream(Stream):
     """Causal solver of landmarks, for any number of robots (:class:`.events.Stream`).
 
     Parameters

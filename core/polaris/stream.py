@@ -67,9 +67,9 @@ from locatk.core.polaris.solver import by_magnets, has_no_tag, identify_range, n
 from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.core.solution import SolverWarning
 from locatk.core.streaming.events import (
-    BackgroundTask,
     DetectionEvent,
     Fix,
+    Stream,
     StreamEvent,
     WarningEvent,
 )
@@ -132,6 +132,10 @@ MAX_VARIANCE_RATIO = 2.0
 MAX_WARNINGS = 1000
 """Number of warnings of a device after which there are no more."""
 
+MAX_ODOMETRY_DELAY_NS = 500_000_000
+"""Time by which odometry may arrive later than samples of the same time [ns]. A device whose
+odometry is farther behind is treated as one without, until it has caught up."""
+
 NEVER_NS, FOREVER_NS = -(2**62), 2**62
 """Times before and after all others."""
 
@@ -139,32 +143,13 @@ _TagKey = tuple[int, int]
 """Identity of a design, and id of a tag."""
 
 
-@dataclass(frozen=True)
-class StreamOptions:
-    """Options of the stream.
-
-    Attributes
-    ----------
-    speed_mps : float or None
-        Speed of the arrays over the floor, if it is known and constant. Without it, the path is
-        taken from odometry, or else estimated from the field.
-    max_odometry_delay_s : float
-        Time by which odometry may arrive later than samples of the same time. A device whose
-        odometry is farther behind is treated as one without, until it has caught up.
-    """
-
-    speed_mps: float | None = None
-    max_odometry_delay_s: float = 0.5
-
-
-class PolarisStream:
+class PolarisStream(Stream):
     """Stream of the Polaris system, see :class:`~locatk.core.streaming.events.Stream`.
 
     Parameters
     ----------
     tags : Tags, mapping of str to Tags, or None
         As of :func:`.solver.solve`.
-    options : StreamOptions, optional
     """
 
     system = "polaris"
@@ -172,10 +157,8 @@ class PolarisStream:
     def __init__(
         self,
         tags: Tags | Mapping[str, Tags] | None = None,
-        options: StreamOptions | None = None,
     ) -> None:
         self._designs = name_designs(tags)
-        self._options = options or StreamOptions()
         self._devices: dict[str, _DeviceStream] = {}
 
     def push(self, observations: Any) -> Sequence[StreamEvent]:
@@ -185,7 +168,7 @@ class PolarisStream:
         name = observations.device
         device = self._devices.get(name)
         if device is None:
-            device = _DeviceStream(name, self._designs, self._options)
+            device = _DeviceStream(name, self._designs)
             self._devices[name] = device
         if isinstance(observations, Trajectory):
             return device.push_odometry(observations)
@@ -198,14 +181,6 @@ class PolarisStream:
     def finish(self) -> Sequence[StreamEvent]:
         """End all passes."""
         return [event for each in self._devices.values() for event in each.finish()]
-
-    def background_task(self) -> BackgroundTask | None:
-        """Return None: nothing is computed elsewhere."""
-        return None
-
-    def complete(self, task: BackgroundTask, result: Any) -> Sequence[StreamEvent]:
-        """Do nothing: there are no tasks."""
-        return ()
 
 
 class _Ring:
@@ -313,10 +288,8 @@ class _RunningPass:
 class _DeviceStream:
     """Stream of one array. Samples are numbered from the first one."""
 
-    def __init__(
-        self, device: str, named_designs: Mapping[str | None, Tags], options: StreamOptions
-    ) -> None:
-        self.device, self.options = device, options
+    def __init__(self, device: str, named_designs: Mapping[str | None, Tags]) -> None:
+        self.device = device
         self.designs = tuple(by_magnets(tuple(named_designs.values())))
         self.names = {id(tags): name for name, tags in named_designs.items()}
         self.first_tag: _TagKey | None = None
@@ -399,7 +372,7 @@ class _DeviceStream:
             return []
         delay_ns = self.newest_ns - max(self.odometry_ns, self.start_ns)
         limit_ns = self.newest_ns
-        if delay_ns <= self.options.max_odometry_delay_s * 1e9:
+        if delay_ns <= MAX_ODOMETRY_DELAY_NS:
             limit_ns = max(self.odometry_ns, self.advanced_ns)
         events: list[StreamEvent] = []
         while self.held and (self.held[0][0] <= limit_ns or len(self.held) > MAX_HELD_SAMPLES):
@@ -527,9 +500,7 @@ class _DeviceStream:
         return events
 
     def _given_path(self, time_ns: NDArray[np.int64]) -> Array | None:
-        """Return the distance (n,) moved at samples, by speed or odometry; None without either."""
-        if self.options.speed_mps is not None:
-            return (time_ns - time_ns[0]) * 1e-9 * self.options.speed_mps
+        """Return the distance (n,) moved at samples, by odometry; None without it."""
         if self.odometry.stop == 0:
             return None
         pose_ns, position, quaternion = self.odometry.rows(self.odometry.first, self.odometry.stop)
@@ -548,9 +519,7 @@ class _DeviceStream:
         path_m = distance_along(driven, time_ns)
         # Whether poses after a gap are known already depends on how the input is interleaved.
         next_pose = np.clip(np.searchsorted(pose_ns, time_ns), 1, len(pose_ns) - 1)
-        is_gap = (
-            pose_ns[next_pose] - pose_ns[next_pose - 1] > self.options.max_odometry_delay_s * 1e9
-        )
+        is_gap = pose_ns[next_pose] - pose_ns[next_pose - 1] > MAX_ODOMETRY_DELAY_NS
         return np.where(is_gap, np.nan, path_m)
 
     def _end_pass(self, is_cut: bool = False) -> list[StreamEvent]:
@@ -599,7 +568,7 @@ class _DeviceStream:
                 merged = identify_range(preprocessed, self.designs, whole, given_m)
                 if merged is not None and merged.is_identified:
                     current = merged
-        events = self._report_path(samples, current, given_m)
+        events = self._report_path(current, given_m)
         self.unidentified = None
         if not (current.is_identified or self.reported):
             magnets = current.magnets
@@ -618,20 +587,17 @@ class _DeviceStream:
 
     # ---- results
 
-    def _report_path(
-        self, samples: Samples, current: IdentifiedPass, given_m: Array | None
-    ) -> list[StreamEvent]:
+    def _report_path(self, current: IdentifiedPass, given_m: Array | None) -> list[StreamEvent]:
         """Return the warnings of a pass and its path."""
         found = list(
             dict.fromkeys(w for each in current.observations for w in each.magnets.warnings)
         )
-        if self.options.speed_mps is not None or given_m is not None:
-            assert given_m is not None
+        if given_m is not None:
             contradiction = compare_path(given_m, current.observations[0])
             found += [
                 each
                 for each in (
-                    contradiction_warning([contradiction], self.options.speed_mps),
+                    contradiction_warning([contradiction], None),
                     coverage_warning(given_m, [current.magnets]),
                 )
                 if each is not None

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -227,7 +228,7 @@ class BackgroundTask:
     arguments: tuple[Any, ...] = field(default_factory=tuple)
 
 
-class Stream(Protocol):
+class Stream(ABC):
     """Causal solver of one system, for any number of devices.
 
     Attributes
@@ -236,8 +237,14 @@ class Stream(Protocol):
         As in :class:`locatk.core.solution.Solution`.
     """
 
-    system: str
+    system: ClassVar[str]
 
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Number of observations that were not used, by reason."""
+        return {}
+
+    @abstractmethod
     def push(self, observations: Any) -> Sequence[StreamEvent]:
         """Return the results that the next observations make known.
 
@@ -253,12 +260,16 @@ class Stream(Protocol):
 
         Sensors that fell silent become known this way.
         """
+        return ()
 
     def finish(self) -> Sequence[StreamEvent]:
         """Return the results of observations that were held back, at the end of the input."""
+        return ()
 
     def background_task(self) -> BackgroundTask | None:
         """Return the next long computation to be done, once; None if there is none."""
+        return None
 
     def complete(self, task: BackgroundTask, result: Any) -> Sequence[StreamEvent]:
         """Take the result of a task, or the exception that it raised."""
+        return ()

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from locatk.core.inertial import InertialSamples
+from locatk.core.solution import add_counts
 from locatk.core.streaming.events import (
     ArtifactUpdate,
     BackgroundTask,
@@ -28,7 +29,6 @@ from locatk.core.streaming.events import (
 )
 from locatk.core.streaming.tracker import (
     DEFAULT_SETTINGS,
-    DeviceHealth,
     DeviceTracker,
     TrackerSettings,
 )
@@ -96,9 +96,12 @@ class LiveLocalizer:
         return self._route(self.stream.complete(task, result))
 
     @property
-    def health(self) -> dict[str, DeviceHealth]:
-        """Condition of each device."""
-        return {name: tracker.health for name, tracker in self._trackers.items()}
+    def rejected(self) -> dict[str, int]:
+        """Numbers of observations that the stream did not use, and of fixes and motions that the
+        trackers did not use, by reason."""
+        return add_counts(
+            self.stream.rejected, *(tracker.rejected for tracker in self._trackers.values())
+        )
 
     def _tracker(self, device: str) -> DeviceTracker:
         tracker = self._trackers.get(device)

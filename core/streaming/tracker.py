@@ -140,26 +140,6 @@ DEFAULT_SETTINGS = {
 (reflections); those of Polaris and landmarks are rare, and their codes exclude wrong ones."""
 
 
-@dataclass(frozen=True)
-class DeviceHealth:
-    """Condition of one device.
-
-    Attributes
-    ----------
-    state : TrackingState
-    reason : str
-    last_pose_ns : int or None
-        Time of the last pose.
-    counts : dict of str to int
-        As :attr:`DeviceTracker.counts`.
-    """
-
-    state: TrackingState
-    reason: str
-    last_pose_ns: int | None
-    counts: dict[str, int]
-
-
 class DeviceTracker:
     """Poses of one device from its fixes and its odometry or IMU.
 
@@ -170,16 +150,17 @@ class DeviceTracker:
 
     Attributes
     ----------
-    counts : dict of str to int
-        Numbers of fixes, of those that were refused by the filter (``refused_fixes``) or came too
-        late for it (``late_fixes``), and of motions that were invalid (``bad_motions``) or jumped.
+    rejected : dict of str to int
+        Numbers of fixes that were refused by the filter (``refused_fixes``) or came too late for it
+        (``late_fixes``), and of motions that were invalid (``bad_motions``) or jumped
+        (``odometry_jumps``).
     """
 
     def __init__(self, device: str, settings: TrackerSettings | None = None) -> None:
         self.device = device
         self.settings = settings or TrackerSettings()
-        self.counts = dict.fromkeys(
-            ("fixes", "refused_fixes", "late_fixes", "bad_motions", "odometry_jumps"), 0
+        self.rejected = dict.fromkeys(
+            ("refused_fixes", "late_fixes", "bad_motions", "odometry_jumps"), 0
         )
         self._history: FilterHistory | None = None
         self._is_planar = False
@@ -197,19 +178,11 @@ class DeviceTracker:
         self._reason, self._own_reason, self._stream_reason = "", "", ""
         self._state_ns = 0
 
-    @property
-    def health(self) -> DeviceHealth:
-        """Condition of the device."""
-        state = self._state or TrackingState.LOST
-        reason = self._reason if self._state is not None else str(StateReason.NO_FIX)
-        return DeviceHealth(state, reason, self._published_ns, dict(self.counts))
-
     # ---- input
 
     def fix(self, fix: Fix, source: str = "") -> list[LiveEvent]:
         """Return the events of a fix; ``source`` names it in a correction, as in ``"tag 77"``."""
         events = self._expire(fix.time_ns)
-        self.counts["fixes"] += 1
         if not _is_provisional(fix):
             self._stream_reason = ""
         if self._frame is not None and fix.frame != self._frame:
@@ -233,10 +206,10 @@ class DeviceTracker:
         before = history.newest_state()
         accepted, refused, resets = self._counters()
         if not history.add_fix(fix.time_ns, self._measurement(fix)):
-            self.counts["late_fixes"] += 1
+            self.rejected["late_fixes"] += 1
             return events
         now_accepted, now_refused, now_resets = self._counters()
-        self.counts["refused_fixes"] += max(now_refused - refused, 0)
+        self.rejected["refused_fixes"] += max(now_refused - refused, 0)
         # A fix in the order of time without a reset is refused, or within the gate: no jump.
         is_usual = fix.time_ns >= head_ns and now_resets == resets and not self._restart_reason
         predicted = None if is_usual else self._estimate(time_ns, before)
@@ -315,7 +288,7 @@ class DeviceTracker:
         assert self._history is not None
         before, before_ns = self._odometry_pose, self._history.motion_time_ns
         if pose is None or (before_ns is not None and time_ns <= before_ns):
-            self.counts["bad_motions"] += 1
+            self.rejected["bad_motions"] += 1
             return []
         events = self._expire(time_ns)
         motion = np.zeros(4)
@@ -326,7 +299,7 @@ class DeviceTracker:
                 distance_m > max(MIN_JUMP_M, MAX_ODOMETRY_SPEED_M_S * duration_s)
                 or angle > MAX_ODOMETRY_RATE_RAD_S * duration_s + JUMP_MARGIN_RAD
             ):
-                self.counts["odometry_jumps"] += 1
+                self.rejected["odometry_jumps"] += 1
                 self._begin_odometry()
                 self._early_fixes.clear()
                 self._unfused = None
@@ -350,7 +323,7 @@ class DeviceTracker:
         # A sensor that was not sampled keeps its reading.
         reading = np.where(is_plausible, reading, np.nan if before is None else before)
         if not np.isfinite(reading).all() or (before_ns is not None and time_ns <= before_ns):
-            self.counts["bad_motions"] += 1
+            self.rejected["bad_motions"] += 1
             return []
         events = self._expire(time_ns)
         self._reading = reading

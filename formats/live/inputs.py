@@ -159,11 +159,9 @@ class InputNotice:
     Attributes
     ----------
     text : str
-    is_connected : bool
     """
 
     text: str
-    is_connected: bool
 
 
 class LiveInput:
@@ -367,20 +365,20 @@ class LiveInput:
             received = []
             if isinstance(event, BytesLeftOut):
                 yield from self._restarted()
-                yield InputNotice("the solver was late: bytes were left out", is_connected=True)
+                yield InputNotice("the solver was late: bytes were left out")
             elif isinstance(event, ConnectionLost):
                 self.is_connected = False
-                yield InputNotice(f"connection lost: {event.why}", is_connected=False)
+                yield InputNotice(f"connection lost: {event.why}")
             elif isinstance(event, Reconnected):
                 self.is_connected = True
                 yield from self._restarted()
-                yield InputNotice(f"reconnected to {event.path}", is_connected=True)
+                yield InputNotice(f"reconnected to {event.path}")
             elif isinstance(event, SourceEnded):
                 self.is_connected, self.is_ended = False, True
                 if not isinstance(self._decoder, CameraIntake):
                     yield from self._converted(self._decoder.decode_finish())
                 if event.error is not None:
-                    yield InputNotice(event.error, is_connected=False)
+                    yield InputNotice(event.error)
         yield from self._observations(received)
 
     def _restarted(self) -> Iterator[Observations | InputNotice]:
@@ -417,7 +415,7 @@ class LiveInput:
                 self._recorded.add(records)
         yield from self._converter.observations(records)
         for remark in self._decoder.remarks():
-            yield InputNotice(remark, is_connected=self.is_connected)
+            yield InputNotice(remark)
 
     def totals(self) -> CaptureStatistics:
         """Return the counts of the decoder."""

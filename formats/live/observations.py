@@ -27,9 +27,6 @@ from locatk.formats.sessions.field_samples import restore_saturation
 Observations = Sweeps | Samples | HallSamples | Frames | Trajectory | InertialSamples
 """What a stream takes; see :class:`locatk.core.streaming.events.Stream`."""
 
-SOLVED_KINDS = ("lighthouse", "magnetometers", "halls")
-"""Kinds of records that a system solves (:data:`.ingestion.SYSTEMS`)."""
-
 
 class AttachedArtifacts:
     """Artifacts of an input that belong to its devices.

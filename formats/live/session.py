@@ -23,7 +23,7 @@ from itertools import groupby
 from typing import Any
 
 from locatk.core.errors import LocatkError
-from locatk.core.solution import SolverWarning, add_counts
+from locatk.core.solution import SolverWarning
 from locatk.core.streaming.events import (
     ArtifactUpdate,
     LiveEvent,
@@ -415,7 +415,8 @@ class LiveSession:
         """Update the counts, and tell the stream that time has passed."""
         for device in self._devices.values():
             device.count(now_s)
-        self._rejected = self._count_rejected()
+        if self._localizer is not None:
+            self._rejected = self._localizer.rejected
         if self._replay is None:
             now_ns = self._clock.now()
             time_ns = min(each.complete_ns(now_ns) for each in self._inputs)
@@ -575,15 +576,6 @@ class LiveSession:
             "rejected": self._rejected,
             "warnings": list(dict(self._warnings)),
         }
-
-    def _count_rejected(self) -> dict[str, int]:
-        """Return the observations that the stream did not use, and the fixes refused, by reason."""
-        if self._localizer is None:
-            return {}
-        own = getattr(self._localizer.stream, "rejected", {})
-        names = ("refused_fixes", "late_fixes", "bad_motions", "odometry_jumps")
-        counts = [health.counts for health in self._localizer.health.values()]
-        return add_counts(own, *({name: count[name] for name in names} for count in counts))
 
     @property
     def devices(self) -> dict[str, DeviceStatus]:

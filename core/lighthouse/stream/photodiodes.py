@@ -179,8 +179,6 @@ class PhotodiodeFixes:
         By station: sweeps of accepted fixes that they use, and that they leave out.
     residual : list of deque of float
         By station, the last residuals of used sweeps.
-    restored : int
-        Number of fixes whose sweeps of two stations were exchanged and restored.
     """
 
     def __init__(
@@ -198,7 +196,6 @@ class PhotodiodeFixes:
         self._observe = observe
         self._states: dict[str, PhotodiodeState] = {}
         self.rejected = [0] * len(known.stations)
-        self.restored = 0
         self._noise: deque[tuple[Array, int]] = deque(maxlen=NOISE_FIXES)
         self._new_fixes = 0
         self._period = [float(period_counts(s.channel)) for s in known.stations]
@@ -486,7 +483,6 @@ class PhotodiodeFixes:
                 epochs, estimates, known.arrays, known.floor_z
             )
             if restored:
-                self.restored += restored
                 changed = np.flatnonzero(np.any(estimates.position != before, axis=1))
                 for row in changed:
                     for _, pair in due[row].members:
@@ -535,5 +531,5 @@ class PhotodiodeFixes:
     def moved_to(self, known: KnownScene) -> PhotodiodeFixes:
         """Return the fixes in another scene; sweeps of stations that both have are kept."""
         new = PhotodiodeFixes(known, self._reject, self._observe)
-        new.sigma_rad, new.gate_rad, new.restored = self.sigma_rad, INLIER_GATE_RAD, self.restored
+        new.sigma_rad, new.gate_rad = self.sigma_rad, INLIER_GATE_RAD
         return new

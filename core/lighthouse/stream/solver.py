@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ from locatk.core.streaming.events import (
     ArtifactUpdate,
     BackgroundTask,
     DetectionEvent,
+    Stream,
     StreamEvent,
     WarningEvent,
 )
@@ -73,7 +74,7 @@ PLANES = (UNKNOWN, 0, 1)
 SCENE_TASK = "scene"
 
 
-class LighthouseStream:
+class LighthouseStream(Stream):
     """Causal solver of Lighthouse for any number of devices.
 
     Devices with three or more photodiodes of known position get poses, all other photodiodes
@@ -93,9 +94,6 @@ class LighthouseStream:
     Attributes
     ----------
     system : str
-    rejected : Counter of str
-        Number of sweeps or epochs that were not used, by reason, as those of
-        :class:`~locatk.core.solution.Solution`.
     version : int
         Of the scene that was estimated; 0 without.
     """
@@ -108,7 +106,7 @@ class LighthouseStream:
         receiver_of: Callable[[str], Receiver | None] = lambda device: None,
         options: SolveOptions | None = None,
     ) -> None:
-        self.rejected: Counter[str] = Counter()
+        self._rejected: Counter[str] = Counter()
         self.version = 0
         self._options = options or SolveOptions()
         self._receiver_of = receiver_of
@@ -139,6 +137,11 @@ class LighthouseStream:
     def scene(self) -> Scene | None:
         """Scene with stations that fixes refer to; None as long as there is none."""
         return None if self._known is None else self._known.scene
+
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """Number of sweeps or epochs that were not used, by reason."""
+        return self._rejected
 
     # ---- observations
 
@@ -198,11 +201,11 @@ class LighthouseStream:
             strict=True,
         ):
             if row[4] not in PLANES:
-                self.rejected["plane_unknown"] += 1
+                self._rejected["plane_unknown"] += 1
                 continue
             if not usable:
                 reason = "count_above_period" if row[2] else "unknown_channel"
-                self.rejected[reason] += 1
+                self._rejected[reason] += 1
                 continue
             self._push_sweep(name, *row)
 
@@ -231,7 +234,7 @@ class LighthouseStream:
         row = (time_ns, device, sensor, channel, polynomial, plane, count)
         self._recent.append(row)
         if channel in self._doubled:
-            self.rejected["sweep_of_doubled_channel"] += 1
+            self._rejected["sweep_of_doubled_channel"] += 1
             return
         if self._store is not None:
             self._store.add(row)
@@ -239,7 +242,7 @@ class LighthouseStream:
             return
         station = self._known.column.get(channel)
         if station is None:
-            self.rejected["station_not_in_scene"] += 1
+            self._rejected["station_not_in_scene"] += 1
             return
         self._supervision.last_ns[station] = time_ns
         if name in self._receivers:
@@ -297,7 +300,7 @@ class LighthouseStream:
         for warning in self._supervision.check_hidden(now_ns):
             self._events.append(WarningEvent("", now_ns, warning))
         if self._ticks % MOVED_CHECK_TICKS == 0:
-            warnings = self._supervision.check_moved(self._photodiodes, self._rigid)
+            warnings = self._supervision.check_moved(self._rigid)
             self._events.extend(WarningEvent("", now_ns, warning) for warning in warnings)
         if self._ticks % DETECTION_TICKS == 0:
             self._detect(now_ns)
@@ -345,7 +348,7 @@ class LighthouseStream:
             self._warn(direction_only_warning(known.stations[0].channel))
 
     def _reject(self, reason: str, number: int) -> None:
-        self.rejected[reason] += number
+        self._rejected[reason] += number
 
     def _observe(self, angles: Any, is_solved: bool, is_inconsistent: bool) -> None:
         self._supervision.observe(angles, is_solved, is_inconsistent)

@@ -101,7 +101,7 @@ class StationSupervision:
 
     # ---- moved stations
 
-    def check_moved(self, photodiodes: PhotodiodeFixes, rigid: RigidFixes) -> list[SolverWarning]:
+    def check_moved(self, rigid: RigidFixes) -> list[SolverWarning]:
         """Exclude stations that disagree with the others; return the warnings about them."""
         warnings = [*self._check_epochs(), *self._check_poses(rigid)]
         inconsistent = sum(self._is_inconsistent)

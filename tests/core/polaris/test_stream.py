@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading, wrap_angle
+from locatk.core.polaris import stream as polaris_stream
 from locatk.core.polaris import stream as stream_module
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.codec import layout_of
@@ -27,7 +28,7 @@ from locatk.core.polaris.preprocessing import PassRange, preprocess
 from locatk.core.polaris.results import HeadingCorrection, TagDetection
 from locatk.core.polaris.simulation.session import SimulationOptions, simulate
 from locatk.core.polaris.solver import identify_range, solve
-from locatk.core.polaris.stream import PolarisStream, StreamOptions
+from locatk.core.polaris.stream import PolarisStream
 from locatk.core.polaris.tag import PlanarPose, Tags
 from locatk.core.streaming.events import DetectionEvent, Fix, StreamEvent, WarningEvent
 from locatk.core.trajectory import Trajectory
@@ -136,11 +137,13 @@ def test_ids_poses_and_corrections_are_those_of_the_solver(
 )
 @given(data=st.data())
 def test_any_cut_and_interleaving_gives_the_same_events(
-    data: st.DataObject, two_tags: tuple[Samples, Trajectory, Tags]
+    data: st.DataObject,
+    two_tags: tuple[Samples, Trajectory, Tags],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     samples, odometry, tags = two_tags
-    options = StreamOptions(max_odometry_delay_s=60.0)
-    expected = run(PolarisStream(tags, options), [odometry, samples])
+    monkeypatch.setattr(polaris_stream, "MAX_ODOMETRY_DELAY_NS", 60_000_000_000)
+    expected = run(PolarisStream(tags), [odometry, samples])
     assert len(fixes(expected)) == 2
 
     def cuts(count: int) -> list[int]:
@@ -156,7 +159,7 @@ def test_any_cut_and_interleaving_gives_the_same_events(
     while any(queues):
         queue = data.draw(st.sampled_from([q for q in queues if q]))
         order.append(queue.pop(0))
-    assert exact(run(PolarisStream(tags, options), order)) == exact(expected)
+    assert exact(run(PolarisStream(tags), order)) == exact(expected)
 
 
 @pytest.mark.slow
@@ -369,10 +372,13 @@ def test_memory_does_not_grow(world: Any, monkeypatch: pytest.MonkeyPatch) -> No
     assert len(device.held) == 0
 
 
-def test_samples_wait_for_odometry_until_time_advances(world: Any) -> None:
+def test_samples_wait_for_odometry_until_time_advances(
+    world: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     course = world.line(length=0.5, speed=0.2)
     samples, odometry = world.record([], course), odometry_of(course)
-    stream = PolarisStream(TAGS, StreamOptions(max_odometry_delay_s=10.0))
+    monkeypatch.setattr(polaris_stream, "MAX_ODOMETRY_DELAY_NS", 10_000_000_000)
+    stream = PolarisStream(TAGS)
     stream.push(odometry.select(np.arange(20)))
     stream.push(samples)
     (device,) = stream._devices.values()

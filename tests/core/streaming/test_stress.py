@@ -454,7 +454,7 @@ def test_a_damaged_pose_of_the_odometry_is_left_out(value: float, column: str) -
     (pose,) = events
     assert isinstance(pose, PoseEstimate)
     assert pose.position[0] == pytest.approx(0.015, abs=2e-3)
-    assert tracker.counts["bad_motions"] == 1
+    assert tracker.rejected["bad_motions"] == 1
 
 
 @pytest.mark.parametrize("variance", [np.inf, 1e200, 1e12])
@@ -508,7 +508,7 @@ def test_extrapolation_of_samples_that_arrived_together_is_limited() -> None:
     check_poses(events)
     (pose,) = (event for event in events if isinstance(event, PoseEstimate))
     assert pose.position[0] == pytest.approx(0.04, abs=0.001)
-    assert tracker.counts["refused_fixes"] == 0
+    assert tracker.rejected["refused_fixes"] == 0
 
 
 def test_covariance_grows_without_fixes() -> None:

@@ -216,7 +216,7 @@ def test_a_single_wrong_fix_is_refused() -> None:
     tracker.fix(make_fix(0.1))
     events = tracker.fix(make_fix(0.15, 1.0))
     np.testing.assert_allclose(poses(events)[0].position, 0.0, atol=1e-3)
-    assert tracker.counts["refused_fixes"] == 1
+    assert tracker.rejected["refused_fixes"] == 1
     assert not any(isinstance(event, Correction) for event in events)
 
 
@@ -272,7 +272,7 @@ def test_odometry_that_restarts_loses_the_pose() -> None:
 def test_invalid_odometry_is_counted() -> None:
     tracker = DeviceTracker("robot")
     tracker.odometry(make_odometry([0.0, 0.1, 0.1, 0.05, 0.2], [0.0, 0.1, 0.1, 0.0, np.nan]))
-    assert tracker.counts["bad_motions"] == 3
+    assert tracker.rejected["bad_motions"] == 3
 
 
 def test_heading_wraps() -> None:
@@ -285,7 +285,7 @@ def test_heading_wraps() -> None:
         events += tracker.odometry(make_odometry(at, 0.0, 0.0, heading[index]))
         if index % 7 == 0:
             events += tracker.fix(make_fix(at, 0.0, 0.0, heading[index]))
-    assert tracker.counts["refused_fixes"] == 0
+    assert tracker.rejected["refused_fixes"] == 0
     estimates = poses(events)
     true = np.pi * np.array([(pose.time_ns - START) / SECOND for pose in estimates])
     found = heading_from_quaternion(np.array([pose.quaternion for pose in estimates]))
@@ -299,7 +299,7 @@ def test_headings_at_half_a_rotation() -> None:
     for index in range(1, 20):
         tracker.odometry(make_odometry(index / 10, 0.0))
         tracker.fix(make_fix(index / 10, heading=np.pi + 0.01 * (-1) ** index))
-    assert tracker.counts["refused_fixes"] == 0
+    assert tracker.rejected["refused_fixes"] == 0
     (pose,) = poses(tracker.odometry(make_odometry(2.0, 0.0)))
     np.testing.assert_allclose(
         abs(float(heading_from_quaternion(pose.quaternion))), np.pi, atol=1e-2
@@ -390,7 +390,7 @@ def test_a_fix_older_than_the_history_is_refused() -> None:
     tracker.fix(make_fix(0.02))
     tracker.odometry(make_odometry(time_s[2:], 0.0))
     assert tracker.fix(make_fix(1.0, 0.3)) == []
-    assert tracker.counts["late_fixes"] == 1
+    assert tracker.rejected["late_fixes"] == 1
 
 
 def test_late_fixes_of_a_slow_polaris_pass_are_used() -> None:
@@ -399,7 +399,7 @@ def test_late_fixes_of_a_slow_polaris_pass_are_used() -> None:
     time_s = np.arange(0.0, 30.0, 0.01)
     tracker.odometry(make_odometry(time_s, 0.05 * time_s))
     tracker.fix(make_fix(24.0, 1.2))
-    assert tracker.counts["late_fixes"] == 0
+    assert tracker.rejected["late_fixes"] == 0
     (pose,) = poses(tracker.odometry(make_odometry(30.0, 1.5)))
     np.testing.assert_allclose(pose.position[0], 1.5, atol=1e-6)
 
@@ -517,4 +517,4 @@ def test_memory_is_flat_in_ten_hours() -> None:
         sizes.append((history.nbytes, len(history)))
         assert len(poses(events)) == (3600 if hour else 3591)
     assert len(set(sizes)) == 1
-    assert tracker.counts["refused_fixes"] == 0
+    assert tracker.rejected["refused_fixes"] == 0

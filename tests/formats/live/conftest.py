@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from locatk.core.streaming.events import BackgroundTask, Fix, PoseEstimate
+from locatk.core.streaming.events import BackgroundTask, Fix, PoseEstimate, Stream
 from locatk.formats.capture import ports, reader_thread
 from locatk.formats.capture.links import LinkEnded, LinkLost, Overruns, SourceError
 from locatk.formats.capture.setup import CaptureRequest
@@ -74,7 +74,7 @@ class ScriptedPort:
         self.closed += 1
 
 
-class ListStream:
+class ListStream(Stream):
     """Stream that returns a fix for each sample of odometry, and keeps its calls."""
 
     system = "landmarks"
