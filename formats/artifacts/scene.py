@@ -12,7 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
+from locatk.core.lighthouse.room import (
+    MAX_CORNERS,
+    MAX_LENGTH_M,
+    MAX_ROBOTS,
+    MOUNTS,
+    Obstacle,
+    RobotSize,
+    Room,
+)
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.core.lighthouse.scene.model import FRAME_SOURCES, JOINT_PARAMETERS
 from locatk.formats.artifacts.kinds import (
@@ -49,7 +59,7 @@ SCENE_FILE = "scene.toml"
 
 SCENE_FORMAT = "locatk-lighthouse-scene"
 
-SCALES = ("markers", "distance", "odometry", "device", "unit")
+SCALES = ("markers", "distance", "odometry", "device", "design", "unit")
 SOURCES = ("factory", "generic", "estimated", "none")
 
 ANGLE_PARAMETERS = ("phase", "tilt", "gibphase", "ogeephase")
@@ -461,8 +471,8 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
             Key(
                 "scale",
                 Text(SCALES),
-                "origin of the scale of the stations; `device` is a device of known size, `unit` "
-                "an unknown scale",
+                "origin of the scale of the stations; `device` is a device of known size, `design` "
+                "a designed room, `unit` an unknown scale",
                 "unit",
             ),
             Key(
@@ -483,7 +493,8 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
                 "frame_source",
                 Text(FRAME_SOURCES),
                 "origin of the axes of the frame: `markers`, `floor` (z = 0 is the floor), "
-                "`gravity` (z is up, at an unknown height) or `station` (not level)",
+                "`gravity` (z is up, at an unknown height), `station` (not level) or `design` (the "
+                "axes of `room`; stations mounted by hand near to their designed poses)",
                 None,
                 "unknown",
             ),
@@ -511,6 +522,7 @@ def _table_of_lengths(floor_z: str, position: str, covariance: str) -> Table:
                 default_text="unknown",
                 value_name="covariance",
             ),
+            Key("room", _ROOM, default=None, default_text="unknown"),
         ),
         _scene_of,
     )
@@ -531,6 +543,113 @@ _JOINT_COVARIANCE = Table(
     lambda covariance: {"factor": covariance},
 )
 
+
+# ---- the room
+
+_CORNERS = Array((None, 2), Number(-1e3 * MAX_LENGTH_M, 1e3 * MAX_LENGTH_M), MAX_CORNERS)
+
+
+def _obstacle_of(values: Values) -> Obstacle:
+    try:
+        return Obstacle(**values)
+    except InputError as error:
+        raise InvalidValueError(error.message, hint=error.hint) from None
+
+
+_OBSTACLE = Table(
+    (
+        Key("name", Text(), "descriptive name", ""),
+        Key("outline_mm", _CORNERS, "corners of a vertical prism that light does not pass"),
+        Key("low_mm", NOT_NEGATIVE, "height of its lower face", 0.0),
+        Key("high_mm", POSITIVE, "height of its upper face"),
+    ),
+    _obstacle_of,
+    vars,
+)
+
+
+def _robots_of(values: Values) -> RobotSize:
+    try:
+        return RobotSize(**values)
+    except InputError as error:
+        raise InvalidValueError(error.message, hint=error.hint) from None
+
+
+_ROBOTS = Table(
+    (
+        Key("count", Integer(1, MAX_ROBOTS), "number of robots in the working area"),
+        Key("radius_mm", POSITIVE, "radius of the cylinder that a robot is"),
+        Key("height_mm", POSITIVE, "its height"),
+    ),
+    _robots_of,
+    vars,
+)
+
+
+def _room_of(values: Values) -> Room:
+    low_m, high_m = values.pop("low_m"), values.pop("high_m")
+    high_m = low_m if high_m is None else high_m
+    tripods = values["tripods_m"]
+    values["tripods_m"] = np.zeros((0, 3)) if tripods is None else tripods
+    try:
+        return Room(photodiode_z_m=(low_m, high_m), **values)
+    except InputError as error:
+        raise InvalidValueError(error.message, hint=error.hint) from None
+
+
+def _room_values(room: Room) -> Values:
+    low_m, high_m = room.photodiode_z_m
+    tripods_m = room.tripods_m if len(room.tripods_m) else None
+    return {
+        **vars(room),
+        "low_m": low_m,
+        "high_m": None if room.is_planar else high_m,
+        "tripods_m": tripods_m,
+    }
+
+
+_ROOM = Table(
+    (
+        Key("outline_mm", _CORNERS, "corners of the walls, along them"),
+        Key("height_mm", POSITIVE, "height of the ceiling; z is 0 on the floor"),
+        Key(
+            "lowest_photodiode_mm",
+            NOT_NEGATIVE,
+            "height of the lowest photodiode",
+            0.0,
+            value_name="low_m",
+        ),
+        Key(
+            "highest_photodiode_mm",
+            NOT_NEGATIVE,
+            "height of the highest one",
+            None,
+            "that of the lowest: all devices move on a plane",
+            value_name="high_m",
+        ),
+        Key("area_mm", _CORNERS, "corners of the working area", None, "the whole room"),
+        Key(
+            "mounts",
+            ListOf(Text(MOUNTS), 1),
+            "kinds of places at which stations can be mounted",
+            ("wall", "ceiling"),
+        ),
+        Key(
+            "tripods_mm",
+            Array((None, 3), Number(-1e3 * MAX_LENGTH_M, 1e3 * MAX_LENGTH_M), MAX_CORNERS),
+            "positions of stations on tripods",
+            None,
+            "none",
+        ),
+        Key("robots", _ROBOTS, default=None, default_text="hide nothing"),
+        Key("obstacles", Tables(_OBSTACLE), default=()),
+    ),
+    _room_of,
+    _room_values,
+)
+
+
+# ---- points and the whole
 
 _MARKER = Table(
     (

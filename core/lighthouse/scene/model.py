@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import Similarity, transform_covariance
 from locatk.core.lighthouse.calibration import Calibration
+from locatk.core.lighthouse.room import Room
 
-FRAME_SOURCES = ("markers", "floor", "gravity", "station")
+FRAME_SOURCES = ("markers", "floor", "gravity", "station", "design")
 """Sources of the axes and the origin of a scene, see :attr:`Scene.frame_source`."""
 
 JOINT_PARAMETERS = 20
@@ -111,7 +112,8 @@ class Scene:
         Height of the photodiodes in a planar scene, in metres.
     scale : str
         Source of the scale: ``"markers"``, ``"distance"``, ``"odometry"``, ``"device"`` (of known
-        size) or ``"unit"`` (the distance of the first two stations is 1).
+        size), ``"design"`` (the room was designed: stations are near to designed positions) or
+        ``"unit"`` (the distance of the first two stations is 1).
     frame : str
         Name of the frame of positions.
     notes : tuple of str
@@ -126,8 +128,10 @@ class Scene:
     frame_source : str or None
         Source of the axes and the origin: ``"markers"``, ``"floor"`` (z = 0 is a floor, or a plane
         at a known height above it), ``"gravity"`` (z is up; the origin is the first station, or the
-        level of the photodiodes is unknown) or ``"station"`` (the axes of the first station, which
-        are not level). None if unknown, as in files of older versions.
+        level of the photodiodes is unknown), ``"station"`` (the axes of the first station, which
+        are not level) or ``"design"`` (the axes of ``room``; the stations were mounted by hand near
+        to their designed poses, within their covariances). None if unknown, as in files of older
+        versions.
     level_sigma_rad : float or None
         Standard deviation of the inclination of the z axis against the vertical, or against the
         floor if this is the source of the frame; about each horizontal axis. None if unknown.
@@ -136,6 +140,8 @@ class Scene:
         ``stations``: position (m), rotation vector in the frame of the scene (rad), and of the
         first and then of the second sweep phase, tilt, curve, ``gibmag`` times cosine and sine of
         ``gibphase``, ``ogeemag`` times cosine and sine of ``ogeephase``.
+    room : Room or None
+        Walls, obstacles and the working volume, if they are known; in the frame of the scene.
     """
 
     stations: tuple[Station, ...] = ()
@@ -152,16 +158,17 @@ class Scene:
     frame_source: str | None = None
     level_sigma_rad: float | None = None
     covariance: NDArray[np.float64] | None = None
+    room: Room | None = None
 
     @property
     def is_on_floor(self) -> bool:
-        """True if the frame is that of markers or of a floor: z is up and 0 on the floor.
+        """True if the frame is that of markers, a floor or a room: z is up and 0 on the floor.
 
         Scenes of older versions, which do not state the source of their frame, count if their scale
         is that of markers.
         """
         source = self.frame_source or ("markers" if self.scale == "markers" else None)
-        return source in ("markers", "floor")
+        return source in ("markers", "floor", "design")
 
     @property
     def is_level(self) -> bool:
@@ -171,8 +178,8 @@ class Scene:
     def transformed(self, to: Similarity) -> Scene:
         """Return the scene with its stations, their covariances and its floor transformed.
 
-        Markers are kept: they are points in the frame that ``to`` leads to. Names and sources of
-        frame and scale are those of the caller. A homography of the floor is dropped if ``to``
+        Markers and the room are kept: they are in the frame that ``to`` leads to. Names and sources
+        of frame and scale are those of the caller. A homography of the floor is dropped if ``to``
         tilts the floor.
         """
         stations = tuple(
