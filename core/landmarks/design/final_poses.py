@@ -17,6 +17,7 @@ The drive is that of :mod:`.localization_steps`. A landmark that is visited agai
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,31 +143,46 @@ class MapEvidence:
 
         ``start`` is ``4 cell + heading`` on the map without pad.
         """
-        first, heading = self._padded(start // 4), start % 4
+        cells = self._cells_of_drive(drive, start)
+        for count, probability in enumerate(self.posteriors(cells, start % 4), 1):
+            if probability >= PROVISIONAL_PROBABILITY:
+                return count
+        return None
+
+    def posteriors(self, cells: Iterable[Cell], heading: int = 0) -> Iterator[float]:
+        """Yield the probability of this floor and the true start after each of the landmarks.
+
+        Parameters
+        ----------
+        cells : iterable of cell
+            Different landmarks of the map in the order in which they are read.
+        heading : int
+            Of the robot at the first one, in quarter turns; the result hardly depends on it.
+        """
         posterior = np.full(self.likelihood.shape[1:], 1 / self.likelihood[0].size)
         prior_odds = OTHER_FLOOR_PROBABILITY / (1 - OTHER_FLOOR_PROBABILITY)
         other = np.full(4, prior_odds / 4)
-        state, visited, repeated = start * drive.phases, set[Cell](), 0
-        while len(visited) < MAX_LANDMARKS and repeated < MAX_REPEATED_VISITS:
-            cell = self._padded(state // drive.phases // 4)
-            state = int(drive.next_state[state])
-            repeated += 1
-            if cell in visited:
-                continue
-            visited.add(cell)
-            repeated = 0
+        first: Cell | None = None
+        for row, column in cells:
+            cell = row + PAD_CELLS, column + PAD_CELLS
+            first = first or cell
             code = int(self.codes[heading][cell])
             offset = cell[0] - first[0], cell[1] - first[1]
             posterior *= self._likelihood_along(code, offset, heading)
             other *= self.other[:, code]
-            right = float(posterior[heading][first])
-            if right >= PROVISIONAL_PROBABILITY * (posterior.sum() + other.sum()):
-                return len(visited)
-        return None
+            yield float(posterior[heading][first] / (posterior.sum() + other.sum()))
 
-    def _padded(self, cell: int) -> Cell:
-        row, column = divmod(cell, self.columns)
-        return row + PAD_CELLS, column + PAD_CELLS
+    def _cells_of_drive(self, drive: LocalizationDrive, start: int) -> Iterator[Cell]:
+        """Yield the different cells of a drive, up to :data:`MAX_LANDMARKS`."""
+        state, visited, repeated = start * drive.phases, set[Cell](), 0
+        while len(visited) < MAX_LANDMARKS and repeated < MAX_REPEATED_VISITS:
+            cell = divmod(state // drive.phases // 4, self.columns)
+            state = int(drive.next_state[state])
+            repeated += 1
+            if cell not in visited:
+                visited.add(cell)
+                repeated = 0
+                yield cell
 
     def _likelihood_along(self, code: int, offset: Cell, heading: int) -> Array:
         """Return the likelihood (4, rows, columns) of a code by the heading and cell of the start.

@@ -1,0 +1,394 @@
+"""Accuracy of one visit to a landmark, predicted from the field of its bars (Fisher information).
+
+A visit is a path over a landmark. The readings of the hall sensors depend on the pose of the robot
+at one point of the path, the *reference*, and on everything that is not as nominal: gains and
+offsets of the sensors, their height, strengths and positions of the bars, and the errors of the
+odometry along the path. All of these are unknowns with Gaussian priors. The covariance of the pose
+is its part of the inverse of
+
+    J' W J + diag(1 / prior^2),
+
+with the derivatives J of the closed-form field (:mod:`locatk.core.landmarks.field`) and the
+weights W of the readings (the bound of Cramer and Rao with nuisance parameters; S. M. Kay,
+Fundamentals of Statistical Signal Processing, vol. 1, 1993, chapters 3 and 12). If iron distorts
+the field, W is the inverse of noise plus a Gaussian process along the floor.
+
+Another code c' is read instead of the true one with the probability Q(d / 2) of a test between two
+Gaussian hypotheses (H. L. Van Trees, Detection, Estimation, and Modulation Theory, part I, 1968,
+section 2.6), where d is the distance of its field from that of all poses and errors near the true
+ones. Poses far from the true one are not compared.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from locatk.core.errors import InputError
+from locatk.core.landmarks.field import basis_gradient
+from locatk.core.landmarks.halls import circle
+from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, code_of, signs
+from locatk.core.streaming.planar_filter import OdometryNoise
+
+Array = NDArray[np.float64]
+
+STEP_M = 2e-3
+"""Distance between the points of a path at which the field is evaluated [m]: a twelfth of the
+circle of the sensors, over which the field is smooth."""
+
+STEP_RAD = math.radians(3)
+"""Rotation on the spot between two points: the sensors then move by 1.3 mm."""
+
+REACH_M = 0.06
+"""Path before and after the territory that counts as part of a visit [m], as in the solver."""
+
+MAX_POSITION_SIGMA_M = 6e-3
+MAX_HEADING_SIGMA_RAD = math.radians(8)
+"""Standard deviations of a pose up to which the solver uses a visit (``too_weak`` otherwise)."""
+
+WALK_UNITS = 6
+"""Pieces of a visit in which the random walk of odometry is constant."""
+
+DIFFUSE_SIGMA = 1.0
+"""Prior of the pose [m, rad]: so wide that it adds no information."""
+
+NNNS = code_of("NNNS")
+"""Landmark 3 of the paper, of which its accuracy figures are."""
+
+
+@dataclass(frozen=True)
+class VisitErrors:
+    """Errors of sensors, bars and floor: standard deviations.
+
+    The defaults are those that the solver assumes (docs/landmarks.md, table of priors), with the
+    noise of an inexpensive hall sensor.
+
+    Attributes
+    ----------
+    noise_t : float
+        Noise of one reading.
+    rate_hz : float
+        Readings of each sensor in a second.
+    gain : float
+        Relative, of each sensor.
+    offset_t : float
+        Constant field at each sensor that is not known: its offset, and the vehicle's iron and
+        magnets.
+    height_m : float
+        Common height of the sensors.
+    bar_strength : float
+        Relative, of each bar.
+    bar_position_m : float
+        Of each bar in x and in y.
+    landmark_position_m, landmark_heading_rad : float
+        Installation of a landmark about its pose on the map.
+    disturbance_t, disturbance_length_m : float
+        Field of iron in the floor, a Gaussian process over the floor with this standard deviation,
+        and the distance over which it changes (its correlation is exp(-d^2 / 2 length^2)).
+    """
+
+    noise_t: float = 1.5e-4
+    rate_hz: float = 200.0
+    gain: float = 0.03
+    offset_t: float = 1e-4
+    height_m: float = 0.5e-3
+    bar_strength: float = 0.04
+    bar_position_m: float = 0.5e-3
+    landmark_position_m: float = 1.5e-3
+    landmark_heading_rad: float = 0.012
+    disturbance_t: float = 0.0
+    disturbance_length_m: float = 0.15
+
+    def __post_init__(self) -> None:
+        positive = ("noise_t", "rate_hz", "disturbance_length_m")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (0 <= value < math.inf) or (value == 0 and item.name in positive):
+                wanted = "a number above 0" if item.name in positive else "0 or more"
+                raise InputError(f"{item.name} of {value!r}", hint=f"Give {wanted}")
+
+
+@dataclass(frozen=True)
+class VisitAccuracy:
+    """Predicted result of one visit.
+
+    Attributes
+    ----------
+    covariance : (3, 3) ndarray
+        Of x, y [m] and heading [rad] of the robot at the reference, in the axes of the landmark
+        and relative to it.
+    misread_probability : float
+        Probability that another code is read (union bound).
+    peak_t : float
+        Largest field at any sensor.
+    """
+
+    covariance: Array
+    misread_probability: float
+    peak_t: float
+
+    @property
+    def is_usable(self) -> bool:
+        """True if the solver uses a visit of this accuracy."""
+        x, y, heading = np.sqrt(np.diag(self.covariance))
+        return bool(max(x, y) <= MAX_POSITION_SIGMA_M and heading <= MAX_HEADING_SIGMA_RAD)
+
+
+def visit_covariance(
+    geometry: Geometry,
+    *,
+    code: int = NNNS,
+    offset_m: float = 0.0,
+    heading_rad: float = 0.0,
+    speed_mps: float = 0.1,
+    noise: OdometryNoise | None = None,
+    errors: VisitErrors | None = None,
+    on_map: bool = True,
+) -> Array:
+    """Return the covariance (3, 3) of the pose after a straight pass over a landmark.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    code : int
+        Code of the landmark, 0 to 15.
+    offset_m : float
+        Distance by which the robot passes left of the landmark's centre (negative: right).
+    heading_rad : float
+        In the axes of the landmark.
+    speed_mps : float
+    noise : OdometryNoise, optional
+    errors : VisitErrors, optional
+    on_map : bool
+        Include the errors of the landmark's installation: the covariance is that on the map, else
+        relative to the landmark.
+
+    Returns
+    -------
+    (3, 3) ndarray
+        Of x, y in metres and heading in radians, in the axes of the landmark, at the point next to
+        its centre.
+    """
+    errors = errors or VisitErrors()
+    path = straight_path(geometry, offset_m, heading_rad)
+    accuracy = predict_visit(
+        geometry, path, signs(code), speed_mps=speed_mps, noise=noise, errors=errors
+    )
+    if not on_map:
+        return accuracy.covariance
+    return accuracy.covariance + installation_covariance(path[len(path) // 2], errors)
+
+
+def straight_path(geometry: Geometry, offset_m: float, heading_rad: float) -> Array:
+    """Return a straight path (n, 3) over a landmark, which the middle point is next to."""
+    reach = territory_reach(geometry) + REACH_M
+    count = math.ceil(reach / STEP_M)
+    along = STEP_M * np.arange(-count, count + 1)
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    x, y = c * along - s * offset_m, s * along + c * offset_m
+    return np.column_stack([x, y, np.full(len(along), heading_rad)])
+
+
+def territory_reach(geometry: Geometry) -> float:
+    """Return a distance [m] from the centre beyond which no sensor is in the territory."""
+    return geometry.radius_m + geometry.bar_length_m + geometry.circle_m
+
+
+def installation_covariance(pose: Array, errors: VisitErrors) -> Array:
+    """Return the covariance (3, 3) of a pose (3,) by the installation of the landmark."""
+    lever = np.array([-pose[1], pose[0], 1.0])
+    covariance = errors.landmark_heading_rad**2 * np.outer(lever, lever)
+    covariance[[0, 1], [0, 1]] += errors.landmark_position_m**2
+    return np.asarray(covariance)
+
+
+def predict_visit(
+    geometry: Geometry,
+    path: Array,
+    strength: Array,
+    *,
+    reference: int | None = None,
+    sensors_m: Array | None = None,
+    speed_mps: float = 0.1,
+    turn_rps: float = math.radians(90),
+    noise: OdometryNoise | None = None,
+    errors: VisitErrors | None = None,
+) -> VisitAccuracy:
+    """Predict the accuracy of a visit along any path.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    path : (n, 3) ndarray
+        Poses of the robot in the frame of the landmark: x, y in metres, heading in radians without
+        jumps; about :data:`STEP_M` or :data:`STEP_RAD` apart.
+    strength : (4,) ndarray
+        Signed strengths of the bars: 1 for N, -1 for S, 0 for a missing bar.
+    reference : int, optional
+        Point of the path at which the pose is predicted; by default the middle one.
+    sensors_m : (N, 2) ndarray, optional
+        In the robot's frame; by default four on the circle of the geometry.
+    speed_mps, turn_rps : float
+        They determine the number of readings at each point.
+    noise : OdometryNoise, optional
+    errors : VisitErrors, optional
+    """
+    noise, errors = noise or OdometryNoise(), errors or VisitErrors()
+    if reference is None:
+        reference = len(path) // 2
+    sensors = circle(geometry.circle_m) if sensors_m is None else sensors_m
+    cos, sin = np.cos(path[:, 2, None]), np.sin(path[:, 2, None])
+    arm = np.stack([cos * sensors[:, 0] - sin * sensors[:, 1],
+                    sin * sensors[:, 0] + cos * sensors[:, 1]], -1)  # fmt: skip
+    position = path[:, None, :2] + arm
+    field, by_position = basis_gradient(geometry, position)
+    total = field @ strength
+    gradient = np.einsum("nsbi,b->nsi", by_position, strength)
+
+    columns = [
+        *_pose_columns(gradient, position - path[reference, :2]),
+        *_odometry_columns(gradient, arm, path, reference, noise),
+        *_sensor_columns(total, gradient, errors),
+        *_bar_columns(field, by_position, strength, errors),
+    ]
+    jacobian = np.stack([column.reshape(-1) for column in columns], -1)
+    root = _Whitener.of(position, _readings(path, speed_mps, turn_rps, errors), errors)
+    jacobian = root(jacobian)
+    information = jacobian.T @ jacobian + np.eye(jacobian.shape[1])
+    information[range(3), range(3)] += DIFFUSE_SIGMA**-2 - 1.0
+    covariance = np.linalg.inv(information)
+
+    others = np.array([each for each in signs(np.arange(CODE_COUNT)) if _differs(each, strength)])
+    difference = root(field.reshape(-1, 4) @ (others - strength).T)
+    projected = jacobian.T @ difference
+    square = np.einsum("rk,rk->k", difference, difference)
+    square -= np.einsum("ik,ij,jk->k", projected, covariance, projected)
+    distance = np.sqrt(np.maximum(square, 0.0))
+    misread = min(1.0, float(ndtr(-distance / 2).sum()))
+    return VisitAccuracy(covariance[:3, :3], misread, float(np.abs(total).max()))
+
+
+def _differs(code_strength: Array, strength: Array) -> bool:
+    """Return whether a code differs in a bar that is there (a missing one has no direction)."""
+    return bool(np.any(code_strength * np.sign(strength) < 0))
+
+
+def _pose_columns(gradient: Array, lever: Array) -> list[Array]:
+    """Return the derivatives (n, N) of the readings by x, y and heading at the reference."""
+    by_heading = gradient[..., 1] * lever[..., 0] - gradient[..., 0] * lever[..., 1]
+    return [gradient[..., 0], gradient[..., 1], by_heading]
+
+
+def _odometry_columns(
+    gradient: Array, arm: Array, path: Array, reference: int, noise: OdometryNoise
+) -> list[Array]:
+    """Return the derivatives of the readings by the errors of the odometry, in their sigmas.
+
+    Scale, rotation scale and drift are constant; the random walk of heading and position is
+    constant in each of :data:`WALK_UNITS` pieces.
+    """
+    step = np.diff(path, axis=0, prepend=path[:1])
+    distance = np.hypot(step[:, 0], step[:, 1])
+    rotation = step[:, 2]
+    direction = step[:, :2].copy()  # of each step, times its length
+    zero = np.zeros_like(distance)
+    stretch = [noise.scale * np.ones_like(distance), zero, zero]
+    bend = [zero, noise.rotation_scale * rotation, noise.drift_rad_per_m * distance]
+    effort = np.cumsum(distance + np.abs(rotation) * noise.rotation_rad)
+    edges = np.linspace(0.0, effort[-1], WALK_UNITS + 1)
+    for first, last in pairwise(edges.tolist()):
+        inside = (effort > first) & (effort <= last)
+        length, angle = float(distance[inside].sum()), float(np.abs(rotation[inside]).sum())
+        walk = math.sqrt(noise.heading_rad**2 * length + noise.rotation_rad**2 * angle)
+        count = max(int(inside.sum()), 1)
+        bend.append(np.where(inside, walk / count, 0.0))
+        stretch.append(zero)
+        # The position walks along the path; across it, the heading dominates.
+        bend.append(zero)
+        stretch.append(
+            np.where(inside, noise.distance_m / math.sqrt(length), 0.0) if length > 0 else zero
+        )
+    heading = np.cumsum(np.stack(bend, -1), axis=0)
+    mean_heading = heading - np.stack(bend, -1) / 2
+    stretches = np.stack(stretch, -1)
+    x = np.cumsum(direction[:, :1] * stretches - direction[:, 1:] * mean_heading, axis=0)
+    y = np.cumsum(direction[:, 1:] * stretches + direction[:, :1] * mean_heading, axis=0)
+    # Relative to the reference, whose pose is an unknown of its own.
+    heading, x, y = (each - each[reference] for each in (heading, x, y))
+    reference_heading = np.cumsum(np.stack(bend, -1), axis=0)[reference]
+    offset = path[:, :2] - path[reference, :2]
+    x = x + offset[:, 1:] * reference_heading
+    y = y - offset[:, :1] * reference_heading
+    sensor_x = x[:, None] - arm[..., 1, None] * heading[:, None]
+    sensor_y = y[:, None] + arm[..., 0, None] * heading[:, None]
+    by_error = gradient[..., 0, None] * sensor_x + gradient[..., 1, None] * sensor_y
+    return list(np.moveaxis(by_error, -1, 0))
+
+
+def _sensor_columns(total: Array, gradient: Array, errors: VisitErrors) -> list[Array]:
+    """Return the derivatives by gains and offsets of the sensors, and by their height."""
+    own = np.eye(total.shape[1])
+    gains = [errors.gain * total * one for one in own]
+    offsets = [errors.offset_t * np.broadcast_to(one, total.shape) for one in own]
+    return [*gains, *offsets, errors.height_m * gradient[..., 2]]
+
+
+def _bar_columns(
+    field: Array, by_position: Array, strength: Array, errors: VisitErrors
+) -> list[Array]:
+    """Return the derivatives by the strength and the position of each bar."""
+    columns = []
+    for bar in range(4):
+        columns.append(errors.bar_strength * strength[bar] * field[..., bar])
+        for axis in range(2):
+            columns.append(-errors.bar_position_m * strength[bar] * by_position[..., bar, axis])
+    return columns
+
+
+def _readings(path: Array, speed_mps: float, turn_rps: float, errors: VisitErrors) -> Array:
+    """Return the number (n,) of readings of a sensor at each point of a path."""
+    step = np.diff(path, axis=0)
+    duration = np.maximum(
+        np.hypot(step[:, 0], step[:, 1]) / speed_mps, np.abs(step[:, 2]) / turn_rps
+    )
+    near = np.r_[duration[:1], (duration[1:] + duration[:-1]) / 2, duration[-1:]]
+    return np.asarray(errors.rate_hz * near)
+
+
+@dataclass(frozen=True)
+class _Whitener:
+    """Multiplication by the root of the weights of the readings.
+
+    Attributes
+    ----------
+    sigma : (r,) ndarray
+        Of each reading, if they are independent.
+    lower : (r, r) ndarray or None
+        Cholesky factor of their covariance, otherwise.
+    """
+
+    sigma: Array
+    lower: Array | None
+
+    @classmethod
+    def of(cls, position: Array, readings: Array, errors: VisitErrors) -> _Whitener:
+        """Return the whitener of readings at positions (n, N, 2)."""
+        sigma = np.repeat(errors.noise_t / np.sqrt(np.maximum(readings, 1e-9)), position.shape[1])
+        if not errors.disturbance_t:
+            return cls(sigma, None)
+        flat = position.reshape(-1, 2)
+        square = np.sum((flat[:, None] - flat) ** 2, axis=-1)
+        covariance = errors.disturbance_t**2 * np.exp(
+            -square / (2 * errors.disturbance_length_m**2)
+        )
+        return cls(sigma, np.linalg.cholesky(covariance + np.diag(sigma**2)))
+
+    def __call__(self, rows: Array) -> Array:
+        if self.lower is None:
+            return rows / self.sigma[:, None]
+        return np.linalg.solve(self.lower, rows)
