@@ -28,6 +28,13 @@ from locatk.core.lighthouse.published.scene import solve_published
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.designed_frame import (
+    design_prior,
+    designed_poses_warning,
+    is_design,
+    place_in_design,
+    with_mounting_tolerance,
+)
 from locatk.core.lighthouse.scene.estimation import (
     SCENE_KINDS,
     SceneEstimate,
@@ -111,7 +118,10 @@ def solve(
     sweeps : Sweeps
     scene : Scene, optional
         With stations: they are used as they are. Without: they are estimated first; markers
-        and distances then fix frame and scale.
+        and distances then fix frame and scale. Stations of a design (``frame_source`` is
+        ``"design"``) are estimated as well, and the result is moved to them
+        (:mod:`~locatk.core.lighthouse.scene.designed_frame`); if the recording does not determine
+        them, the designed poses are used, with their covariances.
     options : SolveOptions, optional
     odometry : sequence of Trajectory
         Determines the scale if the scene has neither markers nor distances.
@@ -124,7 +134,8 @@ def solve(
     Returns
     -------
     Solution
-        Its ``artifact`` is the scene with stations, for later sessions.
+        Its ``artifact`` is the scene with stations, for later sessions; the given design if no
+        stations could be estimated.
 
     Raises
     ------
@@ -136,6 +147,27 @@ def solve(
     """
     scene = scene or Scene()
     options = options or SolveOptions()
+    if not is_design(scene) or options.method != "bundle":
+        return _solve(sweeps, scene, options, odometry, receivers, imu)
+    try:
+        solution = _solve(sweeps, design_prior(scene), options, odometry, receivers, imu)
+        return place_in_design(solution, scene)
+    except DegenerateError as error:
+        given = with_mounting_tolerance(scene)
+        solution = _solve(sweeps, given, options, odometry, receivers, imu)
+        warning = designed_poses_warning(error)
+        return replace(solution, artifact=scene, warnings=(warning, *solution.warnings))
+
+
+def _solve(
+    sweeps: Sweeps,
+    scene: Scene,
+    options: SolveOptions,
+    odometry: Sequence[Trajectory],
+    receivers: Mapping[str, Receiver] | None,
+    imu: Sequence[InertialSamples],
+) -> Solution:
+    """Solve in a scene whose stations are used as they are, or estimated if it has none."""
     channels = find_doubled_channels(sweeps)
     doubled = channels.proven
     is_doubled = np.isin(sweeps.channel, doubled)

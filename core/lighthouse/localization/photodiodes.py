@@ -8,6 +8,7 @@ contradict themselves or the trajectory of their device are rejected and counted
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 
@@ -34,6 +35,7 @@ from locatk.core.lighthouse.noise import (
 from locatk.core.lighthouse.results import SceneVerification, StationDetection
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
+from locatk.core.lighthouse.scene.scene_errors import SceneErrors
 from locatk.core.robust import robust_sigma
 from locatk.core.solution import SolverWarning, add_counts
 from locatk.core.trajectory import Trajectory
@@ -62,6 +64,10 @@ MAX_JUMP_PASSES = 20
 MAX_JUMP_RATIO = 5.0
 """Departure from the predicted position, relative to the usual one and to those of the neighbours,
 from which a position is a jump."""
+
+MAX_MOUNTING_SIGMAS = 4.0
+"""Residual of an angle in a scene of designed stations, in standard deviations by their mounting,
+from which it is an outlier."""
 
 MIN_PREDICTIONS = 3
 """Fewest pairs of neighbours that predict a position: a median of fewer is not robust."""
@@ -126,6 +132,7 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
     stations = stack_stations(selected)
     floor_z = scene.floor_z if scene.planar else None
     floor_map = selected[0].floor_map if len(selected) == 1 else None
+    is_design = scene.frame_source == "design"
 
     rejected: Counter[str] = Counter()
     restored = 0
@@ -139,6 +146,8 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
         estimates = estimate_positions(rotor_angles(epochs), *stations, floor_z=floor_z)
         epochs, estimates, restored = restore_swapped_sweeps(epochs, estimates, stations, floor_z)
         gate = inlier_gate(estimates)
+        if is_design:
+            gate = max(gate, MAX_MOUNTING_SIGMAS * mounting_sigma(selected, estimates.position))
         if len(selected) > 2:
             ideal = correct_angles(rotor_angles(epochs), stations[2])
             estimates, repaired = leave_out_worst_station(ideal, estimates, stations, floor_z, gate)
@@ -160,7 +169,8 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
     rejected["moment_out_of_reach"] += int(np.count_nonzero(is_out_of_range))
     rejected["moment_jumps"] += int(np.count_nonzero(is_jump))
 
-    sigma = angle_sigma(estimates, is_accepted)
+    # Residuals in a design are those of its stations, which count as errors of the scene.
+    sigma = ANGLE_SIGMA_RAD if is_design else angle_sigma(estimates, is_accepted)
     calibration_sigma = None
     is_generic = any(c.is_generic for c in stations[2])
     # A floor homography absorbs the errors of the calibration.
@@ -170,6 +180,13 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
         float(np.hypot(sigma, calibration_sigma)) if calibration_sigma else sigma,
         floor_z is not None,
     )
+    if is_design:
+        errors = SceneErrors(scene, selected, floor_z)
+        is_seen = np.isfinite(estimates.residual).all(axis=2)
+        for row in np.flatnonzero(is_accepted).tolist():
+            covariance[row] += errors.position_covariance(
+                estimates.position[row].tolist(), np.flatnonzero(is_seen[row]).tolist()
+            )
     return PhotodiodeTracks(
         split_by_device(epochs, is_accepted, estimates.position, scene.frame, covariance),
         epochs,
@@ -265,6 +282,23 @@ def inlier_gate(estimates: PositionEstimates) -> float:
     """
     noise = angle_sigma(estimates, estimates.max_residual < INLIER_GATE_RAD)
     return float(np.clip(INLIER_GATE_SIGMAS * noise, MIN_INLIER_GATE_RAD, INLIER_GATE_RAD))
+
+
+def mounting_sigma(stations: Sequence[Station], positions: Array) -> float:
+    """Return the standard deviation of angles by the poses of designed stations [rad].
+
+    ``positions`` (m, 3) are those of photodiodes.
+    """
+    if not np.any(np.isfinite(positions)):
+        return 0.0
+    variances = []
+    for station in stations:
+        distance = np.nanmedian(np.linalg.norm(positions - station.position, axis=1))
+        if station.covariance is None:
+            continue
+        own = np.diagonal(station.covariance)
+        variances.append(np.mean(own[:3]) / distance**2 + np.mean(own[3:]))
+    return float(np.sqrt(np.mean(variances))) if variances else 0.0
 
 
 def find_jumps(

@@ -13,7 +13,7 @@ from locatk.core.lighthouse.epochs import MAX_PLANE_DELAY_TURNS, MIN_PLANE_DELAY
 from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
-from locatk.core.lighthouse.stream.scene_errors import SceneErrors
+from locatk.core.lighthouse.scene.scene_errors import SceneErrors
 
 Array = NDArray[np.float64]
 
