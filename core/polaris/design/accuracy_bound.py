@@ -3,6 +3,10 @@
 Model: dipoles at one height below a bar of sensors that passes straight over them, white noise, and
 an unknown constant offset of each axis of each sensor. The information is that of all samples of
 all sensors; nuisance parameters are marginalized (Schur complement).
+
+Fields of the environment are no part of the bound's model, as they are none of the solver's: the
+covariance of the errors that they cause in the estimate for white noise is added. The estimate
+then also has a drift of each axis of each sensor as an unknown, as the solver's has.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from locatk.core.errors import InputError
 from locatk.core.magnetics import MU0_4PI, dipole_tensor
 from locatk.core.polaris.array import SensorArray
+from locatk.core.polaris.design.environment import QUIET, Environment
 from locatk.core.polaris.tag import TagLayout, Tags, cell_positions, symbol_angles
 
 Array = NDArray[np.float64]
@@ -100,6 +105,7 @@ def magnet_covariance(
     heading_rad: float = 0.0,
     offset_m: float = 0.0,
     nuisance: NuisanceModel = "steps",
+    environment: Environment = QUIET,
 ) -> Array:
     """Return the smallest covariance of positions and angles of the magnets in one pass.
 
@@ -116,6 +122,8 @@ def magnet_covariance(
         Heading of the tag in this frame, and its distance to the left.
     nuisance : {"magnets", "strength", "speed", "steps"}
         See :data:`NuisanceModel`.
+    environment : Environment
+        Fields that vary during the pass.
 
     Returns
     -------
@@ -141,14 +149,35 @@ def magnet_covariance(
 
     columns, path_column = _derivatives(tags, position_m, angle_rad, array, path_m, nuisance)
     columns, path_column = columns / noise, path_column / noise
-    # Offsets are linear unknowns: subtracting the mean of each sensor's axis marginalizes them.
-    columns = columns - columns.mean(1, keepdims=True)
+    has_environment = environment.field_t > 0
+    if has_environment and environment.is_common:
+        columns = columns - columns.mean(2, keepdims=True)
+        path_column = path_column - path_column.mean(1, keepdims=True)
+    # Offsets (and drifts) are linear unknowns: removing their part of each sensor's axis
+    # marginalizes them.
+    remaining = _without_background(path_m, 1 if has_environment else 0)
+    columns = np.einsum("nk,pksi->pnsi", remaining, columns, optimize=True)
     flat = columns.reshape(len(columns), -1)
     information = flat @ flat.T
     if nuisance == "steps":
-        information -= _information_lost_to_steps(columns, path_column, path_m, group)
+        gain = _gain_of_steps(columns, path_column, path_m, group, remaining)
+        mixed = np.einsum("pnsi,nsi->pn", columns, path_column)
+        information -= gain @ mixed.T
+        if has_environment:
+            by_steps = gain[:, :, None, None] * path_column
+            columns = columns - np.einsum("nj,pjsi->pnsi", remaining, by_steps, optimize=True)
     parameters = 3 * len(position_m)
-    return _inverse(information)[:parameters, :parameters]
+    covariance = _inverse(information)[:parameters]
+    result = covariance[:, :parameters]
+    if has_environment:
+        estimator = np.einsum("pq,qnsi->pnsi", covariance, columns) / noise
+        along = environment.path_correlation(path_m)
+        across = environment.bar_correlation(array.position_m[:, 1])
+        spread = np.einsum("nk,pksi,st->pnti", along, estimator, across, optimize=True)
+        result = result + environment.field_t**2 * np.einsum(
+            "pnsi,qnsi->pq", spread, estimator, optimize=True
+        )
+    return np.asarray(result)
 
 
 def pose_covariance(tags: Tags, layout: TagLayout, covariance: Array, heading_rad: float) -> Array:
@@ -180,6 +209,7 @@ def accuracy_bound(
     heading_rad: float = 0.0,
     offset_m: float = 0.0,
     nuisance: NuisanceModel = "steps",
+    environment: Environment = QUIET,
 ) -> AccuracyBound:
     """Return the bound as rms over the magnets of all ``layouts``.
 
@@ -199,6 +229,7 @@ def accuracy_bound(
             heading_rad=heading_rad,
             offset_m=offset_m + ((number + 0.5) / count - 0.5) * spacing_m,
             nuisance=nuisance,
+            environment=environment,
         )
         magnets.append(np.diag(covariance).reshape(-1, 3).mean(0))
         poses.append(np.diag(pose_covariance(tags, layout, covariance, heading_rad)))
@@ -261,28 +292,37 @@ def _derivatives(
     return np.concatenate(columns), by_path
 
 
-def _information_lost_to_steps(
-    columns: Array, path_column: Array, path_m: Array, group: int
+def _without_background(path_m: Array, degree: int) -> Array:
+    """Return the projection (n, n) that removes polynomials along the path from samples."""
+    columns = np.linalg.qr(np.vander(path_m / np.ptp(path_m), degree + 1))[0]
+    return np.asarray(np.eye(len(path_m)) - columns @ columns.T)
+
+
+def _gain_of_steps(
+    columns: Array, path_column: Array, path_m: Array, group: int, remaining: Array
 ) -> Array:
-    """Return the information that is lost if every step of the path is unknown.
+    """Return the estimate (p, n) of the positions of the bar from each column, if steps are free.
 
     The position of the bar at a sample affects that sample only. The information of the positions
-    is therefore diagonal, except for the marginalized offsets. The prior of the steps, a random
+    is therefore diagonal, except for the marginalized background. The prior of the steps, a random
     walk, is added.
     """
     n = len(path_m)
     flat = path_column.reshape(n, -1)
-    block = np.diag((flat * flat).sum(1)) - flat @ flat.T / n
+    block = remaining * (flat @ flat.T)
     step_prior = np.diff(np.eye(n), axis=0) / (STEP_SIGMA_M * math.sqrt(group))
     block += step_prior.T @ step_prior
     mixed = np.einsum("pnsi,nsi->pn", columns, path_column)
     # The position at path 0 is not an unknown, because it defines the frame.
     is_unknown = path_m != 0
-    block, mixed = block[np.ix_(is_unknown, is_unknown)], mixed[:, is_unknown]
+    gain = np.zeros((len(columns), n))
     try:
-        return np.asarray(mixed @ np.linalg.solve(block, mixed.T))
+        gain[:, is_unknown] = np.linalg.solve(
+            block[np.ix_(is_unknown, is_unknown)], mixed[:, is_unknown].T
+        ).T
     except np.linalg.LinAlgError:
         raise InputError("the samples do not determine the magnets") from None
+    return gain
 
 
 def _inverse(information: Array) -> Array:

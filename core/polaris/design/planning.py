@@ -27,6 +27,7 @@ from locatk.core.polaris.design.accuracy_bound import (
     NuisanceModel,
     accuracy_bound,
 )
+from locatk.core.polaris.design.environment import QUIET, Environment
 from locatk.core.polaris.design.materials import bill_of_materials
 from locatk.core.polaris.mlx90393 import Settings, published_bar, settings_for_rate
 from locatk.core.polaris.tag import Magnet, TagLayout, Tags
@@ -88,6 +89,8 @@ class ReadingConditions:
     placement_rad : float or None
         Standard deviation of the orientations of the placed magnets; by default as measured on the
         tags as built, otherwise :data:`PLACEMENT_SIGMA_RAD`.
+    environment : Environment
+        Magnetic fields that vary during a pass.
     """
 
     sensors: int = 9
@@ -97,6 +100,7 @@ class ReadingConditions:
     rate_hz: float | None = None
     speed_mps: float = 0.1
     placement_rad: float | None = None
+    environment: Environment = QUIET
 
 
 @dataclass(frozen=True)

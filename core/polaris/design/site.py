@@ -140,7 +140,7 @@ def grid_points(
     heading_rad: float = 0.0,
 ) -> list[SitePoint]:
     """Return the points of a grid, row by row from the origin, with rows along x."""
-    _check_count(rows * columns)
+    check_tag_count(rows * columns)
     return [
         SitePoint(
             origin_m[0] + column * spacing_m,
@@ -190,7 +190,7 @@ def route_points(
             raise InputError(f"{end.name}: the position of the previous waypoint")
         heading = math.atan2(dy, dx)
         steps = max(1, math.ceil(length_m / spacing_m - 1e-9))
-        _check_count(len(candidates) + steps)
+        check_tag_count(len(candidates) + steps)
         for step in range(steps):
             fraction = step / steps
             point = SitePoint(
@@ -211,7 +211,8 @@ def route_points(
     return points, len(candidates) - len(points)
 
 
-def _check_count(count: int) -> None:
+def check_tag_count(count: int) -> None:
+    """Raise an error for more than :data:`MAX_SITE_TAGS` tags."""
     if count > MAX_SITE_TAGS:
         raise InputError(
             f"more than {MAX_SITE_TAGS} tags on a site", hint="Give a larger spacing, in mm"
@@ -242,7 +243,7 @@ def place_tags(tags: Tags, points: Sequence[SitePoint], min_distance: int = 1) -
     """
     if not points:
         raise InputError("no positions for tags")
-    _check_count(len(points))
+    check_tag_count(len(points))
     given: dict[int, str] = {}
     capacity = codec.capacity(tags)
     for point in points:

@@ -1,0 +1,800 @@
+"""Routes over tags: accuracy of a pass, accuracy along a route, and the spacing of tags.
+
+The pose of the array at a pass has the errors of the field's measurement (Cramer-Rao bound), of the
+magnets within the tag, and of the tag on the floor; the last two dominate. Between two passes,
+odometry continues (:mod:`locatk.core.routes`).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.error_quantiles import error_quantile
+from locatk.core.errors import InputError
+from locatk.core.polaris import codec
+from locatk.core.polaris.design.accuracy_bound import magnet_covariance, rotate
+from locatk.core.polaris.design.planning import ReadingConditions, sample_layouts, sensor_array
+from locatk.core.polaris.design.site import SitePoint, check_tag_count, pass_separation
+from locatk.core.polaris.identification.matching import (
+    AS_BUILT_SIGMA_M,
+    HAND_BUILT_SIGMA_M,
+    SCALE_SIGMA,
+)
+from locatk.core.polaris.tag import PlanarPose, TagLayout, Tags, cell_positions
+from locatk.core.routes import Route, RouteAccuracy, RouteFix, predict_accuracy
+from locatk.core.streaming.planar_filter import OdometryNoise
+from locatk.core.units import length_text
+
+Array = NDArray[np.float64]
+
+LAYING_SIGMA_M = 1.5e-3
+"""Standard deviation of the position of a tag that was laid by hand along each axis [m]: 1 mm for
+the mark and the edge of the sheet, and 1.2 mm for a tape of class II, which is allowed an error of
+0.3 mm + 0.2 mm/m (directive 2014/32/EU, annex X, chapter I), 1.3 mm in 5 m."""
+
+EDGE_SIGMA_M = 1e-3
+"""Standard deviation of each end of the edge by which the heading of a tag is set [m]."""
+
+SAMPLED_LAYOUTS = 4
+"""Number of layouts over which the accuracy of a pass is averaged."""
+
+RUN_UP_CLEARANCES = 2.0
+"""Length of a straight path before the first and after the last row of a tag, in clearances. The
+field of a magnet is a tenth there."""
+
+HEADING_RESOLUTION_RAD, OFFSET_RESOLUTION_M = math.radians(5), 2e-3
+"""Passes whose headings and lateral offsets round to the same multiples are of equal accuracy."""
+
+MAX_TURN_RAD = math.radians(20)
+"""Largest turn of a route over a tag at which the pass counts. Paths with a radius from 80 mm on
+are read in simulation (docs/polaris.md), but nobody has recorded any."""
+
+MAX_SPACING_M = 200.0
+"""Largest spacing of tags that is recommended, even for perfect odometry."""
+
+PLANNED_GAPS = 10
+"""Number of spacings of the straight route for which :func:`spacing_for_accuracy` plans."""
+
+SPACING_RATIO, ROUTE_SPACING_RATIO = 1.02, 1.05
+"""Relative resolution of a planned spacing, on a straight route and on a given one."""
+
+STEPS_PER_SPACING = 8
+"""Points per spacing at which the accuracy is computed while a spacing is searched."""
+
+STRAIGHT_ODOMETRY_ERRORS = (
+    "scale",
+    "drift_rad_per_m",
+    "distance_m",
+    "heading_rad",
+    "slip_m",
+    "slip_rad",
+)
+"""Errors of odometry on a straight route."""
+
+TOLERANCE_M = 1e-9
+"""Tolerance of positions, for rounding [m]."""
+
+PROBABILITY = 0.95
+"""Probability of the errors of a forecast."""
+
+
+# ---- one pass
+
+
+def tag_fix_covariance(
+    tags: Tags,
+    use: ReadingConditions | None = None,
+    *,
+    tag_id: int | None = None,
+    heading_rad: float = 0.0,
+    offset_m: float = 0.0,
+    has_odometry: bool = True,
+    laying: tuple[float, float] | None = None,
+    build_m: float | None = None,
+) -> Array:
+    """Return the covariance of the pose of the array as it passes the middle of a tag.
+
+    It is that of a weighted fit of the grid to the magnets, whose errors are the measurement
+    (:func:`.accuracy_bound.magnet_covariance`) and their placement, plus the tag's on the floor.
+
+    Parameters
+    ----------
+    tags : Tags
+    use : ReadingConditions, optional
+    tag_id : int, optional
+        By default, an average tag of the family.
+    heading_rad, offset_m : float
+        Heading of the tag in the frame of the array, and its distance to the left.
+    has_odometry : bool
+        True if the path of the array is known from odometry. Otherwise it is estimated from the
+        field, and the spacing of the tag gives its scale.
+    laying : (float, float), optional
+        Standard deviations of the position (each axis) and heading of the tag on the floor, in m
+        and rad; by default those of the site, otherwise :func:`laying_sigma`.
+    build_m : float, optional
+        Standard deviation of the position of a magnet in the tag along each axis; by default that
+        of magnets placed by hand, or of tags that were measured as built.
+
+    Returns
+    -------
+    (3, 3) ndarray
+        Of x (forward), y (left) and heading, in the axes of the array, in m and rad.
+
+    Raises
+    ------
+    InputError
+        The samples do not determine the magnets: too few, or too weak a field.
+    """
+    use = use or ReadingConditions()
+    array, _ = sensor_array(use)
+    step_m = use.speed_mps / min(use.rate_hz or math.inf, use.settings.max_rate_hz)
+    layouts = sample_layouts(tags, SAMPLED_LAYOUTS)
+    if tag_id is not None:
+        layouts = [codec.layout_of(tags, tag_id)]
+    if build_m is None:
+        build_m = AS_BUILT_SIGMA_M if tag_id in tags.built else HAND_BUILT_SIGMA_M
+    matches = [
+        _match_covariance(
+            tags,
+            layout,
+            magnet_covariance(
+                tags,
+                layout,
+                array,
+                step_m=step_m,
+                heading_rad=heading_rad,
+                offset_m=offset_m,
+                nuisance="strength" if has_odometry else "steps",
+                environment=use.environment,
+            ),
+            heading_rad,
+            build_m,
+            None if has_odometry else SCALE_SIGMA,
+        )
+        for layout in layouts
+    ]
+    # The error of the array is the opposite of the tag's in the array's frame, about the tag.
+    jacobian = np.diag([-1.0, -1.0, -1.0])
+    jacobian[0, 2] = -offset_m
+    covariance = jacobian @ np.mean(matches, axis=0) @ jacobian.T
+    x_m, y_m, tag_rad = _laying(tags, tag_id, laying)
+    # Site axes are turned into those of the array only if both axes differ.
+    by_tag = np.eye(3)
+    by_tag[0, 2] = offset_m
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    laid = np.zeros((3, 3))
+    laid[:2, :2] = turn @ np.diag([x_m**2, y_m**2]) @ turn.T
+    laid[2, 2] = tag_rad**2
+    return np.asarray(covariance + by_tag @ laid @ by_tag.T)
+
+
+def laying_sigma(tags: Tags) -> tuple[float, float]:
+    """Return standard deviations of position [m] and heading [rad] of a tag laid by hand.
+
+    The heading is set by an edge of the sheet, which is a spacing longer than the grid.
+    """
+    edge_m = tags.order * tags.spacing_m
+    return LAYING_SIGMA_M, math.sqrt(2) * EDGE_SIGMA_M / edge_m
+
+
+def _laying(
+    tags: Tags, tag_id: int | None, laying: tuple[float, float] | None
+) -> tuple[float, float, float]:
+    """Return the standard deviations of x, y and heading of a tag on the floor."""
+    if laying is not None:
+        return laying[0], laying[0], laying[1]
+    if tag_id is not None and tag_id in tags.site_sigma:
+        return tags.site_sigma[tag_id]
+    position_m, heading_rad = laying_sigma(tags)
+    return position_m, position_m, heading_rad
+
+
+def _match_covariance(
+    tags: Tags,
+    layout: TagLayout,
+    covariance: Array,
+    heading_rad: float,
+    build_m: float,
+    scale_sigma: float | None,
+) -> Array:
+    """Return the covariance (3, 3) of the tag's pose in the frame of the array.
+
+    Unknowns are x, y, heading and, with ``scale_sigma``, the scale of lengths along the track.
+    """
+    position_m = rotate(cell_positions(tags, layout.cells), heading_rad)
+    rows = np.flatnonzero(np.arange(len(covariance)) % 3 < 2)
+    jacobian = np.zeros((len(rows), 4))
+    jacobian[0::2, 0] = jacobian[1::2, 1] = 1.0
+    jacobian[0::2, 2], jacobian[1::2, 2] = -position_m[:, 1], position_m[:, 0]
+    jacobian[0::2, 3] = position_m[:, 0]
+    total = covariance[np.ix_(rows, rows)] + build_m**2 * np.eye(len(rows))
+    information = jacobian.T @ np.linalg.solve(total, jacobian)
+    if scale_sigma is None:
+        return np.asarray(np.linalg.inv(information[:3, :3]))
+    information[3, 3] += 1 / scale_sigma**2
+    return np.asarray(np.linalg.inv(information)[:3, :3])
+
+
+# ---- passes of a route
+
+
+@dataclass(frozen=True)
+class TagPass:
+    """A tag that the array passes.
+
+    Attributes
+    ----------
+    tag_id : int
+    distance_m : float
+        Along the route, to the middle of the tag.
+    offset_m : float
+        Distance of the tag's middle to the left of the route.
+    heading_rad : float
+        Heading of the tag in the frame of the array.
+    play_m : float
+        Largest further lateral offset at which all magnets are below the array.
+    """
+
+    tag_id: int
+    distance_m: float
+    offset_m: float
+    heading_rad: float
+    play_m: float
+
+
+def find_tag_passes(
+    tags: Tags, route: Route, use: ReadingConditions | None = None
+) -> list[TagPass]:
+    """Return the tags whose magnets all pass below the array, in the order of the route.
+
+    A tag counts if the whole of it is passed on one segment, or on two with a turn of at most
+    :data:`MAX_TURN_RAD` in between.
+    """
+    use = use or ReadingConditions()
+    half_array_m = (use.sensors - 1) * use.sensor_spacing_m / 2
+    start_m = np.concatenate([[0.0], np.cumsum(route.segment_m)])
+    is_sharp = _sharp_turns(route)
+    half_m = (tags.order - 1) / 2 * tags.spacing_m
+    corners = half_m * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    last = len(route.segment_m) - 1
+    passes = []
+    for k, heading in enumerate(route.heading_rad.tolist()):
+        length_m = float(route.segment_m[k])
+        for tag_id, pose in tags.site.items():
+            offset = np.array([pose.x_m, pose.y_m]) - route.waypoint_m[k]
+            along_m, left_m = rotate(offset[None], -heading)[0].tolist()
+            # A tag at a waypoint is passed once.
+            if not (0 <= along_m < length_m or (k == last and along_m == length_m)):
+                continue
+            relative = math.remainder(pose.heading_rad - heading, math.tau)
+            turned = rotate(corners, relative)
+            reach_m = float(turned[:, 0].max()) - TOLERANCE_M
+            if is_sharp[k] and along_m < reach_m:
+                continue
+            if is_sharp[k + 1] and along_m > length_m - reach_m:
+                continue
+            play_m = half_array_m - abs(left_m) - float(turned[:, 1].max())
+            if play_m >= -TOLERANCE_M:
+                distance_m = float(start_m[k]) + along_m
+                passes.append(TagPass(tag_id, distance_m, left_m, relative, max(play_m, 0.0)))
+    return sorted(passes, key=lambda each: each.distance_m)
+
+
+def _sharp_turns(route: Route) -> NDArray[np.bool_]:
+    """Return whether a tag at each waypoint (n,) is not passed: at turns, start and end."""
+    turn = np.remainder(np.diff(route.heading_rad) + np.pi, math.tau) - np.pi
+    return np.concatenate([[True], np.abs(turn) > MAX_TURN_RAD, [True]])
+
+
+# ---- forecast
+
+
+@dataclass(frozen=True, eq=False)
+class RouteForecast:
+    """Expected accuracy along one route.
+
+    Attributes
+    ----------
+    route : Route
+    passes : tuple of TagPass
+    accuracy : RouteAccuracy
+    missed : tuple of (TagPass, float)
+        Tags beside which the array may pass, and the lateral error before each that is not
+        exceeded with 95 % [m]; it is larger than the play.
+    """
+
+    route: Route
+    passes: tuple[TagPass, ...]
+    accuracy: RouteAccuracy
+    missed: tuple[tuple[TagPass, float], ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class SiteForecast:
+    """Expected accuracy of a robot that drives routes over a site.
+
+    Attributes
+    ----------
+    routes : tuple of RouteForecast
+    length_m : float
+        Length of all routes.
+    tags : int
+        Number of tags that are passed on any route.
+    position_p95_m, heading_p95_rad : float
+        Errors that are not exceeded with a probability of 95 % where the pose is known; ``inf``
+        if no tag is passed.
+    fix_position_p95_m, fix_heading_p95_rad : float
+        The same at the tags, as measured by one pass.
+    covered_fraction : float
+        Part of the length on which the pose is known: from the first tag on.
+    longest_gap_m : float
+        Longest stretch without a tag.
+    worst_m : (2,) ndarray
+        Place on the floor with the largest expected error; ``nan`` if no tag is passed.
+    worst_position_p95_m : float
+        Error there that is not exceeded with 95 %.
+    warnings : tuple of str
+    """
+
+    routes: tuple[RouteForecast, ...]
+    length_m: float
+    tags: int
+    position_p95_m: float
+    heading_p95_rad: float
+    fix_position_p95_m: float
+    fix_heading_p95_rad: float
+    covered_fraction: float
+    longest_gap_m: float
+    worst_m: Array
+    worst_position_p95_m: float
+    warnings: tuple[str, ...] = ()
+
+
+def forecast_routes(
+    tags: Tags,
+    routes: Sequence[Route],
+    use: ReadingConditions | None = None,
+    noise: OdometryNoise | None = None,
+    *,
+    laying: tuple[float, float] | None = None,
+    is_smoothed: bool = False,
+) -> SiteForecast:
+    """Forecast the accuracy of a robot that drives routes over a site.
+
+    Each route is a drive of its own: its pose is unknown until the first tag.
+
+    Parameters
+    ----------
+    tags : Tags
+        With a site.
+    routes : sequence of Route
+        At least one.
+    use : ReadingConditions, optional
+    noise : OdometryNoise, optional
+    laying : (float, float), optional
+        See :func:`tag_fix_covariance`.
+    is_smoothed : bool
+        False: accuracy of ``locatk live``, which knows the tags behind it. True: that of an
+        estimate from the whole recording.
+
+    Raises
+    ------
+    InputError
+        There is no route, or the design is impossible.
+    """
+    use, noise = use or ReadingConditions(), noise or OdometryNoise()
+    if not routes:
+        raise InputError("no route")
+    codec.check_design(tags)
+    pass_covariance = _PassCovariances(tags, use, laying)
+    forecasts, fixes, warnings = [], [], list[str]()
+    for route in routes:
+        passes = tuple(find_tag_passes(tags, route, use))
+        covariances = [pass_covariance(each) for each in passes]
+        accuracy = predict_accuracy(
+            route,
+            [RouteFix(p.distance_m, c) for p, c in zip(passes, covariances, strict=True)],
+            noise,
+            use.speed_mps,
+            is_smoothed=is_smoothed,
+        )
+        fixes += covariances
+        lateral = [(each, lateral_p95_m(accuracy, each.distance_m)) for each in passes]
+        missed = tuple(pair for pair in lateral if pair[1] > pair[0].play_m)
+        forecasts.append(RouteForecast(route, passes, accuracy, missed))
+        warnings += _route_warnings(tags, use, forecasts[-1])
+    covariance = np.concatenate([each.accuracy.covariance for each in forecasts])
+    distances = [each.accuracy.distance_m for each in forecasts]
+    weight = np.concatenate([np.diff(distance, prepend=0.0) for distance in distances])
+    is_known = np.isfinite(covariance).all(axis=(1, 2))
+    worst_m, worst = np.full(2, math.nan), np.full((1, 3, 3), math.inf)
+    if is_known.any():
+        variance = np.where(is_known, np.trace(covariance[:, :2, :2], axis1=1, axis2=2), -1.0)
+        k = int(variance.argmax())
+        worst_m = np.concatenate([each.accuracy.position_m for each in forecasts])[k]
+        worst = covariance[k : k + 1]
+    known = (covariance[is_known], weight[is_known])
+    fixed = np.array(fixes).reshape(-1, 3, 3)
+    length_m = sum(route.length_m for route in routes)
+    return SiteForecast(
+        tuple(forecasts),
+        length_m,
+        len({each.tag_id for forecast in forecasts for each in forecast.passes}),
+        *_quantiles(*known),
+        *_quantiles(fixed, np.ones(len(fixed))),
+        float(weight[is_known].sum() / weight.sum()),
+        max(each.accuracy.longest_without_fix_m for each in forecasts),
+        worst_m,
+        error_quantile(worst[:, :2, :2], PROBABILITY),
+        tuple(warnings),
+    )
+
+
+class _PassCovariances:
+    """Covariances of passes over the tags of a site; equal passes are computed once."""
+
+    def __init__(
+        self, tags: Tags, use: ReadingConditions, laying: tuple[float, float] | None
+    ) -> None:
+        self._tags, self._use, self._laying = tags, use, laying
+        self._known: dict[tuple[object, ...], Array] = {}
+
+    def __call__(self, tag_pass: TagPass) -> Array:
+        tag_id = tag_pass.tag_id
+        is_special = tag_id in self._tags.built or tag_id in self._tags.site_sigma
+        heading = round(tag_pass.heading_rad / HEADING_RESOLUTION_RAD)
+        offset = round(tag_pass.offset_m / OFFSET_RESOLUTION_M)
+        key = (tag_id if is_special else None, heading, offset)
+        if key not in self._known:
+            self._known[key] = tag_fix_covariance(
+                self._tags,
+                self._use,
+                tag_id=tag_id if is_special else None,
+                heading_rad=heading * HEADING_RESOLUTION_RAD,
+                offset_m=offset * OFFSET_RESOLUTION_M,
+                laying=self._laying,
+            )
+        return self._known[key]
+
+
+def _quantiles(covariance: Array, weight: Array) -> tuple[float, float]:
+    """Return the quantiles of the errors of position and heading; ``inf`` without covariances."""
+    if not weight.sum() > 0:
+        weight = np.ones(len(covariance))
+    if not len(covariance):
+        return math.inf, math.inf
+    position_m = error_quantile(covariance[:, :2, :2], PROBABILITY, weight)
+    return position_m, error_quantile(covariance[:, 2:, 2:], PROBABILITY, weight)
+
+
+def _route_warnings(tags: Tags, use: ReadingConditions, forecast: RouteForecast) -> list[str]:
+    """Describe where a robot may miss the tags of a route."""
+    name, passes = forecast.route.name, forecast.passes
+    if not passes:
+        width_m, tag_m = (use.sensors - 1) * use.sensor_spacing_m, (tags.order - 1) * tags.spacing_m
+        return [
+            f"{name}: no tag passes wholly below the array of {length_text(width_m)}; a tag is "
+            f"{length_text(tag_m)} wide, and a robot that turns over it cannot read it"
+        ]
+    missed = forecast.missed
+    if not missed:
+        return []
+    first, lateral_m = max(missed, key=lambda pair: pair[1] - pair[0].play_m)
+    number = "1 tag" if len(missed) == 1 else f"{len(missed)} of {len(passes)} tags"
+    return [
+        f"{name}: {number} may be missed: before tag {first.tag_id} the robot is off by up to "
+        f"{length_text(lateral_m)} across (95 %), and all magnets are below the array up to "
+        f"{length_text(first.play_m)}; lay tags closer together, or take a wider array"
+    ]
+
+
+def lateral_p95_m(accuracy: RouteAccuracy, distance_m: float) -> float:
+    """Return the error across the route, before a fix, that is not exceeded with 95 % [m].
+
+    0 if the pose is unknown: the robot is then led to the tag.
+    """
+    row = int(np.searchsorted(accuracy.distance_m, distance_m - TOLERANCE_M))
+    covariance = accuracy.covariance[min(row, len(accuracy.covariance) - 1)]
+    if not np.isfinite(covariance).all():
+        return 0.0
+    return error_quantile(covariance[None, 1:2, 1:2], PROBABILITY)
+
+
+# ---- spacing
+
+
+@dataclass(frozen=True)
+class SpacingPlan:
+    """Spacing of tags for a wanted accuracy.
+
+    Attributes
+    ----------
+    is_feasible : bool
+        True if ``spacing_m`` gives the wanted accuracy.
+    spacing_m : float
+        The largest one that gives it; otherwise the smallest at which tags are separate passes.
+    position_p95_m, heading_p95_rad : float
+        Errors along the route at this spacing, not exceeded with 95 %.
+    fix_position_p95_m, fix_heading_p95_rad : float
+        The same of a single pass, the limit for dense tags.
+    limited_by : {"position", "heading", "play", "maximum", "field"}
+        Reason for no larger spacing (if feasible) or no accuracy (if not): error of position or
+        heading; lateral error at which the array would miss the next tag; :data:`MAX_SPACING_M`;
+        or a field that is too weak for any pass.
+    remedies : tuple of str
+        Changes that would help if the accuracy is impossible, with their effect.
+    """
+
+    is_feasible: bool
+    spacing_m: float
+    position_p95_m: float
+    heading_p95_rad: float
+    fix_position_p95_m: float
+    fix_heading_p95_rad: float
+    limited_by: str
+    remedies: tuple[str, ...] = ()
+
+
+def spacing_for_accuracy(
+    tags: Tags,
+    use: ReadingConditions | None = None,
+    noise: OdometryNoise | None = None,
+    position_m: float = math.inf,
+    heading_rad: float = math.inf,
+    *,
+    laying: tuple[float, float] | None = None,
+) -> SpacingPlan:
+    """Return the largest spacing of tags along a straight route that keeps the wanted accuracy.
+
+    The route has :data:`PLANNED_GAPS` spacings and begins at a tag. The accuracy is that of a
+    filter (``locatk live``) with a probability of 95 %, and the lateral error before a tag must be
+    less than the play of the array.
+
+    Parameters
+    ----------
+    tags : Tags
+    use : ReadingConditions, optional
+    noise : OdometryNoise, optional
+    position_m, heading_rad : float
+        Errors that must not be exceeded with 95 %.
+    laying : (float, float), optional
+        See :func:`tag_fix_covariance`.
+
+    Raises
+    ------
+    InputError
+        A wanted error is not positive, or the design is impossible.
+    """
+    use, noise = use or ReadingConditions(), noise or OdometryNoise()
+    if not (position_m > 0 and heading_rad > 0):
+        raise InputError("a wanted accuracy must be above 0", hint="Give mm and degrees")
+    codec.check_design(tags)
+    smallest_m = pass_separation(tags, use)
+    try:
+        fix = tag_fix_covariance(tags, use, laying=laying)
+    except InputError:
+        smallest_m = math.nan
+    if math.isnan(smallest_m):
+        remedy = "take larger magnets, less clearance or a lower speed (`locatk tag design`)"
+        return SpacingPlan(False, math.nan, *[math.inf] * 4, "field", (remedy,))
+    single = _quantiles(fix[None], np.ones(1))
+    play_m = ((use.sensors - 1) * use.sensor_spacing_m - (tags.order - 1) * tags.spacing_m) / 2
+
+    def limits(spacing_m: float) -> tuple[float, float, tuple[str, ...]]:
+        """Return the errors at a spacing, and the names of the limits that they exceed."""
+        route = Route(np.array([[0.0, 0.0], [PLANNED_GAPS * spacing_m, 0.0]]))
+        places_m = spacing_m * np.arange(PLANNED_GAPS + 1)
+        accuracy = predict_accuracy(
+            route,
+            [RouteFix(float(min(place, route.length_m)), fix) for place in places_m],
+            noise,
+            use.speed_mps,
+            step_m=spacing_m / STEPS_PER_SPACING,
+        )
+        errors = accuracy.position_quantile_m(), accuracy.heading_quantile_rad()
+        lateral_m = max(lateral_p95_m(accuracy, place) for place in places_m[1:].tolist())
+        exceeded = {
+            "position": errors[0] > position_m,
+            "heading": errors[1] > heading_rad,
+            "play": lateral_m > play_m,
+        }
+        return (*errors, tuple(name for name, is_exceeded in exceeded.items() if is_exceeded))
+
+    *errors, exceeded = limits(smallest_m)
+    if exceeded:
+        remedies = _remedies(tags, use, noise, (position_m, heading_rad), single, exceeded, laying)
+        return SpacingPlan(False, smallest_m, *errors, *single, exceeded[0], remedies)
+    low_m, high_m = smallest_m, MAX_SPACING_M
+    *largest_errors, exceeded = limits(high_m)
+    if not exceeded:
+        return SpacingPlan(True, high_m, *largest_errors, *single, "maximum")
+    while high_m > SPACING_RATIO * low_m:
+        middle_m = math.sqrt(low_m * high_m)
+        *middle_errors, middle_exceeded = limits(middle_m)
+        if middle_exceeded:
+            high_m, exceeded = middle_m, middle_exceeded
+        else:
+            low_m, errors = middle_m, middle_errors
+    return SpacingPlan(True, low_m, *errors, *single, exceeded[0])
+
+
+def _remedies(
+    tags: Tags,
+    use: ReadingConditions,
+    noise: OdometryNoise,
+    wanted: tuple[float, float],
+    single: tuple[float, float],
+    exceeded: Sequence[str],
+    laying: tuple[float, float] | None,
+) -> tuple[str, ...]:
+    """Describe what would have to change for an accuracy that no spacing gives."""
+    if single[0] > wanted[0] or single[1] > wanted[1]:
+
+        def after(build_m: float | None) -> str:
+            exact = tag_fix_covariance(tags, use, laying=(0.0, 0.0), build_m=build_m)
+            return _errors_text(*_quantiles(exact[None], np.ones(1)))
+
+        return (
+            f"a single pass has errors of {_errors_text(*single)} (95 %): the tags are laid to "
+            f"{_errors_text(*(laying or laying_sigma(tags)))} and their magnets to "
+            f"{length_text(HAND_BUILT_SIGMA_M)} rms",
+            f"survey the tags (`locatk site survey`): up to {after(None)}",
+            "also measure the magnets as built (`locatk calibrate tag`): up to "
+            f"{after(AS_BUILT_SIGMA_M)}",
+        )
+    if "play" in exceeded:
+        needed = use.sensors + math.ceil(tags.spacing_m / use.sensor_spacing_m)
+        return (f"the robot misses tags: take a wider array, as of {needed} sensors",)
+    better = replace(
+        noise,
+        **{
+            name: getattr(noise, name) / 2
+            for name in (
+                "scale",
+                "drift_rad_per_m",
+                "distance_m",
+                "heading_rad",
+                "slip_m",
+                "slip_rad",
+            )
+        },
+    )
+    plan = spacing_for_accuracy(tags, use, better, *wanted, laying=laying)
+    if plan.is_feasible:
+        return (
+            "calibrate the odometry: half of its errors allows tags "
+            f"{length_text(plan.spacing_m)} apart",
+        )
+    return ("take odometry with less than half of these errors",)
+
+
+def _errors_text(position_m: float, heading_rad: float) -> str:
+    return f"{length_text(position_m)} and {math.degrees(heading_rad):.2g} deg"
+
+
+def route_points(
+    tags: Tags, waypoints: Sequence[SitePoint], spacing_m: float
+) -> tuple[Route, list[SitePoint]]:
+    """Return a route, and points for tags along it that are passed straight.
+
+    Waypoints with an id or a meaning are points for tags themselves. Between sharp turns, tags are
+    evenly distributed, at most ``spacing_m`` apart: the first one as soon after the turn as it can
+    be passed straight, so that the heading after the turn is known. Points nearer to others than
+    the size of a tag are left out: the route comes by again.
+
+    Parameters
+    ----------
+    tags : Tags
+    waypoints : sequence of SitePoint
+        At least two.
+    spacing_m : float
+
+    Raises
+    ------
+    InputError
+        The waypoints are no route, or there are too many points.
+    """
+    route = Route(np.array([[point.x_m, point.y_m] for point in waypoints]))
+    half_m = (tags.order - 1) / 2 * tags.spacing_m
+    margin_m = half_m + RUN_UP_CLEARANCES * tags.clearance_m
+    start_m = np.concatenate([[0.0], np.cumsum(route.segment_m)])
+    ends_m = start_m[_sharp_turns(route)]
+    places: list[float] = []
+    for number, (first_m, last_m) in enumerate(itertools.pairwise(ends_m.tolist())):
+        usable_m = last_m - first_m - 2 * margin_m
+        if usable_m < 0:
+            continue
+        if number == len(ends_m) - 2:
+            count = math.ceil(usable_m / spacing_m - 1e-9) + 1
+            along = np.linspace(first_m + margin_m, last_m - margin_m, count)
+        else:
+            # The next tag is as far behind the turn as the first one is behind this one.
+            count = max(1, math.ceil((last_m - first_m) / spacing_m - 1e-9))
+            along = first_m + margin_m + (last_m - first_m) / count * np.arange(count)
+            along = along[along <= last_m - margin_m + TOLERANCE_M]
+        check_tag_count(len(places) + count)
+        places += along.tolist()
+    position_m, heading = route.at(np.array(places))
+    headings = np.append(route.heading_rad, route.heading_rad[-1]).tolist()
+    points = [
+        replace(point, heading_rad=angle)
+        for point, angle in zip(waypoints, headings, strict=True)
+        if point.tag_id is not None or point.meaning
+    ]
+    size_m = tags.order * tags.spacing_m
+    for place, (x_m, y_m), angle in zip(places, position_m.tolist(), heading.tolist(), strict=True):
+        if all(math.hypot(x_m - p.x_m, y_m - p.y_m) >= size_m - TOLERANCE_M for p in points):
+            points.append(SitePoint(x_m, y_m, angle, name=f"{place:.3g} m along the route"))
+    return route, points
+
+
+def plan_route(
+    tags: Tags,
+    waypoints: Sequence[SitePoint],
+    use: ReadingConditions | None = None,
+    noise: OdometryNoise | None = None,
+    position_m: float = math.inf,
+    heading_rad: float = math.inf,
+    *,
+    laying: tuple[float, float] | None = None,
+) -> tuple[list[SitePoint], SpacingPlan]:
+    """Return points for tags along a route with a wanted accuracy, and the plan of their spacing.
+
+    It begins with the spacing for a straight route, which is reduced until the forecast for this
+    route (turns, tags that are not passed) has the accuracy, too. If that is impossible, the
+    points are those of the smallest spacing.
+
+    The parameters and errors are those of :func:`spacing_for_accuracy` and :func:`route_points`.
+    """
+    plan = spacing_for_accuracy(tags, use, noise, position_m, heading_rad, laying=laying)
+    smallest_m = pass_separation(tags, use)
+    if math.isnan(smallest_m):
+        return [], plan
+
+    def forecast(spacing_m: float) -> tuple[list[SitePoint], SiteForecast]:
+        route, points = route_points(tags, waypoints, spacing_m)
+        site = {k: PlanarPose(p.x_m, p.y_m, p.heading_rad) for k, p in enumerate(points)}
+        trial = replace(tags, site=site, built={}, site_sigma={}, ids=None)
+        return points, forecast_routes(trial, [route], use, noise, laying=laying)
+
+    def is_enough(result: SiteForecast) -> bool:
+        missed = any(forecast.missed for forecast in result.routes)
+        return (
+            result.position_p95_m <= position_m
+            and result.heading_p95_rad <= heading_rad
+            and not missed
+        )
+
+    low_m, high_m = smallest_m, plan.spacing_m
+    points, result = forecast(high_m)
+    if is_enough(result):
+        plan = replace(plan, is_feasible=True, remedies=())
+    elif plan.is_feasible:
+        points, result = forecast(low_m)
+        limit = "heading" if result.heading_p95_rad > heading_rad else "position"
+        remedy = (
+            "turns, and the stretches beside them without a tag, limit the accuracy: take a route "
+            "with fewer turns, or calibrate the odometry"
+        )
+        is_feasible = is_enough(result)
+        while is_feasible and high_m > ROUTE_SPACING_RATIO * low_m:
+            middle_m = math.sqrt(low_m * high_m)
+            middle_points, middle = forecast(middle_m)
+            if is_enough(middle):
+                low_m, points, result = middle_m, middle_points, middle
+            else:
+                high_m = middle_m
+        plan = replace(plan, is_feasible=is_feasible, spacing_m=low_m)
+        if not is_feasible:
+            plan = replace(plan, limited_by=limit, remedies=(remedy,))
+    plan = replace(
+        plan, position_p95_m=result.position_p95_m, heading_p95_rad=result.heading_p95_rad
+    )
+    return points, plan
