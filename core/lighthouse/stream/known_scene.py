@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from locatk.core.lighthouse.calibration import Calibration, ideal_angles
 from locatk.core.lighthouse.epochs import MAX_PLANE_DELAY_TURNS, MIN_PLANE_DELAY_TURNS
-from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD
+from locatk.core.lighthouse.localization.photodiodes import MAX_MOUNTING_SIGMAS, mounting_sigma
+from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD, INLIER_GATE_RAD
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene.designed_frame import is_design
 from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
 from locatk.core.lighthouse.scene.scene_errors import SceneErrors
 
@@ -88,6 +90,9 @@ class KnownScene:
     errors : SceneErrors
     min_stations : int
         Fewest stations that determine the position of a photodiode.
+    max_gate_rad : float
+        Largest residual of a consistent fix: wider for designed stations, which are beside their
+        poses.
     calibration_sigma_rad : float
         Standard deviation of the angles that generic calibrations add; 0 if there are none. A floor
         homography absorbs their errors, and the covariance of a scene may contain them.
@@ -104,6 +109,7 @@ class KnownScene:
     floor_map: Array | None
     errors: SceneErrors
     min_stations: int
+    max_gate_rad: float
     calibration_sigma_rad: float
     excluded: set[int] = field(default_factory=set)
 
@@ -116,6 +122,13 @@ class KnownScene:
         errors = SceneErrors(scene, stations, floor_z)
         is_generic = any(s.calibration.is_generic for s in stations)
         has_generic_error = is_generic and floor_map is None and not errors.has_calibration
+        max_gate_rad = INLIER_GATE_RAD
+        if is_design(scene):
+            working_m = np.array([np.median([s.position for s in stations], axis=0)])
+            working_m[:, 2] = scene.floor_z
+            max_gate_rad = max(
+                max_gate_rad, MAX_MOUNTING_SIGMAS * mounting_sigma(stations, working_m)
+            )
         return cls(
             scene,
             stations,
@@ -126,5 +139,6 @@ class KnownScene:
             floor_map,
             errors,
             1 if scene.planar or floor_map is not None else 2,
+            max_gate_rad,
             CALIBRATION_SIGMA_RAD if has_generic_error else 0.0,
         )

@@ -189,7 +189,7 @@ class PhotodiodeFixes:
     ) -> None:
         self.known = known
         self.due: list[DueFix] = []
-        self.sigma_rad, self.gate_rad = INITIAL_SIGMA_RAD, INLIER_GATE_RAD
+        self.sigma_rad, self.gate_rad = INITIAL_SIGMA_RAD, known.max_gate_rad
         self.used = [0] * len(known.stations)
         self.residual = [deque[float](maxlen=NOISE_FIXES) for _ in known.stations]
         self._reject = count_rejected
@@ -504,6 +504,8 @@ class PhotodiodeFixes:
         """Estimate the noise of an angle and the gate from the last fixes, as offline."""
         if self._new_fixes < MIN_NOISE_FIXES:
             return
+        if self.known.max_gate_rad > INLIER_GATE_RAD:
+            return  # Residuals of designed stations are those of their poses.
         if sum(redundancy > 0 for _, redundancy in self._noise) < MIN_NOISE_FIXES:
             return
         self._new_fixes = 0
@@ -531,5 +533,5 @@ class PhotodiodeFixes:
     def moved_to(self, known: KnownScene) -> PhotodiodeFixes:
         """Return the fixes in another scene; sweeps of stations that both have are kept."""
         new = PhotodiodeFixes(known, self._reject, self._observe)
-        new.sigma_rad, new.gate_rad = self.sigma_rad, INLIER_GATE_RAD
+        new.sigma_rad = self.sigma_rad
         return new

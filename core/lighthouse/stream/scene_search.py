@@ -14,10 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import DegenerateError
 from locatk.core.geometry import Similarity, umeyama
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.designed_frame import is_design
 from locatk.core.lighthouse.solver import SolveOptions, solve
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -54,7 +56,7 @@ ODOMETRY_INTERVAL_NS = 100_000_000
 MAX_ODOMETRY_POSES = 6_000
 """Largest number of poses of odometry that are kept of a device: ten minutes."""
 
-SCALE_RANK = {"unit": 0, "odometry": 1, "device": 1, "distance": 2, "markers": 2}
+SCALE_RANK = {"unit": 0, "odometry": 1, "device": 1, "design": 1, "distance": 2, "markers": 2}
 """Rank of the sources of the scale of a scene; a higher one is better."""
 
 Row = tuple[int, int, int, int, int, int, float]
@@ -90,6 +92,9 @@ def estimate_live_scene(
         The sweeps do not determine the scene. The message states what is missing.
     """
     solution = solve(sweeps, prior, options, odometry, receivers)
+    if is_design(solution.artifact):
+        (reason,) = [w for w in solution.warnings if w.code == "designed_poses_used"]
+        raise DegenerateError(reason.message)
     return SceneResult(solution.artifact, solution.warnings)
 
 

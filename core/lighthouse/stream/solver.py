@@ -14,6 +14,7 @@ from locatk.core.lighthouse.devices.device_sweeps import MIN_SENSORS
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.lighthouse.scene.designed_frame import is_design, with_mounting_tolerance
 from locatk.core.lighthouse.scene.estimation import direction_only_warning
 from locatk.core.lighthouse.solver import SolveOptions
 from locatk.core.lighthouse.stream.known_scene import KnownScene
@@ -85,7 +86,8 @@ class LighthouseStream(Stream):
     ----------
     scene : Scene, optional
         With stations: they are used as they are. Without, they are estimated in the background;
-        markers, distances and calibrations of the scene are used for it.
+        markers, distances and calibrations of the scene are used for it. Those of a design
+        (``frame_source`` is ``"design"``) are used until then, with their mounting tolerance.
     receiver_of : callable, optional
         Returns the receiver of a device, or None; called at its first sweep.
     options : SolveOptions, optional
@@ -128,9 +130,11 @@ class LighthouseStream(Stream):
         self._next_attempt_ns = FIRST_ATTEMPT_NS
         self._is_task_due = self._is_task_running = False
         self._detected_sweeps = 0
-        if self._prior.stations:
+        if is_design(self._prior):
+            self._use_scene(with_mounting_tolerance(self._prior))
+        elif self._prior.stations:
             self._use_scene(self._prior)
-        else:
+        if self._known is None or self._is_provisional:
             self._store = SweepStore()
 
     @property
@@ -299,7 +303,7 @@ class LighthouseStream(Stream):
         self._rigid.update_noise()
         for warning in self._supervision.check_hidden(now_ns):
             self._events.append(WarningEvent("", now_ns, warning))
-        if self._ticks % MOVED_CHECK_TICKS == 0:
+        if self._ticks % MOVED_CHECK_TICKS == 0 and not self._is_provisional:
             warnings = self._supervision.check_moved(self._rigid)
             self._events.extend(WarningEvent("", now_ns, warning) for warning in warnings)
         if self._ticks % DETECTION_TICKS == 0:
@@ -347,6 +351,11 @@ class LighthouseStream(Stream):
         if len(known.stations) < known.min_stations:
             self._warn(direction_only_warning(known.stations[0].channel))
 
+    @property
+    def _is_provisional(self) -> bool:
+        """True if the stations in use are designed poses."""
+        return self._known is not None and is_design(self._known.scene)
+
     def _reject(self, reason: str, number: int) -> None:
         self._rejected[reason] += number
 
@@ -379,35 +388,36 @@ class LighthouseStream(Stream):
         self._next_attempt_ns = self._following_attempt(now_ns - self._start_ns)
         if isinstance(result, LocatkError):
             hint = f" ({result.hint})" if result.hint else ""
-            self._warn(
-                SolverWarning("scene_not_estimated", f"no scene yet: {result.message}{hint}")
-            )
+            state = "the designed poses are in use" if self._is_provisional else "no scene yet"
+            self._warn(SolverWarning("scene_not_estimated", f"{state}: {result.message}{hint}"))
         elif isinstance(result, BaseException):
             raise result
         else:
             self._adopt(result, now_ns)
-        if self._known is not None and now_ns - self._start_ns > LAST_ATTEMPT_NS:
+        is_found = self._known is not None and not self._is_provisional
+        if is_found and now_ns - self._start_ns > LAST_ATTEMPT_NS:
             self._store = None
         return self._take_events()
 
     def _following_attempt(self, elapsed_ns: int) -> int:
         """Return the time since the start of the next attempt."""
         interval_ns = max(FIRST_ATTEMPT_NS, round((INTERVAL_GROWTH - 1.0) * elapsed_ns))
-        if self._known is None:
+        if self._known is None or self._is_provisional:
             interval_ns = min(interval_ns, MAX_INTERVAL_NS)
         return elapsed_ns + interval_ns
 
     def _adopt(self, result: SceneResult, now_ns: int) -> None:
         """Use the scene of a result, in the frame of the one before, if it is better."""
         scene, old = result.scene, self.scene
-        if old is not None:
+        if old is not None and not is_design(old):
             if not is_better(scene, old):
                 return
             scene = align_scene(scene, old)
         self._flush()
         self.version += 1
         self._use_scene(scene)
-        reason = "estimated from the first sweeps" if old is None else "refined with later sweeps"
+        is_first = old is None or is_design(old)
+        reason = "estimated from the first sweeps" if is_first else "refined with later sweeps"
         self._events.append(ArtifactUpdate(now_ns, self.version, scene, reason))
         for warning in result.warnings:
             self._warn(warning)

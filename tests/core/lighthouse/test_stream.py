@@ -496,6 +496,72 @@ def test_what_a_scene_lacks_is_said_once() -> None:
     assert not fixes_of(events)
 
 
+def as_design(session: SimulatedSession, seed: int) -> Scene:
+    """Return the true stations, beside which these were mounted within 20 mm and 1.5 degrees."""
+    rng = np.random.default_rng(seed)
+    sigma = np.repeat([0.02, np.radians(1.5)], 3)
+    stations = []
+    for station in session.true_scene.stations:
+        error = rng.normal(0, sigma)
+        position = station.position + error[:3]
+        rotation = rotation_exp(error[3:]) @ station.rotation
+        stations.append(replace(station, position=position, rotation=rotation, covariance=None))
+    return Scene(tuple(stations), planar=True, scale="design", frame="room", frame_source="design")
+
+
+def test_designed_stations_are_used_until_they_are_estimated() -> None:
+    session = simulated(
+        replace(PHOTODIODES, outliers=0.0, planar=True, report_hz=10.0, duration_s=10.0)
+    )
+    stream = LighthouseStream(as_design(session, 1))
+    events: list[StreamEvent] = []
+    for piece in cut(session.sweeps):
+        events += stream.push(piece)
+        task = stream.background_task()
+        if task is not None:
+            events += stream.complete(task, task.function(*task.arguments))
+    (update,) = [e for e in events if isinstance(e, ArtifactUpdate)]
+    fixes = fixes_of(events)
+    before = [f for f in fixes if f.time_ns < update.time_ns]
+    after = [f for f in fixes if f.time_ns > update.time_ns]
+    assert {f.frame for f in fixes} == {"room"}
+    assert len(before) > 0.5 * len(after)
+    assert before[0].time_ns - session.sweeps.time_ns[0] < 0.5e9
+    for chosen in (before, after):
+        error = errors_of(session, chosen)[:, :2]
+        own = np.array([f.covariance[:2, :2] for f in chosen])
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(own), error) / 2
+        if chosen is before:
+            assert np.mean(nees) < 3  # One draw of the mounting, common to all.
+            assert np.median(np.sqrt(own[:, 0, 0])) > 0.01
+    spread = [np.std(errors_of(session, chosen)[:, :2], axis=0).max() for chosen in (before, after)]
+    assert spread[1] < 0.006 < spread[0]
+    assert not {"station_contradicts_others", "scene_contradicted"} & set(codes(events))
+    assert "frame_of_design" in codes(events)
+
+
+def test_designed_stations_stay_in_use_if_they_cannot_be_estimated() -> None:
+    session = simulated(
+        replace(PHOTODIODES, outliers=0.0, planar=True, stations=1, report_hz=10.0, duration_s=7.0)
+    )
+    stream = LighthouseStream(as_design(session, 2))
+    events: list[StreamEvent] = []
+    for piece in cut(session.sweeps):
+        events += stream.push(piece)
+        task = stream.background_task()
+        if task is not None:
+            with pytest.raises(DegenerateError) as error:
+                task.function(*task.arguments)
+            events += stream.complete(task, error.value)
+    assert len(fixes_of(events)) > 60
+    (warning,) = [
+        e.warning
+        for e in events
+        if isinstance(e, WarningEvent) and e.warning.code == "scene_not_estimated"
+    ]
+    assert "designed poses" in warning.message
+
+
 def test_notes_of_a_scene_are_said_with_the_first_sweep() -> None:
     session = simulated(PHOTODIODES)
     scene = replace(session.true_scene, notes=("stations were measured by hand",))
