@@ -241,6 +241,9 @@ def _existing_setting(kind: FilePath) -> Callable[[click.Context, click.Paramete
     """Return the callback that demands that the file of a setting exists."""
 
     def callback(ctx: click.Context, parameter: click.Parameter, value: Any) -> Any:
+        if isinstance(value, tuple):
+            options.must_exist(list(map(Path, value)))
+            return value
         return value if value in kind.names else _existing_file(ctx, parameter, value)
 
     return callback

@@ -115,6 +115,8 @@ UNITS = {
     "_percent": Unit("percent"),
     "_pitches": Unit("pitches"),
     "_udeg": Unit("microdegrees"),
+    "_mw": Unit("mW", Decimal("1e-3"), "_w"),
+    "_wh": Unit("Wh"),
     "_fraction": Unit("fraction"),
 }
 """Endings of keys and their units. Percentages and microdegrees are converted by their users."""

@@ -1,22 +1,52 @@
-"""Prices of the parts of bills of materials, ``prices.toml``, which users edit."""
+"""Prices of parts and minutes of work, ``prices.toml``, which users edit."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass, field
 from typing import Any
 
+from locatk.core.advice.work import WORK_MINUTES
 from locatk.core.landmarks.design.materials import PARTS as LANDMARK_PARTS
 from locatk.core.materials import Price
 from locatk.core.polaris.design.materials import PARTS as TAG_PARTS
 from locatk.core.polaris.design.materials import PUBLISHED_PRICES
-from locatk.formats.artifacts.kinds import InvalidValueError, Number, Text, nearest_key_hint
-from locatk.formats.artifacts.schema import Artifact, Key, Table, Tables, Values
+from locatk.formats.artifacts.kinds import (
+    InvalidValueError,
+    Number,
+    Text,
+    nearest_key_hint,
+)
+from locatk.formats.artifacts.schema import (
+    Artifact,
+    Key,
+    Table,
+    Tables,
+    Values,
+    refuse_repeated,
+)
 
 PARTS = (*TAG_PARTS, *LANDMARK_PARTS)
 """Parts that can have a price."""
 
 Prices = dict[str, Price]
 """Prices by part."""
+
+
+@dataclass(frozen=True)
+class PriceList:
+    """Content of ``prices.toml``.
+
+    Attributes
+    ----------
+    parts : dict of str to Price
+    work_minutes : dict of str to float
+        Minutes of the pieces of work that the file states, as in
+        :data:`~locatk.core.advice.work.WORK_MINUTES`.
+    """
+
+    parts: Prices = field(default_factory=dict)
+    work_minutes: dict[str, float] = field(default_factory=dict)
 
 
 def _item_of(values: Values) -> Values:
@@ -30,38 +60,36 @@ def _item_of(values: Values) -> Values:
     return values
 
 
-def _prices_of(values: Values) -> Prices:
-    items = values["parts"]
-    names = [item["part"] for item in items]
-    for number, name in enumerate(names):
-        if name in names[:number]:
-            raise InvalidValueError(
-                f"{name!r} occurs twice", f"parts[{number}]", "Keep one of the two"
-            )
+def _step_of(values: Values) -> Values:
+    if values["step"] not in WORK_MINUTES:
+        hint = nearest_key_hint(values["step"], WORK_MINUTES)
+        raise InvalidValueError(f"no step {values['step']!r}", "step", hint)
+    return values
+
+
+def _prices_of(values: Values) -> PriceList:
+    refuse_repeated((item["part"] for item in values["parts"]), "parts", "part")
+    refuse_repeated((item["step"] for item in values["work"]), "work", "step")
     prices = {
         item["part"]: Price(item["price"], item["currency"], item["date"], item["source"])
-        for item in items
+        for item in values["parts"]
         if item["price"] is not None
     }
-    currencies = sorted({price.currency for price in prices.values()})
-    if len(currencies) > 1:
-        raise InvalidValueError(
-            f"prices in {' and '.join(currencies)}", "parts", "Convert all prices to one currency"
-        )
-    return prices
+    return PriceList(prices, {item["step"]: item["minutes"] for item in values["work"]})
 
 
-def _values_of(prices: Prices) -> dict[str, Any]:
+def _values_of(prices: PriceList) -> dict[str, Any]:
     unknown = {"price": None, "currency": "", "date": "", "source": ""}
     rows = []
     for part in PARTS:
-        price = prices.get(part)
+        price = prices.parts.get(part)
         known = unknown if price is None else {**vars(price), "price": price.amount}
         rows.append({"part": part, **known})
-    return {"parts": rows}
+    work = [{"step": step, "minutes": value} for step, value in prices.work_minutes.items()]
+    return {"parts": rows, "work": work}
 
 
-PRICES: Artifact[Prices] = Artifact(
+PRICES: Artifact[PriceList] = Artifact(
     "prices.toml",
     "locatk-prices",
     Table(
@@ -79,7 +107,7 @@ PRICES: Artifact[Prices] = Artifact(
                                 default=None,
                                 default_text="unknown",
                             ),
-                            Key("currency", Text(), "as in `USD`; one for all parts", default=""),
+                            Key("currency", Text(), "as in `USD`", default=""),
                             Key("date", Text(), "day, month or year of the price", default=""),
                             Key("source", Text(), "shop or document of the price", default=""),
                         ),
@@ -87,22 +115,40 @@ PRICES: Artifact[Prices] = Artifact(
                     )
                 ),
             ),
+            Key(
+                "work",
+                Tables(
+                    Table(
+                        (
+                            Key("step", Text(is_blank_allowed=False), "work of an installation"),
+                            Key(
+                                "minutes",
+                                Number(0.0, hint="Give 0 or more minutes"),
+                                "minutes for one piece",
+                            ),
+                        ),
+                        _step_of,
+                    )
+                ),
+                default=(),
+            ),
         ),
         _prices_of,
         _values_of,
     ),
-    comment="Prices of one piece: enter price, currency, date and source of the parts you buy.",
+    comment="Prices of one piece: enter price, currency, date and source of the parts you buy.\n"
+    "Work: minutes for one piece of each step, used by `locatk advise`.",
 )
 """Prices as a file."""
 
 
 def prices_template() -> str:
-    """Return the text of a file with all parts, and the prices that the papers state."""
-    return PRICES.dumps(PUBLISHED_PRICES)
+    """Return the text of a file with all parts and steps of work, and the published prices."""
+    return PRICES.dumps(PriceList(PUBLISHED_PRICES, WORK_MINUTES))
 
 
-def read_prices(path: str | os.PathLike[str] | None) -> Prices | None:
-    """Read a file of prices; return None if there is none.
+def read_price_list(path: str | os.PathLike[str] | None) -> PriceList | None:
+    """Read a file of prices and minutes of work; return None if there is none.
 
     Raises
     ------
@@ -110,3 +156,9 @@ def read_prices(path: str | os.PathLike[str] | None) -> Prices | None:
         See :meth:`locatk.formats.artifacts.schema.Artifact.read`.
     """
     return None if path is None else PRICES.read(path)
+
+
+def read_prices(path: str | os.PathLike[str] | None) -> Prices | None:
+    """Read the prices of a file as :func:`read_price_list`; return None if there is none."""
+    prices = read_price_list(path)
+    return None if prices is None else prices.parts

@@ -320,7 +320,9 @@ def refuse_repeated(values: Iterable[Any], table: str, key: str) -> None:
     for number, value in enumerate(values):
         if value in known:
             shown = list(value) if isinstance(value, tuple) else value
-            raise InvalidValueError(f"{shown!r} occurs twice", f"{table}[{number}].{key}")
+            raise InvalidValueError(
+                f"{shown!r} occurs twice", f"{table}[{number}].{key}", "Keep one of the two"
+            )
         known.add(value)
 
 

@@ -22,7 +22,7 @@ from typing import Any
 
 from locatk.core.errors import InputError
 from locatk.formats.artifacts import toml
-from locatk.formats.artifacts.kinds import FilePath, Number
+from locatk.formats.artifacts.kinds import FilePath, ListOf, Number
 from locatk.formats.artifacts.schema import Key, Table, header, parse_document
 from locatk.formats.artifacts.toml import Inline
 from locatk.formats.simulation.settings import NO_DEFAULT, Requirement, Setting
@@ -54,6 +54,10 @@ class SimulationConfig:
     conflicts : tuple of (keys, keys)
         None of the first keys can be set together with one of the second; false counts as not set.
     requirements : tuple of Requirement
+    command : str
+        Command that reads the file; by default that of the simulator.
+    format : str
+        Key ``format`` of the file; by default that of the simulator.
     """
 
     system: str
@@ -61,6 +65,8 @@ class SimulationConfig:
     defaults: object
     conflicts: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()
     requirements: tuple[Requirement, ...] = ()
+    command: str = ""
+    format: str = ""
 
     # ---- declaration
 
@@ -110,7 +116,7 @@ class SimulationConfig:
         """Return the TOML file: every key with a comment, commented out if it is not set."""
         settings = settings or {}
         lines = [
-            f"# Settings of `locatk simulate {self.system} --config FILE`.",
+            f"# Settings of `{self.command or f'locatk simulate {self.system} --config FILE'}`.",
             "# A key after # has its default, or an example of a value. Remove the # to set it.",
             "# Options of the command line override this file.",
             *toml.dumps(header(self._format, FORMAT_VERSION)).splitlines(),
@@ -158,7 +164,7 @@ class SimulationConfig:
 
     @property
     def _format(self) -> str:
-        return f"locatk-simulation-{self.system}"
+        return self.format or f"locatk-simulation-{self.system}"
 
     def _parse(
         self, data: dict[str, Any], file: str | os.PathLike[str], folder: Path
@@ -170,6 +176,8 @@ class SimulationConfig:
             if value is not None:
                 if isinstance(setting.kind, FilePath):
                     value = setting.kind.resolve(value, folder)
+                elif isinstance(setting.kind, ListOf) and isinstance(setting.kind.item, FilePath):
+                    value = tuple(setting.kind.item.resolve(path, folder) for path in value)
                 settings[setting.key] = value
         return settings
 
@@ -253,11 +261,14 @@ class SimulationConfig:
 
     def files(self, settings: Mapping[str, Any]) -> list[Path]:
         """Return the files that settings name."""
-        return [
-            Path(value)
-            for key, value in settings.items()
-            if isinstance(kind := self.setting(key).kind, FilePath) and value not in kind.names
-        ]
+        files: list[Path] = []
+        for key, value in settings.items():
+            kind = self.setting(key).kind
+            if isinstance(kind, FilePath):
+                files += [Path(value)] if value not in kind.names else []
+            elif isinstance(kind, ListOf) and isinstance(kind.item, FilePath):
+                files += map(Path, value)
+        return files
 
 
 def _is_set(settings: Mapping[str, Any], key: str) -> bool:

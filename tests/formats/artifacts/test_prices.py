@@ -45,7 +45,7 @@ def test_the_template_has_every_part_and_the_published_prices(tmp_path: Path) ->
 
 
 def test_bills_are_added() -> None:
-    prices = PRICES.loads(HEAD + part("bar magnet", 0.5) + part("compass", 9))
+    prices = PRICES.loads(HEAD + part("bar magnet", 0.5) + part("compass", 9)).parts
     items = with_prices(
         [BillItem("bar magnet", 80, ""), BillItem("bar magnet, spare", 4, "")], prices
     )
@@ -60,7 +60,7 @@ def test_bills_are_added() -> None:
 
 
 def test_a_file_of_prices_replaces_all_published_ones(tmp_path: Path) -> None:
-    prices = PRICES.loads(HEAD + part("glue", 4.0))
+    prices = PRICES.loads(HEAD + part("glue", 4.0)).parts
     items = with_prices(tag_bill(Tags(), 9, "MLX90393"), prices)
     assert [item.part for item in items if item.price is not None] == ["glue"]
     path = tmp_path / "bill.csv"
@@ -77,7 +77,8 @@ def test_a_file_of_prices_replaces_all_published_ones(tmp_path: Path) -> None:
         (part("glue", -1), "at least 0"),
         (part("glue", 1).replace("price", "prise"), "unknown key 'prise'"),
         (part("glu", 1), "no part 'glu'"),
-        (part("glue", 1) + part("compass", 1, "USD"), "prices in EUR and USD"),
+        (part("glue", 1) + '[[work]]\nstep = "lay a shee"\nminutes = 3\n', "no step"),
+        (part("glue", 1) + '[[work]]\nstep = "lay a sheet"\nminutes = -3\n', "at least 0"),
         (part("glue", 1) + part("glue", 2), "glue"),
         (part("glue", 1, date=""), "needs its date"),
         (part("glue", float("nan")), "finite"),

@@ -1,0 +1,1 @@
+"""Comparison of the four systems for a task, before anything is bought."""

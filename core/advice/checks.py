@@ -1,0 +1,86 @@
+"""Checks that several systems share, and the surroundings that magnets and light suffer from."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from locatk.core.advice.answer import Certainty, Check
+from locatk.core.advice.task import Task
+
+IRON_FIELDS_T = {"none": 0.0, "reinforced": 3e-6, "plates": 30e-6}
+"""Standard deviation [T] of the field of iron in the floor over a few centimetres. Reinforced: see
+:data:`locatk.core.polaris.design.environment.REINFORCED`. Plates: magnetised steel a few
+centimetres below the sensors differs by tens of microtesla from place to place; an assumption."""
+
+MOTOR_FIELD_T = 2.6e-6
+"""Standard deviation [T] of the field of motors during a pass, see
+:data:`locatk.core.polaris.design.environment.MOTORS`."""
+
+MIN_COVERAGE = 0.95
+"""Fraction of area or routes on which a position must be known."""
+
+
+def limit_check(
+    name: str,
+    unit: str,
+    expected: float,
+    wanted: float | None,
+    certainty: Certainty,
+    source: str,
+    remedy: str = "",
+    *,
+    better: Literal["lower", "higher"] = "lower",
+) -> Check:
+    """Return the check of a number; it is met if nothing is wanted or it is on the better side."""
+    is_met = None
+    if wanted is not None:
+        is_met = expected <= wanted if better == "lower" else expected >= wanted
+        is_met = is_met and not math.isnan(expected)
+    return Check(name, unit, expected, wanted, is_met, certainty, source, remedy)
+
+
+def condition_check(
+    name: str,
+    is_met: bool,
+    expected: str,
+    source: str,
+    remedy: str = "",
+    certainty: Certainty = "published",
+) -> Check:
+    """Return the check of a condition that is no number."""
+    return Check(name, "", expected, None, is_met, certainty, source, remedy)
+
+
+def magnetic_checks(task: Task, what: str) -> list[Check]:
+    """Return the checks of iron and of flight that both magnetic systems have."""
+    checks = [
+        condition_check(
+            "iron",
+            task.iron != "plates",
+            f"steel plates hide and distort the fields of {what}"
+            if task.iron == "plates"
+            else "fields of iron are part of the forecast",
+            "flux follows iron of high permeability (Jackson, Classical Electrodynamics, 5.12)",
+            "A floor without steel plates or rails within 0.1 m of the magnets",
+        )
+    ]
+    if task.is_flying:
+        checks.append(driving_check(what))
+    return checks
+
+
+def driving_check(what: str) -> Check:
+    """Return the check that fails for robots in space over infrastructure in the floor."""
+    return condition_check(
+        "robots in space",
+        False,
+        f"{what} are read from a few millimetres to centimetres only",
+        "ranges of the sensors in the papers",
+        "Robots that drive",
+    )
+
+
+def disturbance_t(task: Task) -> float:
+    """Return the standard deviation [T] of fields that vary during a pass."""
+    return math.hypot(IRON_FIELDS_T[task.iron], MOTOR_FIELD_T * task.has_motors)

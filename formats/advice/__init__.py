@@ -1,0 +1,1 @@
+"""Tasks as files, and answers to them, of ``locatk advise``."""
