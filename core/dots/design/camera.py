@@ -1,0 +1,837 @@
+"""Design of a camera over printed dots: optics, exposure, read rate and accuracy before buying.
+
+All figures are closed forms of the setup; no frame is rendered. The lens is thin: an object at the
+distance s is in focus at v = 1 / (1 / f - 1 / s) behind it, magnified by v / s.
+:func:`~locatk.core.dots.design.camera_measurement.measure_camera` renders frames of the same setup
+and decodes them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+from locatk.core.dots.design.camera_materials import camera_materials
+from locatk.core.dots.design.dot_noise import ROUNDING_VARIANCE, DotImage, dot_error
+from locatk.core.dots.design.pose_accuracy import PoseAccuracy, pose_accuracy
+from locatk.core.dots.design.read_rate import (
+    MAX_BLUR_PITCHES,
+    MAX_MOTION_PITCHES,
+    MAX_SHEAR,
+    MIN_PX_PER_PITCH,
+    read_rate,
+    searched_levels,
+)
+from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
+from locatk.core.errors import InputError
+from locatk.core.materials import BillItem
+from locatk.core.units import length_text
+
+MIN_WINDOW_DOTS = 8
+"""Columns and rows of the smallest window that is decoded (Hostettler et al. 2016, II-B.6)."""
+
+GOOD_WINDOW_DOTS = 12
+"""Columns and rows with which missing and wrong dots do no harm."""
+
+PAPER_LEVEL = 210.0
+"""Grey value of paper in a well exposed frame of 8 bits."""
+
+MAX_LEVEL = 255.0
+
+
+EXPOSURE_MOTION_PITCHES = 1 / 11
+"""Motion during a chosen exposure: one pixel of the paper's camera, whose pitch is 11 px."""
+
+LUMEN_PHOTONS_PER_S = 4.09e15
+"""Photons of one lumen at 555 nm: 1 / 683 W over the energy of a photon, 3.58e-19 J (SI: candela).
+"""
+
+QUANTUM_EFFICIENCY = 0.5
+"""Electrons per photon at the peak of common CMOS sensors, if the data sheet does not give it."""
+
+PAPER_REFLECTANCE = 0.8
+LENS_TRANSMITTANCE = 0.9
+
+AIRY_DIAMETER, AIRY_SIGMA = 2.44, 0.42
+"""Diameter of the first dark ring, and standard deviation of the Gaussian that fits the middle of
+the diffraction pattern, in wavelength times working f-number (Hecht, Optics, 10.2.5)."""
+
+DECODING_S_PER_PX = 0.29e-3 / (188 * 120)
+"""Time to decode a frame per pixel of the image that is searched: 0.29 ms for a frame of the paper
+on a core of a PC (`locatk bench dots`)."""
+
+PRINT_SIGMA_M = 0.09e-3
+"""Error of positions on an uncalibrated laser print within 200 mm, standard deviation per axis: the
+largest errors of 121 positions of the paper, 0.155 mm across and 0.273 mm along the feed (Table
+III), are 2.5 standard deviations; the mean square of both axes. `locatk calibrate printer` and
+`calibrate sheet` remove most of it."""
+
+STANDARD_FOCAL_LENGTHS_M = (
+    1.8e-3, 2.1e-3, 2.5e-3, 2.8e-3, 3.6e-3, 4e-3, 5.5e-3, 6e-3, 8e-3, 12e-3, 16e-3,
+)  # fmt: skip
+"""Focal lengths in which lenses with an M12 thread are sold."""
+
+PREFERRED_DISTANCE_M = 0.020
+"""Distance from lens to paper if it can be chosen: a robot of low height, and room for the LEDs."""
+
+MAX_SIDE_M = 10.0
+"""Larger distances are probably in another unit."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Image sensor.
+
+    Attributes
+    ----------
+    name : str
+    size_px : (width, height)
+    pixel_m : float
+        Width of a pixel.
+    max_fps : float
+        Frame rate at full size.
+    shutter : {"global", "rolling"}
+    is_colour : bool
+    max_snr_db : float
+        Signal to noise ratio at saturation, 10 log10 of the full well in electrons: 38 dB are 6300.
+    dynamic_range_db : float
+        20 log10 of the full well over the read noise.
+    min_exposure_s : float
+    source : str
+        Data sheet.
+    """
+
+    name: str
+    size_px: tuple[int, int]
+    pixel_m: float
+    max_fps: float
+    shutter: str = "global"
+    is_colour: bool = False
+    max_snr_db: float = 38.0
+    dynamic_range_db: float = 60.0
+    min_exposure_s: float = 20e-6
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if min(self.size_px) < 1:
+            raise InputError(f"a sensor of {self.size_px[0]} x {self.size_px[1]} px")
+        if self.shutter not in ("global", "rolling"):
+            raise InputError(f"no shutter {self.shutter!r}", hint="Known: global, rolling")
+        _require(self, 0, 100e-6, "pixel_m", unit="um", scale=1e6)
+        _require(self, 0, 1e5, "max_fps")
+        _require(self, 0, 80, "max_snr_db", "dynamic_range_db")
+        _require(self, 0, 10, "min_exposure_s")
+
+    @property
+    def full_well_e(self) -> float:
+        """Electrons of a saturated pixel."""
+        return float(10 ** (self.max_snr_db / 10))
+
+    @property
+    def read_noise_e(self) -> float:
+        """Noise of a dark pixel in electrons."""
+        return float(self.full_well_e / 10 ** (self.dynamic_range_db / 20))
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Lens; ``distortion`` displaces a corner of the frame towards the centre, relative."""
+
+    focal_m: float
+    f_number: float = 2.4
+    distortion: float = 0.02
+
+    def __post_init__(self) -> None:
+        _require(self, 0, 1, "focal_m", unit="mm", scale=1e3)
+        _require(self, 0.5, 64, "f_number")
+        if not -0.35 <= self.distortion <= 0.35:
+            raise InputError(
+                f"a distortion of {self.distortion:g}", hint="Give a fraction from -0.35 to 0.35"
+            )
+
+
+@dataclass(frozen=True)
+class CameraSetup:
+    """Camera over a printed sheet.
+
+    Attributes
+    ----------
+    sensor : Sensor
+    lens : Lens
+    distance_m : float
+        From the lens (its principal plane) to the paper; the lens is focused there.
+    exposure_s : float
+    binning : int
+        Pixels of the sensor along each side of one pixel of the frame.
+    pitch_m : float
+        Distance of two positions of the printed grid.
+    dot_pitches : float
+        Diameter of a printed dot; the nominal 1/6 grows in print.
+    contrast : float
+        Contrast of the ink; 1 is black.
+    illuminance_lx : float or None
+        On the paper, at 555 nm; None: as much as the exposure needs.
+    noise_levels : float or None
+        Standard deviation of a pixel of paper in grey values, instead of that by the light.
+    lens_blur_m : float
+        Standard deviation of the blur by aberrations, on the sensor.
+    focus_error_m : float
+        Error of the distance: tolerances of the holder and waves of the paper.
+    tilt_rad : float
+        Angle between the optical axis and the vertical.
+    jitter_m : float
+        Standard deviation of the position of a printed dot, per axis.
+    wavelength_m : float
+    speed_mps, yaw_rate_rps : float
+        Largest speeds at which poses are wanted.
+    wanted_rate_hz : float
+        Poses per second.
+    is_calibrated : bool
+        The lens is known (`locatk calibrate camera`); otherwise it is estimated in each frame.
+
+    Raises
+    ------
+    InputError
+        A value is out of its range, or the lens cannot be focused on the paper.
+    """
+
+    sensor: Sensor
+    lens: Lens
+    distance_m: float
+    exposure_s: float
+    binning: int = 1
+    pitch_m: float = 0.508e-3
+    dot_pitches: float = 0.30
+    contrast: float = 0.75
+    illuminance_lx: float | None = None
+    noise_levels: float | None = None
+    lens_blur_m: float = 0.0
+    focus_error_m: float = 0.2e-3
+    tilt_rad: float = 0.0
+    jitter_m: float = 10e-6
+    wavelength_m: float = 850e-9
+    speed_mps: float = 0.0
+    yaw_rate_rps: float = 0.0
+    wanted_rate_hz: float = 30.0
+    is_calibrated: bool = True
+
+    def __post_init__(self) -> None:
+        _require(self, 0, MAX_SIDE_M, "distance_m", unit="mm", scale=1e3)
+        _require(self, 0, 10, "exposure_s")
+        _require(self, 0, 0.1, "pitch_m", unit="mm", scale=1e3)
+        _require(self, 0, 2 / 3, "dot_pitches")
+        _require(self, 0, 1, "contrast")
+        _require(self, 0, 1e-5, "wavelength_m", unit="nm", scale=1e9)
+        _require(self, 0, 1e5, "wanted_rate_hz")
+        for name in ("speed_mps", "yaw_rate_rps", "jitter_m", "lens_blur_m", "focus_error_m"):
+            if not 0 <= getattr(self, name) < 1e4:
+                raise InputError(f"{name} is {getattr(self, name):g}", hint="Give at least 0")
+        if self.illuminance_lx is not None:
+            _require(self, 0, 1e7, "illuminance_lx")
+        if self.noise_levels is not None and not 0 <= self.noise_levels <= MAX_LEVEL:
+            raise InputError(f"a noise of {self.noise_levels:g} grey values", hint="Give 0 to 255")
+        if not 0 <= self.tilt_rad <= math.pi / 4:
+            raise InputError(
+                f"a tilt of {math.degrees(self.tilt_rad):g} degrees", hint="Give 0 to 45 degrees"
+            )
+        if not 1 <= self.binning <= min(self.sensor.size_px):
+            raise InputError(f"a binning of {self.binning}", hint="Give 1, 2 or 4")
+        if self.distance_m <= 1.05 * self.lens.focal_m:
+            raise InputError(
+                f"a lens of {length_text(self.lens.focal_m)} cannot be focused on paper "
+                f"{length_text(self.distance_m)} in front of it",
+                hint=f"Give a distance above {length_text(2 * self.lens.focal_m)}, or a shorter "
+                "focal length",
+            )
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of a frame."""
+        width, height = self.sensor.size_px
+        return width // self.binning, height // self.binning
+
+    @property
+    def pixel_m(self) -> float:
+        """Width of a pixel of a frame on the sensor."""
+        return self.binning * self.sensor.pixel_m
+
+    @property
+    def image_distance_m(self) -> float:
+        """Distance from the lens to the sensor."""
+        return 1 / (1 / self.lens.focal_m - 1 / self.distance_m)
+
+    @property
+    def magnification(self) -> float:
+        """Size of the image over that of the paper."""
+        return self.image_distance_m / self.distance_m
+
+    @property
+    def metres_per_px(self) -> float:
+        """Width of a pixel on the paper."""
+        return self.pixel_m / self.magnification
+
+    @property
+    def field_m(self) -> tuple[float, float]:
+        """Width and height of the visible paper, without distortion."""
+        width, height = self.size_px
+        return width * self.metres_per_px, height * self.metres_per_px
+
+    @property
+    def corner_m(self) -> float:
+        """Distance on the paper from the centre of the frame to its corner."""
+        return math.hypot(*self.field_m) / 2
+
+    @property
+    def motion_m(self) -> float:
+        """Motion of the corner on the paper during the exposure, at most."""
+        return self.exposure_s * (self.speed_mps + self.yaw_rate_rps * self.corner_m)
+
+
+@dataclass(frozen=True)
+class CameraReport:
+    """Figures of a camera over dots.
+
+    Attributes
+    ----------
+    setup : CameraSetup
+    magnification : float
+    metres_per_px : float
+        Width of a pixel on the paper.
+    field_m : (width, height)
+    pixels_per_pitch : float
+    searched_px_per_pitch : float
+        In the image that the decoder searches, which is halved several times if the frame is large.
+    dots_in_view : (columns, rows)
+        With the grid parallel to the frame.
+    window_dots : int
+        Columns and rows of the largest square of dots that is in view in any direction.
+    used_dots : float
+        Number of dots of a frame that determine its pose.
+    image_distance_m : float
+        From the lens to the sensor.
+    near_m, far_m : float
+        Distances from the lens between which the dots are sharp enough to be decoded.
+    circle_of_confusion_m : float
+        Tolerated diameter of the blur on the sensor.
+    airy_px, blur_px : float
+        Diameter of the diffraction disc, and standard deviation of all blur but motion.
+    distortion_px : float
+        Displacement of the corner by the lens.
+    motion_px, rotation_px : float
+        Motion blur by the speed, and by the rotation at the corner.
+    one_pixel_speed_mps, one_pixel_yaw_rate_rps : float
+        Speeds with a motion blur of one pixel: by translation, and by rotation at the pixel in the
+        middle of the farther edge (paper, III-A.2).
+    max_exposure_s : float
+        Longest exposure with which the frames at the wanted speeds are decoded.
+    max_speed_mps, max_yaw_rate_rps : float
+        Largest speeds at which frames with this exposure are decoded, each without the other.
+    needed_illuminance_lx : float
+        On the paper, for a well exposed frame.
+    noise_levels : float
+        Standard deviation of a pixel of paper in grey values.
+    dot_sigma_m : float
+        Standard deviation of the position of a dot on the paper per axis, printer included.
+    position_sigma_m, heading_sigma_rad : float
+        Standard deviations of a pose of one frame, relative to the dots in view; position per axis.
+    absolute_position_sigma_m : float
+        Position per axis with the error of an uncalibrated print, :data:`PRINT_SIGMA_M`.
+    read_rate : float
+        Fraction of the frames that are decoded.
+    needed_fps : float
+        Frames per second for the wanted rate of poses.
+    pose_rate_hz : float
+        Poses per second at the largest frame rate.
+    pose_spacing_m : float
+        Distance between two poses at the wanted speed.
+    latency_s : float
+        From the middle of the exposure to the pose, on a PC.
+    materials : tuple of BillItem
+    warnings : tuple of str
+        Requirements that are not met, with figures and remedies.
+    """
+
+    setup: CameraSetup
+    magnification: float
+    metres_per_px: float
+    field_m: tuple[float, float]
+    pixels_per_pitch: float
+    searched_px_per_pitch: float
+    dots_in_view: tuple[int, int]
+    window_dots: int
+    used_dots: float
+    image_distance_m: float
+    near_m: float
+    far_m: float
+    circle_of_confusion_m: float
+    airy_px: float
+    blur_px: float
+    distortion_px: float
+    motion_px: float
+    rotation_px: float
+    one_pixel_speed_mps: float
+    one_pixel_yaw_rate_rps: float
+    max_exposure_s: float
+    max_speed_mps: float
+    max_yaw_rate_rps: float
+    needed_illuminance_lx: float
+    noise_levels: float
+    dot_sigma_m: float
+    position_sigma_m: float
+    heading_sigma_rad: float
+    absolute_position_sigma_m: float
+    read_rate: float
+    needed_fps: float
+    pose_rate_hz: float
+    pose_spacing_m: float
+    latency_s: float
+    materials: tuple[BillItem, ...] = field(repr=False)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def depth_of_field_m(self) -> float:
+        """Range of distances in which the dots are sharp enough."""
+        return self.far_m - self.near_m
+
+
+def design_camera(setup: CameraSetup) -> CameraReport:
+    """Predict optics, read rate and accuracy of a camera over dots."""
+    mpp = setup.metres_per_px
+    blur_px = static_blur_px(setup)
+    confusion_m = tolerated_confusion_m(setup)
+    near_m, far_m = focus_range(setup, confusion_m)
+    noise = noise_levels(setup)
+    quality = _frame_quality(setup, blur_px, noise)
+    corner_m = setup.corner_m
+    speed_px = setup.exposure_s * setup.speed_mps / mpp
+    rotation_px = setup.exposure_s * setup.yaw_rate_rps * corner_m / mpp
+    tolerated_m = MAX_MOTION_PITCHES * setup.pitch_m
+    speed_of_corner = setup.speed_mps + setup.yaw_rate_rps * corner_m
+    fps = frame_rate(setup)
+    decoding_s = DECODING_S_PER_PX * math.prod(setup.size_px) / 4**quality.level
+    report = CameraReport(
+        setup=setup,
+        magnification=setup.magnification,
+        metres_per_px=mpp,
+        field_m=setup.field_m,
+        pixels_per_pitch=setup.pitch_m / mpp,
+        searched_px_per_pitch=setup.pitch_m / mpp / 2**quality.level,
+        dots_in_view=(
+            int(setup.field_m[0] / setup.pitch_m),
+            int(setup.field_m[1] / setup.pitch_m),
+        ),
+        window_dots=window_in_view(min(setup.field_m), setup.pitch_m),
+        used_dots=quality.accuracy.dots,
+        image_distance_m=setup.image_distance_m,
+        near_m=near_m,
+        far_m=far_m,
+        circle_of_confusion_m=confusion_m,
+        airy_px=AIRY_DIAMETER * _working_wavelength_m(setup) / setup.pixel_m,
+        blur_px=blur_px,
+        distortion_px=abs(setup.lens.distortion) * math.hypot(*setup.size_px) / 2,
+        motion_px=speed_px,
+        rotation_px=rotation_px,
+        one_pixel_speed_mps=mpp / setup.exposure_s,
+        one_pixel_yaw_rate_rps=1 / (setup.exposure_s * (max(setup.size_px) - 1) / 2),
+        max_exposure_s=math.inf if speed_of_corner == 0 else tolerated_m / speed_of_corner,
+        max_speed_mps=tolerated_m / setup.exposure_s,
+        max_yaw_rate_rps=tolerated_m / (setup.exposure_s * corner_m),
+        needed_illuminance_lx=needed_illuminance_lx(setup),
+        noise_levels=noise,
+        dot_sigma_m=quality.dot_sigma_m,
+        position_sigma_m=quality.accuracy.position_pitches * setup.pitch_m,
+        heading_sigma_rad=quality.accuracy.heading_rad,
+        absolute_position_sigma_m=math.hypot(
+            quality.accuracy.position_pitches * setup.pitch_m, PRINT_SIGMA_M
+        ),
+        read_rate=quality.read_rate,
+        needed_fps=setup.wanted_rate_hz / max(quality.read_rate, 1e-3),
+        pose_rate_hz=quality.read_rate * min(fps, 1 / decoding_s),
+        pose_spacing_m=setup.speed_mps / (fps * max(quality.read_rate, 1e-3)),
+        latency_s=setup.exposure_s / 2 + 1 / setup.sensor.max_fps + decoding_s,
+        materials=camera_materials(setup.sensor.name, setup.lens.focal_m, setup.wavelength_m),
+    )
+    return replace(report, warnings=tuple(_warnings(report)))
+
+
+# ---- optics
+
+
+def window_diagonal_m(dots: int, pitch_m: float, dot_pitches: float = DOT_OFFSET_PITCHES) -> float:
+    """Return the diagonal of a square of dots that are displaced outwards (paper, III-A.3).
+
+    >>> round(window_diagonal_m(8, 0.508e-3) * 1e3, 2)
+    5.39
+    """
+    return math.sqrt(2) * pitch_m * (dots - 1 + 2 * DOT_OFFSET_PITCHES + dot_pitches)
+
+
+def window_in_view(side_m: float, pitch_m: float) -> int:
+    """Return the columns and rows of the largest square of dots whose diagonal fits ``side_m``."""
+    rest = side_m / (math.sqrt(2) * pitch_m) - 3 * DOT_OFFSET_PITCHES
+    return max(0, 1 + math.floor(rest + 1e-9))
+
+
+def _working_wavelength_m(setup: CameraSetup) -> float:
+    """Return the wavelength times the f-number on the side of the sensor."""
+    return setup.wavelength_m * setup.lens.f_number * (1 + setup.magnification)
+
+
+def blur_circle_m(setup: CameraSetup, distance_m: float) -> float:
+    """Return the diameter on the sensor of the image of a point at another distance."""
+    aperture = setup.lens.focal_m / setup.lens.f_number
+    return aperture * setup.image_distance_m * abs(1 / setup.distance_m - 1 / distance_m)
+
+
+def focus_range(setup: CameraSetup, confusion_m: float) -> tuple[float, float]:
+    """Return the nearest and farthest distance whose blur circle is ``confusion_m``."""
+    aperture = setup.lens.focal_m / setup.lens.f_number
+    step = confusion_m / (aperture * setup.image_distance_m)
+    inverse = 1 / setup.distance_m
+    return 1 / (inverse + step), math.inf if step >= inverse else 1 / (inverse - step)
+
+
+def tolerated_confusion_m(setup: CameraSetup) -> float:
+    """Return the largest blur circle with which dots are decoded.
+
+    A uniform disc of diameter c has a standard deviation of c / 4 per axis. Diffraction and
+    aberrations take their part of the blur that the decoder tolerates.
+    """
+    limit = MAX_BLUR_PITCHES * setup.pitch_m * setup.magnification
+    rest = limit**2 - _diffraction_sigma_m(setup) ** 2 - setup.lens_blur_m**2
+    return 4 * math.sqrt(max(rest, 0.0))
+
+
+def _diffraction_sigma_m(setup: CameraSetup) -> float:
+    return AIRY_SIGMA * _working_wavelength_m(setup)
+
+
+def static_blur_px(setup: CameraSetup) -> float:
+    """Return the standard deviation of the blur by focus, diffraction and aberrations in pixels."""
+    defocus = max(
+        blur_circle_m(setup, setup.distance_m + sign * setup.focus_error_m)
+        for sign in (-1, 1)
+        if setup.distance_m + sign * setup.focus_error_m > 0
+    )
+    sigma = math.hypot(defocus / 4, _diffraction_sigma_m(setup), setup.lens_blur_m)
+    return sigma / setup.pixel_m
+
+
+def frame_rate(setup: CameraSetup) -> float:
+    """Return the largest frame rate with this exposure."""
+    return min(setup.sensor.max_fps, 1 / setup.exposure_s)
+
+
+# ---- light
+
+
+def electrons_of_paper(setup: CameraSetup, illuminance_lx: float) -> float:
+    """Return the electrons of a pixel of paper, without saturation.
+
+    Illuminance of the sensor: E R T / (4 N^2 (1 + m)^2) for a diffuse paper.
+    """
+    working = setup.lens.f_number * (1 + setup.magnification)
+    on_sensor_lx = illuminance_lx * PAPER_REFLECTANCE * LENS_TRANSMITTANCE / (4 * working**2)
+    photons = on_sensor_lx * LUMEN_PHOTONS_PER_S * setup.pixel_m**2 * setup.exposure_s
+    return photons * QUANTUM_EFFICIENCY
+
+
+def full_well_e(setup: CameraSetup) -> float:
+    """Return the electrons of a saturated pixel of a frame; binned pixels add up."""
+    return setup.sensor.full_well_e * setup.binning**2
+
+
+def needed_illuminance_lx(setup: CameraSetup) -> float:
+    """Return the illuminance of the paper with which its grey value is :data:`PAPER_LEVEL`."""
+    return PAPER_LEVEL / MAX_LEVEL * full_well_e(setup) / electrons_of_paper(setup, 1.0)
+
+
+def noise_levels(setup: CameraSetup) -> float:
+    """Return the noise of a pixel of paper in grey values: photons and read noise.
+
+    With less light than is needed, the gain of the sensor brings the paper to
+    :data:`PAPER_LEVEL`, and the noise with it.
+    """
+    if setup.noise_levels is not None:
+        return setup.noise_levels
+    electrons = PAPER_LEVEL / MAX_LEVEL * full_well_e(setup)
+    if setup.illuminance_lx is not None:
+        electrons = min(electrons, electrons_of_paper(setup, setup.illuminance_lx))
+    read_noise = setup.sensor.read_noise_e * setup.binning
+    return PAPER_LEVEL * math.sqrt(electrons + read_noise**2) / electrons
+
+
+# ---- read rate and accuracy
+
+
+@dataclass(frozen=True)
+class _FrameQuality:
+    """Read rate of frames, and accuracy of those that are decoded at a number of halvings."""
+
+    level: int
+    read_rate: float
+    dot_sigma_m: float
+    accuracy: PoseAccuracy
+
+
+def _frame_quality(setup: CameraSetup, blur_px: float, noise: float) -> _FrameQuality:
+    """Return the quality at the sizes of a frame that the decoder tries, best first.
+
+    The accuracy is that of the first size at which most frames are decoded, otherwise of the best.
+    """
+    candidates = []
+    missed = 1.0
+    for level in searched_levels(setup.size_px):
+        candidate = _quality_at_level(setup, blur_px, noise, level)
+        missed *= 1 - candidate.read_rate
+        candidates.append(candidate)
+        if candidate.read_rate > 0.5:
+            break
+    best = max(candidates, key=lambda candidate: candidate.read_rate)
+    return replace(best, read_rate=1 - missed)
+
+
+def _quality_at_level(
+    setup: CameraSetup, blur_px: float, noise: float, level: int
+) -> _FrameQuality:
+    factor = 2**level
+    mpp = setup.metres_per_px * factor
+    size = (setup.size_px[0] // factor, setup.size_px[1] // factor)
+    pitch_px = setup.pitch_m / mpp
+    # Halved images are rounded once more.
+    variance = (noise**2 + ROUNDING_VARIANCE) / factor**2 + (ROUNDING_VARIANCE if level else 0.0)
+    motion_px = setup.exposure_s * setup.speed_mps / mpp
+    # A rotation blurs the dots of a frame in all directions, in the mean square like this.
+    radius_px = math.hypot(*size) / math.sqrt(12)
+    turn_px = setup.exposure_s * setup.yaw_rate_rps * radius_px
+    image = DotImage(
+        pitch_px=pitch_px,
+        diameter_px=setup.dot_pitches * pitch_px,
+        blur_px=math.hypot(blur_px / factor, turn_px / math.sqrt(24)),
+        motion_px=motion_px,
+        noise=math.sqrt(variance) / PAPER_LEVEL,
+        contrast=setup.contrast,
+        jitter_px=setup.jitter_m / mpp,
+    )
+    error = dot_error(image)
+    accuracy = pose_accuracy(
+        size, pitch_px, error.total_px, is_lens_known=setup.is_calibrated
+    ).with_fraction(error.used_fraction)
+    rate = read_rate(error, accuracy.dots, pitch_px)
+    return _FrameQuality(level, rate, error.total_px * mpp, accuracy)
+
+
+# ---- warnings
+
+
+def _warnings(report: CameraReport) -> Iterator[str]:
+    """Yield the requirements that are not met, most important first."""
+    setup = report.setup
+    yield from _field_warnings(report)
+    yield from _light_warnings(report)
+    if setup.focus_error_m > min(setup.distance_m - report.near_m, report.far_m - setup.distance_m):
+        yield (
+            f"the depth of field, {length_text(report.depth_of_field_m)}, is less than twice the "
+            f"error of the distance, {length_text(setup.focus_error_m)}: choose an f-number above "
+            f"{setup.lens.f_number:g}, or a stiffer holder"
+        )
+    if setup.sensor.shutter == "rolling":
+        skew = setup.speed_mps / setup.sensor.max_fps / min(setup.field_m)
+        if skew > MAX_SHEAR:
+            slower = MAX_SHEAR * min(setup.field_m) * setup.sensor.max_fps
+            yield (
+                f"the rolling shutter shears the frame by {skew:.2f} at {setup.speed_mps:g} m/s, "
+                f"more than the {MAX_SHEAR:g} that are decoded: drive at most {slower:.2g} m/s, or "
+                "choose a sensor with a global shutter"
+            )
+    fps = frame_rate(setup)
+    if report.needed_fps > fps * (1 + 1e-9):
+        yield (
+            f"{setup.wanted_rate_hz:g} poses per second need {report.needed_fps:.3g} frames per "
+            f"second, and the camera takes {fps:.3g}: choose a faster sensor, or accept "
+            f"{report.pose_rate_hz:.3g} poses per second"
+        )
+    if report.read_rate < 0.95:
+        yield (f"only {100 * report.read_rate:.0f} % of the frames are expected to be decoded")
+
+
+def _field_warnings(report: CameraReport) -> Iterator[str]:
+    setup = report.setup
+    if report.window_dots < MIN_WINDOW_DOTS:
+        needed_m = window_diagonal_m(MIN_WINDOW_DOTS, setup.pitch_m)
+        farther_m = distance_for_field(setup, needed_m)
+        yield (
+            f"only {report.window_dots} x {report.window_dots} dots are in view in any direction, "
+            f"and a position needs {MIN_WINDOW_DOTS} x {MIN_WINDOW_DOTS}: the shorter side of the "
+            f"field has to be {length_text(needed_m)}, as with a distance of "
+            f"{length_text(farther_m)}"
+        )
+    if report.pixels_per_pitch < MIN_PX_PER_PITCH:
+        nearer_m = distance_for_field(
+            setup,
+            min(setup.field_m) * report.pixels_per_pitch / (1.2 * MIN_PX_PER_PITCH),
+        )
+        yield (
+            f"{report.pixels_per_pitch:.1f} px per pitch are less than the {MIN_PX_PER_PITCH:g} "
+            f"that the decoder needs: move the lens to {length_text(nearer_m)}, choose more pixels "
+            "or a longer focal length"
+        )
+
+
+def _light_warnings(report: CameraReport) -> Iterator[str]:
+    setup = report.setup
+    if setup.exposure_s > report.max_exposure_s * (1 + 1e-9):
+        yield (
+            f"the exposure of {setup.exposure_s * 1e6:.0f} us blurs the corner by "
+            f"{report.motion_px + report.rotation_px:.1f} px at the wanted speed: expose at most "
+            f"{report.max_exposure_s * 1e6:.0f} us, or drive at most {report.max_speed_mps:.2g} m/s"
+        )
+    if setup.exposure_s < setup.sensor.min_exposure_s:
+        yield (
+            f"the sensor exposes at least {setup.sensor.min_exposure_s * 1e6:.0f} us, not "
+            f"{setup.exposure_s * 1e6:.0f} us: pulse the LEDs instead"
+        )
+    if setup.illuminance_lx is not None and setup.noise_levels is None:
+        ratio = setup.illuminance_lx / report.needed_illuminance_lx
+        if ratio > MAX_LEVEL / PAPER_LEVEL:
+            yield (
+                f"the paper is overexposed {ratio:.1f} times: expose "
+                f"{setup.exposure_s / ratio * 1e6:.0f} us, or dim the light to "
+                f"{report.needed_illuminance_lx:.3g} lx"
+            )
+
+
+# ---- choices
+
+
+def distance_for_field(setup: CameraSetup, side_m: float) -> float:
+    """Return the distance of the lens at which the shorter side of the field is ``side_m``."""
+    magnification = min(setup.size_px) * setup.pixel_m / side_m
+    return setup.lens.focal_m * (1 + 1 / magnification)
+
+
+def suggest_camera(
+    sensor: Sensor,
+    *,
+    focal_m: float | None = None,
+    distance_m: float | None = None,
+    exposure_s: float | None = None,
+    window_dots: int = GOOD_WINDOW_DOTS,
+    f_number: float = 2.4,
+    distortion: float = 0.02,
+    **conditions: object,
+) -> CameraSetup:
+    """Choose focal length, distance and exposure that are not given, for a window of dots.
+
+    The shorter side of the field shows ``window_dots`` columns and rows in any direction. The focal
+    length is one in which M12 lenses are sold. The exposure is the longest with which a dot moves
+    by less than :data:`EXPOSURE_MOTION_PITCHES` at the wanted speeds, and which the frame rate
+    leaves time for.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    focal_m, distance_m, exposure_s : float, optional
+        Given values are kept.
+    window_dots : int
+    f_number, distortion : float
+        Of the lens.
+    **conditions
+        Further attributes of :class:`CameraSetup`.
+
+    Raises
+    ------
+    InputError
+        See :class:`CameraSetup`.
+    """
+    if not 1 <= window_dots <= 100:
+        raise InputError(f"a window of {window_dots} dots", hint="Give 8 to 40; 12 is good")
+
+    def setup_of(focal_m: float, distance_m: float, exposure_s: float = 1e-4) -> CameraSetup:
+        lens = Lens(focal_m, f_number, distortion)
+        return CameraSetup(sensor, lens, distance_m, exposure_s, **conditions)  # type: ignore[arg-type]
+
+    if focal_m is not None and distance_m is None:
+        distance_m = _distance_for_dots(setup_of(focal_m, 2 * focal_m), window_dots)
+    elif focal_m is None:
+        aim_m = PREFERRED_DISTANCE_M if distance_m is None else distance_m
+        focal_m, chosen_m = _standard_lens(setup_of, aim_m, window_dots)
+        distance_m = chosen_m if distance_m is None else distance_m
+    assert focal_m is not None
+    assert distance_m is not None
+    setup = setup_of(focal_m, distance_m)
+    if exposure_s is None:
+        exposure_s = _longest_exposure(setup)
+    return replace(setup, exposure_s=exposure_s)
+
+
+def _distance_for_dots(setup: CameraSetup, window_dots: int) -> float:
+    return distance_for_field(setup, window_diagonal_m(window_dots, setup.pitch_m))
+
+
+def _standard_lens(setup_of, aim_m: float, window_dots: int) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+    """Return the standard focal length and its distance for the window, nearest to ``aim_m``.
+
+    Of the lenses that show the window at ``aim_m`` or nearer, the longest is taken: its field is
+    the smallest that is large enough.
+    """
+    distances = {
+        focal_m: _distance_for_dots(setup_of(focal_m, 2 * focal_m), window_dots)
+        for focal_m in STANDARD_FOCAL_LENGTHS_M
+    }
+    suitable = [focal_m for focal_m, distance_m in distances.items() if distance_m <= aim_m]
+    focal_m = max(suitable, default=STANDARD_FOCAL_LENGTHS_M[0])
+    return focal_m, distances[focal_m]
+
+
+def _longest_exposure(setup: CameraSetup) -> float:
+    corner_mps = setup.speed_mps + setup.yaw_rate_rps * setup.corner_m
+    by_rate = 0.5 / max(setup.wanted_rate_hz, setup.sensor.max_fps)
+    if corner_mps == 0:
+        return by_rate
+    by_motion = EXPOSURE_MOTION_PITCHES * setup.pitch_m / corner_mps
+    return max(min(by_motion, by_rate), setup.sensor.min_exposure_s)
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """Sensor for a task: the setup chosen for it, its figures, and why it does not fit."""
+
+    sensor: Sensor
+    report: CameraReport
+    reasons: tuple[str, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Whether all requirements are met."""
+        return not self.reasons
+
+
+def compare_sensors(sensors: Iterable[Sensor], **wanted: object) -> tuple[CameraFit, ...]:
+    """Choose a setup for each sensor, with the arguments of :func:`suggest_camera`.
+
+    Sensors that fit come first, then in the order given.
+    """
+    fits = []
+    for sensor in sensors:
+        report = design_camera(suggest_camera(sensor, **wanted))  # type: ignore[arg-type]
+        fits.append(CameraFit(sensor, report, report.warnings))
+    return tuple(sorted(fits, key=lambda fit: not fit.fits))
+
+
+def _require(
+    item: object,
+    low: float,
+    high: float,
+    *names: str,
+    unit: str = "",
+    scale: float = 1.0,
+) -> None:
+    """Raise InputError unless the attributes are above ``low`` and at most ``high``."""
+    for name in names:
+        value = getattr(item, name)
+        if not low < value <= high:
+            shown = f"{value * scale:g} {unit}".strip()
+            limits = f"above {low * scale:g}, at most {high * scale:g} {unit}".strip()
+            raise InputError(f"{name.rpartition('_')[0] or name} is {shown}", hint=f"Give {limits}")
