@@ -21,7 +21,8 @@ def command(
     """Simulate robots that drive or fly under Lighthouse stations into a session with truth.
 
     The same settings and seed give the same sweeps. The session contains markers, as a user would
-    measure them, but not the stations: the solver estimates these.
+    measure them, but not the stations: the solver estimates these. With --artifact, it contains the
+    room instead, whose stations are beside their designed poses, by their mounting tolerance.
 
     \b
     Examples:
@@ -30,6 +31,7 @@ def command(
       locatk simulate lighthouse -o hard.mcap --3d --occlusion 0.2 --seed 7
       locatk simulate lighthouse -o deck.mcap --3d --receiver deck
       locatk simulate lighthouse -o flight.mcap --flight --receiver deck
+      locatk simulate lighthouse -o room.mcap --artifact room.toml --robots 5
       locatk simulate lighthouse --robots 20 --print-config > sim.toml
       locatk simulate lighthouse --config sim.toml -o swarm.mcap --seed 2
     """

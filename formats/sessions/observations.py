@@ -93,6 +93,9 @@ _SWEEP_RANGES = {
     "sweep": (-1, 1),
 }
 
+TRUE_SCENE_FILE = "true-scene.toml"
+"""Attachment with the true stations of a simulation."""
+
 MAX_LISTED_TOPICS = 5
 """Number of topics that the message about a session without sweeps lists."""
 
@@ -210,6 +213,7 @@ def write_session(
     facts: Mapping[str, object] | None = None,
     stations: Sequence[StationReport] = (),
     receivers: Mapping[str, Receiver] | None = None,
+    true_scene: Scene | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a session of sweeps, with reference data and artifacts.
@@ -243,6 +247,8 @@ def write_session(
     receivers : mapping of str to Receiver, optional
         By device; attached as ``receiver.toml``, or if the devices differ as one
         ``receiver-<device>.toml`` each.
+    true_scene : Scene, optional
+        Attached as ``true-scene.toml``, for comparison: solvers do not use it.
     overwrite : bool
         Replace an existing file.
 
@@ -268,6 +274,8 @@ def write_session(
         writer.facts(facts)
         if scene is not None:
             writer.attach_toml(SCENE_FILE, dumps_scene(scene))
+        if true_scene is not None:
+            writer.attach_toml(TRUE_SCENE_FILE, dumps_scene(true_scene))
         for name, text in receiver_texts.items():
             writer.attach_toml(name, text)
         for name, record in records.items():

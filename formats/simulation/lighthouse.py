@@ -20,6 +20,7 @@ from locatk.formats.artifacts.kinds import (
     Number,
 )
 from locatk.formats.artifacts.receiver import read_receiver
+from locatk.formats.artifacts.scene import read_scene
 from locatk.formats.sessions import observations
 from locatk.formats.simulation.config import SimulationConfig
 from locatk.formats.simulation.settings import Setting
@@ -69,11 +70,21 @@ CONFIG = SimulationConfig(
         Setting(
             "robots.speed_mps",
             POSITIVE,
-            "Largest speed of flights, without take-off and landing",
+            "Largest speed of flights, without take-off and landing, and of robots in a room",
             "speed_mps",
         ),
         Setting("robots.imu_hz", NOT_NEGATIVE, "Rate of the IMU of flights; 0: none", "imu_hz"),
         Setting("stations.count", Integer(1, 16), "Number of stations", "stations", "--stations"),
+        Setting(
+            "stations.artifact",
+            FilePath(),
+            "Room of `locatk room design` (room.toml): its stations, mounted by hand; robots drive "
+            "in its working area, and walls, obstacles and robots stop light",
+            flag="--artifact",
+            default=None,
+            default_text="a floor of 2 m without obstacles",
+            example="room.toml",
+        ),
         Setting(
             "stations.factory_data",
             Boolean(),
@@ -125,7 +136,10 @@ CONFIG = SimulationConfig(
         Setting("random.seed", Integer(0), "Seed of all random numbers", "seed", "--seed"),
     ),
     SimulationOptions(),
-    conflicts=((("robots.flying",), ("robots.planar",)),),
+    conflicts=(
+        (("robots.flying",), ("robots.planar",)),
+        (("stations.artifact",), ("robots.flying", "robots.planar", "stations.count")),
+    ),
 )
 """Settings of the command."""
 
@@ -136,14 +150,17 @@ def simulation_options(settings: Mapping[str, Any]) -> SimulationOptions:
     Raises
     ------
     MissingDataError, ArtifactError
-        The file of the receiver is missing or invalid.
+        The file of the receiver or of the room is missing or invalid.
     InputError
         A value is out of its range.
     """
     values = CONFIG.in_si(settings)
     noise_udeg = values.pop("errors.noise_udeg", NOISE_UDEG)
     receiver = _read_receiver(values.pop("robots.receiver", None))
+    artifact = values.pop("stations.artifact", None)
     values.setdefault("planar", not values.get("flying", False))
+    if artifact is not None:
+        values["room"] = read_scene(Path(artifact))
     return SimulationOptions(
         **values,
         noise_rad=math.radians(noise_udeg * 1e-6),
@@ -179,6 +196,7 @@ def write_simulation(
         scene=simulated.scene,
         truth=simulated.truth,
         imu=simulated.imu,
+        true_scene=simulated.true_scene if options.room is not None else None,
         receivers={} if receiver is None else dict.fromkeys(sweeps.devices, receiver),
         overwrite=overwrite,
     )

@@ -128,6 +128,9 @@ class OpticalLink:
     normal : (3,) ndarray or None
         Direction in which the photodiode points, in the robot's axes; None if it receives light
         from everywhere.
+    is_blocked : callable or None
+        Function of positions (..., 3) of the photodiode and times (...), True if no light of the
+        station arrives; None if nothing stops it.
     """
 
     robot: int
@@ -136,6 +139,7 @@ class OpticalLink:
     sensor: int = 0
     offset_m: Array | None = None
     normal: Array | None = None
+    is_blocked: Callable[[Array, Array], NDArray[np.bool_]] | None = None
 
     def position(self, time_s: Array) -> Array:
         """Return the positions (..., 3) of the photodiode in metres at times (...)."""
@@ -217,6 +221,8 @@ def observe_reports(
     start_s = source.zero_s + rotation * source.period_s
     time_s, count = source.observe(start_s, link.position, noise[is_new])
     is_missing = (time_s < 0) | ~link.is_facing(time_s)
+    if link.is_blocked is not None:
+        is_missing |= link.is_blocked(link.position(time_s), time_s)
     for edges_s in hidden_s:
         is_missing |= np.searchsorted(edges_s, time_s) % 2 == 1
     count[is_missing] = np.nan

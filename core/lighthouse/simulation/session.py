@@ -16,6 +16,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_exp
 from locatk.core.inertial import InertialSamples
 from locatk.core.lighthouse.calibration import (
@@ -43,6 +44,7 @@ from locatk.core.lighthouse.simulation.optics import (
     observe_reports,
 )
 from locatk.core.lighthouse.simulation.paths import DrivenPath, FlownPath, RobotPath
+from locatk.core.lighthouse.simulation.rooms import RoomLight, RoomPath, mounted_stations
 from locatk.core.simulation import (
     MAX_SAMPLES,
     check_options,
@@ -116,7 +118,7 @@ class SimulationOptions:
     flying : bool
         True for quadrotors, which tilt as they accelerate; not if ``planar``.
     speed_mps : float
-        Bound of the speed of a flight, without take-off and landing.
+        Bound of the speed of a flight, without take-off and landing, or of a robot in a room.
     imu_hz : float
         Rate of the inertial measurement units of quadrotors; 0 for none.
     reflections : float
@@ -127,6 +129,11 @@ class SimulationOptions:
         Standard deviation of the tilts and phases of the stations from their factory data.
     factory_data : bool
         True if the scene contains the factory data of the stations.
+    room : Scene, optional
+        Scene with stations and their room. If it is a design, the true stations are beside the
+        designed poses, by their covariances. Robots drive within its working area and heights at
+        ``speed_mps``; walls, obstacles and robots stop light. ``stations`` and ``planar`` are not
+        used, robots do not visit markers, and the scene of the session is this one.
     seed : int
         At least 0.
 
@@ -154,9 +161,12 @@ class SimulationOptions:
     station_turn_rad: float = 0.0
     calibration_error_rad: float = 0.0
     factory_data: bool = False
+    room: Scene | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if self.room is not None:
+            _check_room(self.room, self.flying)
         check_options(
             self,
             (
@@ -176,6 +186,22 @@ class SimulationOptions:
         )
 
 
+def _check_room(scene: Scene, flying: bool) -> None:
+    """Raise InputError if nothing can be simulated in a scene."""
+    if scene.room is None:
+        raise InputError(
+            "the scene has no room",
+            hint="Give a scene of `locatk room design`, or add the table [room]",
+        )
+    if not scene.stations:
+        raise InputError("the room has no stations", hint="Run `locatk room design` first")
+    if flying:
+        raise InputError(
+            "flights are not simulated in a room",
+            hint="Without them, robots move through the heights of the room",
+        )
+
+
 @dataclass(frozen=True)
 class SimulatedSession:
     """Simulated recording and its ground truth.
@@ -185,12 +211,13 @@ class SimulatedSession:
     sweeps : Sweeps
         Ascending in time. As in a DotBot's reports, the plane of a sweep is unknown.
     scene : Scene
-        Knowledge of a user before solving: the markers, and when robot 1 was on them.
+        Knowledge of a user before solving: the markers, and when robot 1 was on them, or the
+        design of the room.
     truth : tuple of Trajectory
         True poses of each robot at 100 Hz; x points along its path, or ahead of a quadrotor.
         Robot 1 has neither truth nor sweeps while it is carried from marker to marker.
     true_scene : Scene
-        ``scene`` with the true stations.
+        ``scene`` with the true stations, without covariances.
     is_outlier : (n,) bool ndarray
         True for the sweeps that were replaced by outliers.
     imu : tuple of InertialSamples
@@ -218,31 +245,28 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
     """
     options = options or SimulationOptions()
     photodiodes = 1 if options.receiver is None else len(options.receiver)
-    rate_hz = TRUTH_RATE_HZ + options.report_hz * options.stations * photodiodes
+    room = None if options.room is None else options.room.room
+    count = options.stations if options.room is None else len(options.room.stations)
+    rate_hz = TRUTH_RATE_HZ + options.report_hz * count * photodiodes
     rate_hz += options.imu_hz * options.flying
     check_session_size(options.robots * options.duration_s * rate_hz, options.duration_s)
     # One random stream for each aspect: more noise, for example, leaves the paths as they are.
-    streams = (np.random.default_rng(s) for s in np.random.SeedSequence(options.seed).spawn(9))
+    streams = (np.random.default_rng(s) for s in np.random.SeedSequence(options.seed).spawn(10))
     station_rng, path_rng, report_rng, noise_rng, occlusion_rng, fault_rng = islice(streams, 6)
-    reflection_rng, deviation_rng, imu_rng = streams
-    stations = _simulate_stations(station_rng, options)
+    reflection_rng, deviation_rng, imu_rng, mounting_rng = streams
+    mounted = [] if options.room is None else mounted_stations(mounting_rng, options.room)
+    stations = _simulate_stations(station_rng, options, mounted)
     factory_data = {s.station.channel: s.station.calibration for s in stations}
     stations = [_deviate(station, deviation_rng, options) for station in stations]
     if options.station_turn_rad:
         stations[-1] = _turn(stations[-1], options)
     markers_m = FLOOR_MARKERS_M if options.planar else RAISED_MARKERS_M
-    paths: list[RobotPath] = []
+    paths = [_make_path(path_rng, robot, markers_m, options) for robot in range(options.robots)]
+    light = None if room is None else RoomLight(room, paths)
     links: list[OpticalLink] = []
     parts: list[SweepPairs] = []
     reflections_s: list[Array] = []
-    for robot in range(options.robots):
-        visited_m = markers_m[: 0 if robot else None]
-        path: RobotPath
-        if options.flying:
-            path = FlownPath(path_rng, options.duration_s, visited_m, options.speed_mps)
-        else:
-            path = DrivenPath(path_rng, options.planar, options.duration_s, visited_m)
-        paths.append(path)
+    for robot, path in enumerate(paths):
         reports_s = _report_times(report_rng, options)
         for station in stations:
             occlusion_s = draw_intervals(
@@ -253,6 +277,9 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
                 reflection_rng, options.reflections, MEAN_REFLECTION_S, options.duration_s
             )
             for link in _optical_links(robot, path, station, options.receiver):
+                if light is not None:
+                    is_blocked = light.blocked(robot, station.station.position)
+                    link = replace(link, is_blocked=is_blocked)
                 noise = noise_rng.normal(0.0, options.noise_rad, (len(reports_s), 2))
                 links.append(link)
                 parts.append(observe_reports(link, len(parts), reports_s, hidden_s, noise))
@@ -265,17 +292,23 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
     digits = len(str(options.robots))
     names = tuple(f"robot-{k + 1:0{digits}d}" for k in range(options.robots))
     sweeps, is_outlier = _to_sweeps(pairs, links, names, options.labelled)
-    scene = Scene(
-        markers=_visited_markers(markers_m, names[0], paths[0].tour.visits_s),
-        planar=options.planar,
-        scale="markers",
-        calibrations=factory_data if options.factory_data else {},
-    )
+    if options.room is None:
+        scene = Scene(
+            markers=_visited_markers(markers_m, names[0], paths[0].tour.visits_s),
+            planar=options.planar,
+            scale="markers",
+        )
+    else:
+        scene = options.room
+    if options.factory_data:
+        scene = replace(scene, calibrations=factory_data)
     return SimulatedSession(
         sweeps,
         scene,
-        tuple(_truth(n, p, options.duration_s) for n, p in zip(names, paths, strict=True)),
-        replace(scene, stations=tuple(station.station for station in stations)),
+        tuple(
+            _truth(n, scene.frame, p, options.duration_s) for n, p in zip(names, paths, strict=True)
+        ),
+        replace(scene, stations=tuple(station.station for station in stations), covariance=None),
         is_outlier,
         tuple(
             measure_inertia(imu_rng, name, path, options.duration_s, options.imu_hz)
@@ -289,10 +322,13 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
 
 
 def _simulate_stations(
-    rng: np.random.Generator, options: SimulationOptions
+    rng: np.random.Generator, options: SimulationOptions, mounted: Sequence[Station]
 ) -> list[SimulatedStation]:
-    """Distribute stations around the floor, 2 m from its centre, looking down at it."""
-    count = options.stations
+    """Distribute stations around the floor, 2 m from its centre, looking down at it.
+
+    Stations that are ``mounted`` in a room replace these.
+    """
+    count = len(mounted) or options.stations
     azimuth = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 3)
     azimuth = azimuth + np.radians(rng.uniform(-10, 10, count))
     units = np.resize(rng.permutation(len(FACTORY_UNITS)), count)
@@ -309,8 +345,11 @@ def _simulate_stations(
             "ideal": IDEAL_CALIBRATION,
         }[options.calibration]
         station = Station(k + 1, position, _look_at(position, target) @ roll, calibration)
+        if mounted:
+            known = mounted[k].calibration
+            station = replace(mounted[k], calibration=calibration if known.is_generic else known)
         clock_error_ppm = rng.uniform(-MAX_CLOCK_ERROR_PPM, MAX_CLOCK_ERROR_PPM)
-        period_s = float(period_ticks(k + 1)) / TICK_HZ * (1 + clock_error_ppm * 1e-6)
+        period_s = float(period_ticks(station.channel)) / TICK_HZ * (1 + clock_error_ppm * 1e-6)
         bits = rng.integers(0, 2, int(options.duration_s / period_s) + 2)
         stations.append(SimulatedStation(station, -period_s * rng.random(), period_s, bits))
     return stations
@@ -352,6 +391,18 @@ def _unit_calibration(unit: Array) -> Calibration:
 
 
 # ---- robots
+
+
+def _make_path(
+    rng: np.random.Generator, robot: int, markers_m: Array, options: SimulationOptions
+) -> RobotPath:
+    """Return the path of a robot; the first one visits the markers, but not in a room."""
+    if options.room is not None and options.room.room is not None:
+        return RoomPath(rng, options.room.room, options.duration_s, options.speed_mps)
+    visited_m = markers_m[: 0 if robot else None]
+    if options.flying:
+        return FlownPath(rng, options.duration_s, visited_m, options.speed_mps)
+    return DrivenPath(rng, options.planar, options.duration_s, visited_m)
 
 
 def _optical_links(
@@ -411,10 +462,10 @@ def _visited_markers(markers_m: Array, device: str, visits_s: Array) -> tuple[Ma
     )
 
 
-def _truth(device: str, path: RobotPath, duration_s: float) -> Trajectory:
+def _truth(device: str, frame: str, path: RobotPath, duration_s: float) -> Trajectory:
     """Return the true poses of one robot, except while it is carried."""
     time_s = np.arange(int(np.ceil(duration_s * TRUTH_RATE_HZ)) + 1) / TRUTH_RATE_HZ
     time_s = time_s[np.searchsorted(path.tour.carry_edges_s, time_s) % 2 == 0]
     no_covariance = np.zeros((len(time_s), 6, 6))
     position, quaternion = path.position(time_s), path.quaternion(time_s)
-    return Trajectory(device, "floor", stamps_ns(time_s), position, quaternion, no_covariance)
+    return Trajectory(device, frame, stamps_ns(time_s), position, quaternion, no_covariance)
