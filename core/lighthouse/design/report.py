@@ -1,0 +1,368 @@
+"""Report about the stations of a room: accuracy, coverage, worst places and the best addition."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import InputError
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
+from locatk.core.lighthouse.design.accuracy import predict_poses, predict_positions
+from locatk.core.lighthouse.design.placement import (
+    MAX_STATIONS,
+    MOUNT_DEPTH_M,
+    PERCENTILE,
+    UNDETERMINED_SIGMA_M,
+    PlacementProblem,
+    RoomRequest,
+    candidates,
+    refine,
+    seen_stations,
+    working_points,
+)
+from locatk.core.lighthouse.design.visibility import (
+    MAX_RANGE_M,
+    MEASURED_RANGE_M,
+    blocked_fraction,
+)
+from locatk.core.lighthouse.room import (
+    MOUNTING_POSITION_SIGMA_M,
+    MOUNTING_ROTATION_SIGMA_RAD,
+    Room,
+    rectangle,
+    signed_area,
+)
+from locatk.core.lighthouse.scene import Scene, Station
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+REPORT_POINTS = 2000
+"""Number of points of the working volume of which a report consists."""
+
+WORST_PLACES = 3
+"""Number of places that a report names."""
+
+MIN_PLACE_DISTANCE_M = 1.0
+"""Smallest distance of two places that a report names [m]."""
+
+NEGLIGIBLE_FRACTION = 0.01
+"""Fraction of the places below which a report does not mention them: edges of the volume."""
+
+MIN_AVAILABILITY = 0.99
+"""Fraction of time, below which a report warns of robots that hide each other."""
+
+
+@dataclass(frozen=True)
+class RoomReport:
+    """Predicted accuracy and coverage at p places of the working volume.
+
+    Attributes
+    ----------
+    points_m : (p, 3) ndarray
+    stations_seen : (p,) int ndarray
+        Number of stations in view, without robots in between.
+    availability : (p,) ndarray
+        Fraction of time in which at least ``min_seen`` stations are in view.
+    sigma_m, noise_sigma_m : (p,) ndarray
+        Standard deviations of the distance from the true position, in all, and of repeated
+        measurements at rest. Infinite if the stations in view do not determine a position.
+    dilution : (p,) ndarray
+        See :class:`~locatk.core.lighthouse.design.accuracy.PositionAccuracy`.
+    is_covered : (p,) bool ndarray
+        Enough stations are in view, and they determine a position.
+    min_seen : int
+    is_planar : bool
+    channels : tuple of int
+        Of the stations.
+    station_points : (s,) int ndarray
+        Number of places that see each station.
+    warnings : tuple of str
+        Deficiencies of the room.
+    notes : tuple of str
+        Assumptions that matter for this room.
+    """
+
+    points_m: Array
+    stations_seen: NDArray[np.int64]
+    availability: Array
+    sigma_m: Array
+    noise_sigma_m: Array
+    dilution: Array
+    is_covered: BoolArray
+    min_seen: int
+    is_planar: bool
+    channels: tuple[int, ...]
+    station_points: NDArray[np.int64]
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def covered_fraction(self) -> float:
+        """Fraction of the places that are covered."""
+        return float(np.mean(self.is_covered))
+
+    @property
+    def p95_sigma_m(self) -> float:
+        """95th percentile of ``sigma_m`` of all places; infinite if more are not covered."""
+        return percentile(np.where(self.is_covered, self.sigma_m, np.inf))
+
+    @property
+    def p95_noise_sigma_m(self) -> float:
+        """95th percentile of ``noise_sigma_m`` of all places."""
+        return percentile(np.where(self.is_covered, self.noise_sigma_m, np.inf))
+
+    @property
+    def mean_sigma_m(self) -> float:
+        """Mean of ``sigma_m`` of the covered places; infinite without any."""
+        return float(self.sigma_m[self.is_covered].mean()) if np.any(self.is_covered) else np.inf
+
+    @property
+    def worst_places(self) -> tuple[int, ...]:
+        """Indices of up to three places with the largest errors, places without coverage first."""
+        order = np.lexsort((-np.nan_to_num(self.sigma_m, posinf=1e9), self.is_covered))
+        found: list[int] = []
+        for index in order.tolist():
+            offset = self.points_m[found] - self.points_m[index]
+            if np.all(np.linalg.norm(offset, axis=1) > MIN_PLACE_DISTANCE_M):
+                found.append(index)
+            if len(found) == WORST_PLACES:
+                break
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class Addition:
+    """Station that improves a room most.
+
+    Attributes
+    ----------
+    station : Station
+    report : RoomReport
+        With the station.
+    """
+
+    station: Station
+    report: RoomReport
+
+
+def percentile(sigma: Array) -> float:
+    """Return the 95th percentile of values of which some may be infinite."""
+    return float(np.sort(sigma)[int(np.ceil(PERCENTILE / 100 * len(sigma))) - 1])
+
+
+def mounting_covariance() -> Array:
+    """Return the covariance (6, 6) of a station that was mounted by hand at its designed pose."""
+    sigma = np.repeat([MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD], 3)
+    return np.diag(sigma**2)
+
+
+def station_of(channel: int, position_m: Array, rotation: Array) -> Station:
+    """Return a designed station."""
+    return Station(
+        channel, position_m, rotation, GENERIC_CALIBRATION, covariance=mounting_covariance()
+    )
+
+
+def report_room(
+    scene: Scene,
+    room: Room,
+    request: RoomRequest | None = None,
+    *,
+    given_errors: bool = False,
+    points_m: Array | None = None,
+) -> RoomReport:
+    """Predict accuracy and coverage of the stations of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        In metres, with z up and 0 on the floor of ``room``.
+    room : Room
+    request : RoomRequest, optional
+        Its photodiodes, range and number of stations in view.
+    given_errors : bool
+        Include the covariances of the stations. Otherwise, the stations are taken as solved from a
+        recording, whose errors are part of that of the calibration.
+    points_m : (p, 3) ndarray, optional
+        Places; the default is a grid in the working volume.
+    """
+    request = RoomRequest() if request is None else request
+    points = working_points(room, REPORT_POINTS) if points_m is None else points_m
+    if not len(points):
+        raise InputError(
+            "the working volume is empty: it is outside the room or inside obstacles",
+            hint="Check the working area, the heights of photodiodes and the obstacles",
+        )
+    min_seen = request.seen_by(room)
+    position, rotation = _stacked(scene)
+    is_seen = seen_stations(room, position, rotation, points, request)
+    accuracy = predict_positions(
+        position,
+        rotation,
+        points,
+        is_seen,
+        is_planar=room.is_planar,
+        errors=request.errors,
+        station_covariances=[s.covariance for s in scene.stations] if given_errors else None,
+    )
+    blocked = blocked_fraction(
+        room.robots, abs(signed_area(room.working_outline_m)), position, points
+    )
+    count = is_seen.sum(axis=0)
+    report = RoomReport(
+        points_m=points,
+        stations_seen=count,
+        availability=_availability(np.where(is_seen, 1.0 - blocked, 0.0), min_seen),
+        sigma_m=accuracy.sigma_m,
+        noise_sigma_m=accuracy.noise_sigma_m,
+        dilution=accuracy.dilution,
+        is_covered=(count >= min_seen) & _is_determined(accuracy.noise_sigma_m, request),
+        min_seen=min_seen,
+        is_planar=room.is_planar,
+        channels=tuple(s.channel for s in scene.stations),
+        station_points=is_seen.sum(axis=1),
+    )
+    distance = np.linalg.norm(points[None] - position[:, None], axis=-1)
+    is_near = is_seen & (distance <= MEASURED_RANGE_M)
+    is_far = (count >= min_seen) & (is_near.sum(axis=0) < min_seen)
+    return replace(
+        report, warnings=tuple(_warnings(report)), notes=tuple(_notes(float(is_far.mean())))
+    )
+
+
+def heading_sigmas(
+    scene: Scene, report: RoomReport, room: Room, photodiodes_m: Array, request: RoomRequest
+) -> Array:
+    """Return the standard deviations (p,) of the heading of a level rigid device [rad].
+
+    Parameters
+    ----------
+    scene, report, room, request
+        As of :func:`report_room`.
+    photodiodes_m : (n, 3) ndarray
+        Offsets of the photodiodes from the centre of the device.
+    """
+    position, rotation = _stacked(scene)
+    is_seen = seen_stations(room, position, rotation, report.points_m, request)
+    return predict_poses(
+        position, rotation, report.points_m, is_seen, photodiodes_m, errors=request.errors
+    ).heading_sigma_rad
+
+
+def best_addition(
+    scene: Scene, room: Room, request: RoomRequest, *, given_errors: bool = False
+) -> Addition | None:
+    """Find the station that improves a scene most; None if all channels are used.
+
+    Its channel is the lowest free one.
+    """
+    used = {station.channel for station in scene.stations}
+    free = [c for c in range(1, MAX_STATIONS + 1) if c not in used]
+    if not free:
+        return None
+    problem = PlacementProblem(room, request)
+    position, rotation = _stacked(scene)
+    existing = problem.views_of(position, rotation)
+    poses = candidates(room, problem.points_m)
+    costs = problem.costs_with(existing, problem.views(poses))
+    if not np.any(np.isfinite(costs)):
+        return None
+    pose = refine(problem, poses.take([int(np.argmin(costs))]), existing)
+    station = station_of(free[0], pose.position_m[0], pose.rotation[0])
+    more = replace(scene, stations=(*scene.stations, station), covariance=None)
+    return Addition(station, report_room(more, room, request, given_errors=given_errors))
+
+
+def assumed_room(scene: Scene) -> Room:
+    """Return the smallest room around the stations and markers of a scene without a room.
+
+    Raises
+    ------
+    InputError
+        The scene has no stations, or its z axis is not up.
+    """
+    if not scene.stations:
+        raise InputError("the scene has no stations", hint="Give a solved or designed scene")
+    if not scene.is_on_floor and not scene.planar:
+        raise InputError(
+            "the floor of the scene is unknown: its z axis is not known to be up from the floor",
+            hint="Give the room with --room, or fix the frame with `locatk calibrate scene`",
+        )
+    position, _ = _stacked(scene)
+    places = np.concatenate([position, *[m.position[None] for m in scene.markers]])
+    low, high = places[:, :2].min(axis=0) - MOUNT_DEPTH_M, places[:, :2].max(axis=0) + MOUNT_DEPTH_M
+    size = np.maximum(high - low, 1.0)
+    low = 0.5 * (low + high) - 0.5 * size
+    top = float(position[:, 2].max())
+    if top <= 0:
+        raise InputError("all stations are below the floor", hint="Check the frame of the scene")
+    z = (max(scene.floor_z, 0.0),) * 2 if scene.planar else (0.0, 0.5 * top)
+    return Room(rectangle(*size, (float(low[0]), float(low[1]))), top + MOUNT_DEPTH_M, z)
+
+
+def _stacked(scene: Scene) -> tuple[Array, Array]:
+    position = np.array([s.position for s in scene.stations]).reshape(-1, 3)
+    rotation = np.array([s.rotation for s in scene.stations]).reshape(-1, 3, 3)
+    return position, rotation
+
+
+def _is_determined(noise_sigma_m: Array, request: RoomRequest) -> BoolArray:
+    """Return True for the places that the search counts as determined."""
+    errors = request.errors
+    factor = np.hypot(1.0, errors.calibration_rad / errors.noise_rad)
+    return np.asarray(factor * noise_sigma_m < UNDETERMINED_SIGMA_M)
+
+
+def _availability(free: Array, min_seen: int) -> Array:
+    """Return the probability (p,) that at least ``min_seen`` of independent events (s, p) occur."""
+    fewer = np.zeros((free.shape[1], min_seen))
+    fewer[:, 0] = 1.0
+    for each in free:
+        more = fewer * (1.0 - each[:, None])
+        more[:, 1:] += fewer[:, :-1] * each[:, None]
+        fewer = more
+    return np.asarray(1.0 - fewer.sum(axis=1))
+
+
+def _warnings(report: RoomReport) -> list[str]:
+    messages: list[str] = []
+    blind = [c for c, n in zip(report.channels, report.station_points, strict=True) if n == 0]
+    if blind:
+        stations = "station" if len(blind) == 1 else "stations"
+        sees = "sees" if len(blind) == 1 else "see"
+        messages.append(
+            f"{stations} {', '.join(map(str, blind))} {sees} nothing of the working volume: turn "
+            "or move"
+        )
+    uncovered = 1.0 - report.covered_fraction
+    if uncovered > NEGLIGIBLE_FRACTION:
+        needed = f"{report.min_seen} station" + "s" * (report.min_seen > 1)
+        messages.append(
+            f"{_percent(uncovered)} of the working volume is not covered: it sees fewer than "
+            f"{needed}, or only ones in line with it"
+        )
+    hidden = report.is_covered & (report.availability < MIN_AVAILABILITY)
+    if np.any(hidden):
+        worst = float(report.availability[report.is_covered].min())
+        messages.append(
+            f"robots hide each other: at the worst place, {report.min_seen} or more stations are "
+            f"received in {100 * worst:.1f} % of the time. Mount stations higher, or photodiodes"
+        )
+    return messages
+
+
+def _notes(far_fraction: float) -> list[str]:
+    if far_fraction <= NEGLIGIBLE_FRACTION:
+        return []
+    return [
+        f"{_percent(far_fraction)} of the working volume needs stations more than "
+        f"{MEASURED_RANGE_M:g} m away. HTC states a range of {MAX_RANGE_M:g} m, but reception was "
+        f"published up to {MEASURED_RANGE_M:g} m only: try it before you drill"
+    ]
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.1f} %" if fraction < 0.1 else f"{100 * fraction:.0f} %"
