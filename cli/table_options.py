@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import click
 
+from locatk.cli.command import section
+
 
 def parse_columns(
     ctx: click.Context, param: click.Parameter, value: str | None
@@ -27,3 +29,21 @@ def parse_words(
 ) -> tuple[str, ...] | None:
     """Return ``s,mm,deg`` as a tuple; a click callback."""
     return value if value is None else tuple(word.strip().lower() for word in value.split(","))
+
+
+site_table_options = section(
+    "Tables",
+    click.option(
+        "--columns",
+        metavar="KEY=NAME,...",
+        callback=parse_columns,
+        help="Headers of x, y, heading, id and meaning, if they differ from these names.",
+    ),
+    click.option(
+        "--units",
+        metavar="UNIT,...",
+        callback=parse_words,
+        help="Units of columns without a unit in their names: one of m, cm, mm; of rad, deg.",
+    ),
+)
+"""Options of tables of positions, for :mod:`locatk.formats.importers.floors.site_csv`."""

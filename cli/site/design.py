@@ -8,12 +8,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
 from locatk.cli.map.options import Size
 from locatk.cli.options import number
+from locatk.cli.site.forecast import (
+    LengthAndAngle,
+    laying_of,
+    odometry_noise,
+    odometry_options,
+    plan_entry,
+    plan_text,
+    plan_warnings,
+    read_routes,
+)
 from locatk.cli.site.site_text import report_check, site_entry, written_text
-from locatk.cli.table_options import parse_columns, parse_words
+from locatk.cli.table_options import site_table_options
 from locatk.cli.tag.options import reading_conditions, reading_options
 from locatk.core.units import metres
 
@@ -44,22 +54,6 @@ class Position(click.ParamType):
 
 MAX_COORDINATE_MM = 1e7
 
-table_options = section(
-    "Tables",
-    click.option(
-        "--columns",
-        metavar="KEY=NAME,...",
-        callback=parse_columns,
-        help="Headers of x, y, heading, id and meaning, if they differ from these names.",
-    ),
-    click.option(
-        "--units",
-        metavar="UNIT,...",
-        callback=parse_words,
-        help="Units of columns without a unit in their names: one of m, cm, mm; of rad, deg.",
-    ),
-)
-
 
 @click.command(cls=Command)
 @options.input_argument("tag")
@@ -72,14 +66,21 @@ table_options = section(
     options.input_option("--points", help="Table (.csv) of positions: one tag each."),
     options.input_option(
         "--route",
-        help="Table (.csv) of waypoints: a tag at each, and between them so that no distance is "
-        "above --spacing, with the heading of the route.",
+        help="Table (.csv) of waypoints. With --spacing, a tag at each, and between them so that "
+        "no distance is above it; with --accuracy, as many as are needed.",
     ),
     click.option(
         "--spacing",
         type=options.PositiveNumber(1, 1e6),
         metavar="MM",
         help="Distance between neighbouring tags of --grid; largest one of --route.",
+    ),
+    click.option(
+        "--accuracy",
+        type=LengthAndAngle(),
+        metavar="MM[,DEG]",
+        help="Error of position (and heading) along --route that must not be exceeded with 95 %, "
+        "instead of --spacing.",
     ),
     click.option(
         "--origin",
@@ -107,7 +108,8 @@ table_options = section(
         help="Minimum distance of two ids, in orientation steps, if TAG has no family.",
     ),
 )
-@table_options
+@odometry_options
+@site_table_options
 @reading_options
 @options.overwrite
 @options.as_json
@@ -119,9 +121,13 @@ def command(
     points: Path | None,
     route: Path | None,
     spacing: float | None,
+    accuracy: tuple[float, float | None] | None,
     origin: tuple[float, float],
     heading: float,
     min_distance: int,
+    drift: float | None,
+    slip: float | None,
+    laying: tuple[float, float | None] | None,
     columns: dict[str, str] | None,
     units: tuple[str, ...] | None,
     overwrite: bool,
@@ -134,6 +140,10 @@ def command(
     has no family, one is generated. The site is then checked as by `locatk site check`; with
     findings it is written nevertheless, and the exit status is 3.
 
+    With --accuracy, the tags along a route are as far apart as errors of odometry, tags and
+    measurement allow. If the accuracy is impossible, the site has tags at the smallest distance,
+    the output names what would have to change, and the exit status is 3.
+
     A table has columns x and y and, optionally, heading, id and meaning, with units in their names
     (x_mm, heading_deg) or given by --units.
 
@@ -142,16 +152,23 @@ def command(
       locatk site design tag.toml --grid 3x4 --spacing 1000 -o site.toml
       locatk site design tag.toml --points stations.csv --units m,deg -o site.toml
       locatk site design tag.toml --route aisle.csv --spacing 800 -o site.toml
+      locatk site design tag.toml --route aisle.csv --accuracy 20,2 -o site.toml
     """
     from locatk.core.errors import error_context
+    from locatk.core.polaris.design.routes import forecast_routes, plan_route
     from locatk.core.polaris.design.site import check_site, place_tags
     from locatk.formats.artifacts.tags import read_tags, write_tags
+    from locatk.formats.importers.floors.site_csv import read_site_points
 
     sources = [each for each in (grid, points, route) if each is not None]
     if len(sources) != 1:
         raise click.UsageError("Give one of --grid, --points and --route.")
-    if points is None and spacing is None:
-        raise click.UsageError("--grid and --route need --spacing.")
+    if points is None and spacing is None and accuracy is None:
+        raise click.UsageError("--grid and --route need --spacing, or --route an --accuracy.")
+    if accuracy is not None and (route is None or spacing is not None):
+        raise click.UsageError("--accuracy is for --route, instead of --spacing.")
+    if accuracy is None and any(each is not None for each in (drift, slip, laying)):
+        raise click.UsageError("--drift, --slip and --laying are for --accuracy.")
     if points is not None and spacing is not None:
         raise click.UsageError("--spacing is for --grid and --route, not for --points.")
     if grid is not None and (columns or units):
@@ -160,11 +177,33 @@ def command(
     inputs = [tag] if table is None else [tag, table]
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
     tags = read_tags(tag)
+    use = reading_conditions(**conditions)
+    if accuracy is not None and route is not None:
+        waypoints, _ = read_site_points(route, columns, units or ())
+        wanted = accuracy[0], math.inf if accuracy[1] is None else accuracy[1]
+        noise, laid = odometry_noise(drift, slip), laying_of(laying, tags)
+        with console.working("Planning"), error_context(route):
+            placed_at, plan = plan_route(tags, waypoints, use, noise, *wanted, laying=laid)
+        if not placed_at:
+            failures.finish_with_warnings(plan_warnings(plan, wanted))
+        with error_context(route):
+            site = place_tags(tags, placed_at, min_distance)
+        with console.working("Checking"):
+            report = check_site(site, use)
+            forecast = forecast_routes(
+                site, read_routes([route], columns, units), use, noise, laying=laid
+            )
+        write_tags(output, site, overwrite=overwrite)
+        console.result(f"{written_text(output, site)}\n\n{plan_text(plan)}\n")
+        more = {"output": output, "site": site_entry(site), "spacing": plan_entry(plan)}
+        warnings = plan_warnings(plan, wanted)
+        report_check(report, more, as_json, forecast=forecast, warnings=warnings)
+        return
     placed_at = _points(tags, grid, points, route, spacing, origin, heading, columns, units)
     with error_context(table or tag):
         site = place_tags(tags, placed_at, min_distance)
     with console.working("Checking"):
-        report = check_site(site, reading_conditions(**conditions))
+        report = check_site(site, use)
     write_tags(output, site, overwrite=overwrite)
     console.result(written_text(output, site) + "\n")
     report_check(report, {"output": output, "site": site_entry(site)}, as_json)

@@ -10,8 +10,8 @@ import click
 from locatk.cli import console, drawing_options, options
 from locatk.cli.command import Command, section
 from locatk.cli.options import number
-from locatk.cli.site.design import table_options
 from locatk.cli.site.site_text import site_entry, written_text
+from locatk.cli.table_options import site_table_options
 
 ENDINGS = {"csv": (".csv",), "lif": (".json", ".lif"), "dxf": (".dxf",)}
 DEFAULT_LAYER = "TAGS"
@@ -51,7 +51,7 @@ DEFAULT_LAYER = "TAGS"
     "Drawings",
     drawing_options.layer(DEFAULT_LAYER, "tags"),
 )
-@table_options
+@site_table_options
 @options.overwrite
 @options.as_json
 @options.verbosity

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console, failures
+from locatk.cli.site.forecast import forecast_entry, forecast_text
 
 if TYPE_CHECKING:
+    from locatk.core.polaris.design.routes import SiteForecast
     from locatk.core.polaris.design.site import SiteReport
     from locatk.core.polaris.tag import Tags
 
@@ -16,19 +18,32 @@ MAX_FINDINGS = 20
 """Number of findings that are printed; ``--json`` has all."""
 
 
-def report_check(report: SiteReport, more: dict[str, Any], as_json: bool) -> None:
+def report_check(
+    report: SiteReport,
+    more: dict[str, Any],
+    as_json: bool,
+    *,
+    forecast: SiteForecast | None = None,
+    warnings: Sequence[str] = (),
+) -> None:
     """Print the check of a site, and finish with exit status 3 if there are findings.
 
-    ``more`` are further keys of the JSON object.
+    ``more`` are further keys of the JSON object, ``forecast`` is that of a route, and ``warnings``
+    come before the findings.
     """
-    console.result(_text(report))
+    text = _text(report)
+    if forecast is not None:
+        text += "\n\n" + forecast_text(forecast)
+        more = {**more, "forecast": forecast_entry(forecast)}
+        warnings = [*warnings, *forecast.warnings]
+    console.result(text)
     if as_json:
         console.emit_json({"version": 1, **more, **entry(report)})
     messages = [finding.message for finding in report.findings]
     omitted = len(messages) - MAX_FINDINGS
     if omitted > 0:
         messages = [*messages[:MAX_FINDINGS], f"{omitted} more findings: see --json"]
-    failures.finish_with_warnings(messages)
+    failures.finish_with_warnings([*warnings, *messages])
 
 
 def _text(report: SiteReport) -> str:

@@ -112,6 +112,14 @@ reading_options = combine(
             help="RMS error of the magnets' orientations.  [default: as calibrated, otherwise 6 "
             "as for the published tags]",
         ),
+        click.option(
+            "--environment",
+            default="quiet",
+            show_default=True,
+            metavar="NAME|UT",
+            help="Fields that vary during a pass: quiet, reinforced (floor), motors, or their "
+            "standard deviation in uT.",
+        ),
     ),
 )
 
@@ -141,8 +149,10 @@ def reading_conditions(
     rate: float | None,
     speed: float,
     placement_error: float | None,
+    environment: str,
 ) -> ReadingConditions:
     """Return the conditions of reading that :data:`reading_options` describe."""
+    from locatk.core.polaris.design.environment import environment_of
     from locatk.core.polaris.design.planning import ReadingConditions
     from locatk.core.polaris.mlx90393 import Settings
 
@@ -154,4 +164,5 @@ def reading_conditions(
         rate_hz=rate,
         speed_mps=speed,
         placement_rad=None if placement_error is None else math.radians(placement_error),
+        environment=environment_of(environment),
     )

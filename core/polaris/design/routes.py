@@ -20,7 +20,12 @@ from locatk.core.errors import InputError
 from locatk.core.polaris import codec
 from locatk.core.polaris.design.accuracy_bound import magnet_covariance, rotate
 from locatk.core.polaris.design.planning import ReadingConditions, sample_layouts, sensor_array
-from locatk.core.polaris.design.site import SitePoint, check_tag_count, pass_separation
+from locatk.core.polaris.design.site import (
+    MAX_SITE_TAGS,
+    SitePoint,
+    check_tag_count,
+    pass_separation,
+)
 from locatk.core.polaris.identification.matching import (
     AS_BUILT_SIGMA_M,
     HAND_BUILT_SIGMA_M,
@@ -680,7 +685,7 @@ def _errors_text(position_m: float, heading_rad: float) -> str:
 
 
 def route_points(
-    tags: Tags, waypoints: Sequence[SitePoint], spacing_m: float
+    tags: Tags, waypoints: Sequence[SitePoint], spacing_m: float, min_spacing_m: float = 0.0
 ) -> tuple[Route, list[SitePoint]]:
     """Return a route, and points for tags along it that are passed straight.
 
@@ -694,7 +699,9 @@ def route_points(
     tags : Tags
     waypoints : sequence of SitePoint
         At least two.
-    spacing_m : float
+    spacing_m, min_spacing_m : float
+        Largest and smallest distance between neighbours; if no number of tags fits both, the
+        smallest counts.
 
     Raises
     ------
@@ -707,16 +714,21 @@ def route_points(
     start_m = np.concatenate([[0.0], np.cumsum(route.segment_m)])
     ends_m = start_m[_sharp_turns(route)]
     places: list[float] = []
+
+    def gaps(length_m: float) -> int:
+        most = math.floor(length_m / min_spacing_m + 1e-9) if min_spacing_m > 0 else MAX_SITE_TAGS
+        return min(math.ceil(length_m / spacing_m - 1e-9), most)
+
     for number, (first_m, last_m) in enumerate(itertools.pairwise(ends_m.tolist())):
         usable_m = last_m - first_m - 2 * margin_m
         if usable_m < 0:
             continue
         if number == len(ends_m) - 2:
-            count = math.ceil(usable_m / spacing_m - 1e-9) + 1
+            count = gaps(usable_m) + 1
             along = np.linspace(first_m + margin_m, last_m - margin_m, count)
         else:
             # The next tag is as far behind the turn as the first one is behind this one.
-            count = max(1, math.ceil((last_m - first_m) / spacing_m - 1e-9))
+            count = max(1, gaps(last_m - first_m))
             along = first_m + margin_m + (last_m - first_m) / count * np.arange(count)
             along = along[along <= last_m - margin_m + TOLERANCE_M]
         check_tag_count(len(places) + count)
@@ -759,7 +771,7 @@ def plan_route(
         return [], plan
 
     def forecast(spacing_m: float) -> tuple[list[SitePoint], SiteForecast]:
-        route, points = route_points(tags, waypoints, spacing_m)
+        route, points = route_points(tags, waypoints, spacing_m, smallest_m)
         site = {k: PlanarPose(p.x_m, p.y_m, p.heading_rad) for k, p in enumerate(points)}
         trial = replace(tags, site=site, built={}, site_sigma={}, ids=None)
         return points, forecast_routes(trial, [route], use, noise, laying=laying)

@@ -1,0 +1,230 @@
+"""Options, text and JSON of the forecast of a route over a site."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from locatk.cli import console
+from locatk.cli.command import section
+from locatk.core.units import length_text, metres
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from locatk.core.polaris.design.routes import SiteForecast, SpacingPlan
+    from locatk.core.routes import Route
+    from locatk.core.streaming.planar_filter import OdometryNoise
+
+LIMITS = {
+    "position": "error of the position",
+    "heading": "error of the heading",
+    "play": "lateral error at which the array misses a tag",
+    "maximum": "largest spacing that is planned",
+    "field": "field of the magnets",
+}
+"""Descriptions of the limits of a spacing."""
+
+
+class LengthAndAngle(click.ParamType):
+    """Length in mm and, optionally, angle in degrees, as in ``20`` or ``20,1.5``."""
+
+    name = "MM[,DEG]"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float | None]:
+        """Parse the text to m and rad; fail with the expected form."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            length, *angle = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not MM or MM,DEG as in 20,1.5.", param, ctx)
+        numbers = [length, *angle]
+        if len(angle) > 1 or not all(number > 0 and math.isfinite(number) for number in numbers):
+            self.fail(
+                f"{value!r} is not one or two numbers above 0, in mm and degrees.", param, ctx
+            )
+        if length > MAX_ACCURACY_MM or any(number > 180 for number in angle):
+            self.fail(f"{value!r} is not within 100000 mm and 180 degrees.", param, ctx)
+        return metres(length), math.radians(angle[0]) if angle else None
+
+
+MAX_ACCURACY_MM = 1e5
+
+odometry_options = section(
+    "Odometry and tags on the floor",
+    click.option(
+        "--drift",
+        type=click.FloatRange(0, 90),
+        metavar="DEG/M",
+        help="Drift of the heading of the odometry (standard deviation).  [default: 2.9]",
+    ),
+    click.option(
+        "--slip",
+        type=click.FloatRange(0, 50),
+        metavar="PERCENT",
+        help="Error of distances by odometry (standard deviation).  [default: 1.5]",
+    ),
+    click.option(
+        "--laying",
+        type=LengthAndAngle(),
+        metavar="MM[,DEG]",
+        help="Error of tags on the floor along x and y, and of their headings (standard "
+        "deviation).  [default: as surveyed, otherwise 1.5 mm, and 1 mm at each end of an edge]",
+    ),
+)
+
+
+def odometry_noise(drift: float | None, slip: float | None) -> OdometryNoise:
+    """Return the errors of odometry of the options."""
+    from dataclasses import replace
+
+    from locatk.core.streaming.planar_filter import OdometryNoise
+
+    noise = OdometryNoise()
+    if drift is not None:
+        noise = replace(noise, drift_rad_per_m=math.radians(drift))
+    if slip is not None:
+        noise = replace(noise, scale=slip / 100)
+    return noise
+
+
+def laying_of(laying: tuple[float, float | None] | None, tags: Any) -> tuple[float, float] | None:
+    """Return the standard deviations of tags on the floor; None for the default."""
+    from locatk.core.polaris.design.routes import laying_sigma
+
+    if laying is None:
+        return None
+    position_m, heading_rad = laying
+    return position_m, laying_sigma(tags)[1] if heading_rad is None else heading_rad
+
+
+def read_routes(
+    paths: Sequence[Path], columns: dict[str, str] | None, units: tuple[str, ...] | None
+) -> list[Route]:
+    """Read the waypoints of routes."""
+    import numpy as np
+
+    from locatk.core.errors import error_context
+    from locatk.core.routes import Route
+    from locatk.formats.importers.floors.site_csv import read_site_points
+
+    routes = []
+    for path in paths:
+        points, _ = read_site_points(path, columns, units or ())
+        with error_context(path):
+            routes.append(Route(np.array([[p.x_m, p.y_m] for p in points]), path.stem))
+    return routes
+
+
+def forecast_text(forecast: SiteForecast) -> str:
+    """Format a forecast in 80 columns."""
+    rows = [
+        ("routes", f"{_count(len(forecast.routes), 'route')}, {forecast.length_m:.4g} m"),
+        (
+            "tags passed",
+            f"{forecast.tags}; longest stretch without a tag {forecast.longest_gap_m:.3g} m",
+        ),
+        ("pose known", f"on {100 * forecast.covered_fraction:.3g} % of the length"),
+    ]
+    if math.isfinite(forecast.position_p95_m):
+        x_mm, y_mm = (1e3 * forecast.worst_m).tolist()
+        rows += [
+            (
+                "error on the route",
+                f"{_errors(forecast.position_p95_m, forecast.heading_p95_rad)} (95 %, live)",
+            ),
+            (
+                "error at a tag",
+                f"{_errors(forecast.fix_position_p95_m, forecast.fix_heading_p95_rad)} "
+                "(95 %, one pass)",
+            ),
+            (
+                "worst place",
+                f"x {x_mm:.0f}, y {y_mm:.0f} mm: {length_text(forecast.worst_position_p95_m)} "
+                "(95 %)",
+            ),
+        ]
+    return console.labelled(rows)
+
+
+def forecast_entry(forecast: SiteForecast) -> dict[str, Any]:
+    """Return a forecast for ``--json``; unknown errors are null."""
+    return {
+        "length_m": forecast.length_m,
+        "tags": forecast.tags,
+        "position_p95_m": forecast.position_p95_m,
+        "heading_p95_rad": forecast.heading_p95_rad,
+        "fix_position_p95_m": forecast.fix_position_p95_m,
+        "fix_heading_p95_rad": forecast.fix_heading_p95_rad,
+        "covered_fraction": forecast.covered_fraction,
+        "longest_gap_m": forecast.longest_gap_m,
+        "worst_m": forecast.worst_m,
+        "worst_position_p95_m": forecast.worst_position_p95_m,
+        "routes": [
+            {
+                "name": each.route.name,
+                "length_m": each.route.length_m,
+                "passes": [
+                    {
+                        "id": one.tag_id,
+                        "distance_m": one.distance_m,
+                        "offset_m": one.offset_m,
+                        "heading_rad": one.heading_rad,
+                        "play_m": one.play_m,
+                    }
+                    for one in each.passes
+                ],
+            }
+            for each in forecast.routes
+        ],
+        "warnings": list(forecast.warnings),
+    }
+
+
+def plan_text(plan: SpacingPlan) -> str:
+    """Format the plan of a spacing in 80 columns."""
+    limit = LIMITS[plan.limited_by]
+    rows = [
+        ("spacing", f"{length_text(plan.spacing_m)}; a larger one is limited by the {limit}"),
+    ]
+    if not plan.is_feasible:
+        rows = [("spacing", f"{length_text(plan.spacing_m)}, the smallest for separate passes")]
+    return console.labelled(rows)
+
+
+def plan_entry(plan: SpacingPlan) -> dict[str, Any]:
+    """Return the plan of a spacing for ``--json``."""
+    from dataclasses import asdict
+
+    return asdict(plan)
+
+
+def plan_warnings(plan: SpacingPlan, wanted: tuple[float, float]) -> list[str]:
+    """Return what is possible, and what would have to change, if the wanted accuracy is not."""
+    if plan.is_feasible:
+        return []
+    wish = length_text(wanted[0])
+    if math.isfinite(wanted[1]):
+        wish += f" and {math.degrees(wanted[1]):.2g} deg"
+    if plan.limited_by == "field":
+        return [f"{wish} is impossible: no pass over a tag is detected", *plan.remedies]
+    possible = _errors(plan.position_p95_m, plan.heading_p95_rad)
+    return [
+        f"{wish} (95 %) is impossible on this route: tags {length_text(plan.spacing_m)} apart give "
+        f"{possible}",
+        *plan.remedies,
+    ]
+
+
+def _errors(position_m: float, heading_rad: float) -> str:
+    return f"{length_text(position_m)}, {math.degrees(heading_rad):.2g} deg"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + "s" * (number != 1)

@@ -1,0 +1,382 @@
+"""Figures of the planning of Polaris: predictions against simulated drives and published recordings.
+
+Each of twenty tasks (fixed seeds) has a design of tags, a clearance, a speed, a route with tags at
+some spacing, and standard deviations of the odometry, of the magnets in the tags and of the tags on
+the floor. The prediction (:mod:`locatk.core.polaris.design.routes`) knows these standard deviations,
+the design and the route. Several drives are simulated, each over tags that were built and laid
+anew, with discs as cylinders (magpylib), conversions of the axes one after the other, and odometry
+with errors of scale and drift and a random walk of its heading. They are solved as by
+``locatk solve`` (poses at the tags) and as by ``locatk live`` (poses between the tags: that filter
+knows the tags behind it only, as the forecast does), with the designed positions of the tags.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
+from locatk.core.polaris.design.planning import ReadingConditions
+from locatk.core.polaris.design.routes import SiteForecast, forecast_routes, tag_fix_covariance
+from locatk.core.polaris.design.site import SitePoint, place_tags
+from locatk.core.polaris.mlx90393 import Settings
+from locatk.core.polaris.simulation.options import SimulationOptions, usual_bar
+from locatk.core.polaris.simulation.session import SimulatedSession, simulate
+from locatk.core.polaris.solver import solve
+from locatk.core.polaris.stream import PolarisStream
+from locatk.core.polaris.tag import Magnet, PlanarPose, Tags
+from locatk.core.routes import Route
+from locatk.core.simulation import random_stream
+from locatk.core.streaming.events import PoseEstimate
+from locatk.core.streaming.localizer import LiveLocalizer
+from locatk.core.streaming.planar_filter import OdometryNoise
+from locatk.core.streaming.tracker import DEFAULT_SETTINGS
+from locatk.core.trajectory import Trajectory
+from locatk.formats.benchmarks.figures import Figure, measure_or_explain
+
+Array = NDArray[np.float64]
+
+SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+"""Signs of the errors of scale and drift of the odometry in the drives of a task."""
+
+TASKS, DRIVES, TAGS = 20, len(SIGNS), 4
+"""Tasks, simulated drives of each, and tags along each route."""
+
+FIRST_SEED = 25_100
+
+RATE_HZ = 60.0
+"""Sampling rate: the highest of the MLX90393 with the settings of the published arrays, whose noise
+is known."""
+
+MAX_DISCS_M = ((2e-3, 0.5e-3, 1.45), (2e-3, 1e-3, 1.3), (3e-3, 1e-3, 1.3))
+"""Diameter, height and remanence [T] of the magnets."""
+
+MEDIAN_RATIO, TAIL_RATIO = 1.25, 2.0
+"""Goals: predicted over reached standard deviation, or its inverse, in the median and for nine of
+ten tasks."""
+
+RUN_UP_M = 0.2
+"""Distance before the first tag and after the last one."""
+
+CHUNK_SAMPLES = 6
+"""Samples of field and odometry that are given to the filter at once, a tenth of a second."""
+
+BUILD_SIGMA_M = 4e-4
+"""Standard deviation of the magnets in a tag along each axis: set by hand."""
+
+KINDS = (
+    "position at tags",
+    "heading at tags",
+    "position along the route",
+    "heading along the route",
+)
+
+
+@dataclass(frozen=True)
+class PlanningTask:
+    """One task: what is planned, and what is simulated.
+
+    Attributes
+    ----------
+    tags : Tags
+        With the designed site and the standard deviations of its tags.
+    route : Route
+        Through the middles of the tags.
+    use : ReadingConditions
+    noise : OdometryNoise
+    build_angle_rad : float
+        Standard deviation of the orientations of the magnets.
+    """
+
+    tags: Tags
+    route: Route
+    use: ReadingConditions
+    noise: OdometryNoise
+    build_angle_rad: float
+
+    def predict(self) -> SiteForecast:
+        """Return the forecast."""
+        return forecast_routes(self.tags, [self.route], self.use, self.noise)
+
+
+def make_task(number: int) -> PlanningTask:
+    """Draw a task."""
+    rng = np.random.default_rng(FIRST_SEED + number)
+    order = int(rng.integers(3, 5))
+    diameter_m, height_m, remanence_t = MAX_DISCS_M[rng.integers(len(MAX_DISCS_M))]
+    tags = Tags(
+        order=order,
+        magnets=int(rng.integers(5, 8)),
+        spacing_m=float(rng.uniform(0.03, 0.045)),
+        magnet=Magnet(diameter_m, height_m, remanence_t, ""),
+        clearance_m=float(rng.uniform(0.008, 0.012)),
+    )
+    spacing_m = float(rng.uniform(0.6, 1.5))
+    turns = rng.uniform(-math.radians(15), math.radians(15), TAGS - 1)
+    headings = np.cumsum(turns)
+    steps = spacing_m * np.column_stack([np.cos(headings), np.sin(headings)])
+    middle_m = np.concatenate([[[0.0, 0.0]], np.cumsum(steps, axis=0)])
+    # A robot passes a tag in the direction between its neighbours.
+    along = middle_m[np.minimum(np.arange(TAGS) + 1, TAGS - 1)]
+    along = along - middle_m[np.maximum(np.arange(TAGS) - 1, 0)]
+    direction = np.arctan2(along[:, 1], along[:, 0])
+    tag_heading = direction + rng.choice(4, TAGS) * math.pi / 2
+    ends = RUN_UP_M * np.column_stack([np.cos(direction), np.sin(direction)])
+    before_m, after_m = middle_m[:1] - ends[:1], middle_m[-1:] + ends[-1:]
+    points = [
+        SitePoint(x, y, heading)
+        for (x, y), heading in zip(middle_m.tolist(), tag_heading.tolist(), strict=True)
+    ]
+    site = place_tags(tags, points, min_distance=2)
+    laid = float(rng.uniform(0.5e-3, 2e-3)), math.radians(rng.uniform(0.2, 0.8))
+    sigma = dict.fromkeys(site.site, (laid[0], laid[0], laid[1]))
+    noise = OdometryNoise(
+        scale=float(rng.uniform(0.003, 0.015)),
+        rotation_scale=0.0,
+        drift_rad_per_m=float(rng.uniform(0.005, 0.05)),
+        distance_m=0.0,
+        heading_rad=float(rng.uniform(0.002, 0.01)),
+        rotation_rad=0.0,
+        slip_m=0.0,
+        slip_rad=0.0,
+    )
+    return PlanningTask(
+        replace(site, site_sigma=sigma),
+        Route(np.concatenate([before_m, middle_m, after_m])),
+        ReadingConditions(
+            rate_hz=RATE_HZ, settings=Settings(), speed_mps=float(rng.uniform(0.05, 0.2))
+        ),
+        noise,
+        math.radians(rng.uniform(1, 5)),
+    )
+
+
+# ---- a simulated drive
+
+
+def drive(
+    task: PlanningTask, seed: int, signs: tuple[float, float]
+) -> tuple[SimulatedSession, Trajectory]:
+    """Simulate a drive over tags that were laid anew; return it with its odometry.
+
+    The constant errors of the odometry, scale and drift, are plus or minus their standard
+    deviations: four drives with all ``signs`` have exactly these standard deviations, and no
+    correlation, which four random numbers would not.
+    """
+    rng = np.random.default_rng([FIRST_SEED, seed])
+    laid = {
+        tag_id: PlanarPose(*(np.array([p.x_m, p.y_m, p.heading_rad]) + s * rng.normal(size=3)))
+        for (tag_id, p), s in zip(task.tags.site.items(), _sigmas(task.tags), strict=True)
+    }
+    session = simulate(
+        replace(task.tags, site=laid, site_sigma={}),
+        SimulationOptions(
+            array=usual_bar(rate_hz=RATE_HZ, noise_t=None),
+            rate_hz=RATE_HZ,
+            route=_order_along(task),
+            speed_mps=task.use.speed_mps,
+            build_angle_rad=task.build_angle_rad,
+            build_place_m=BUILD_SIGMA_M,
+            build_seed=seed,
+            odometry=True,
+            odometry_scale=signs[0] * task.noise.scale,
+            odometry_turn_rad=task.noise.heading_rad,
+            seed=seed,
+        ),
+    )
+    if session.odometry is None:
+        raise AssertionError("odometry was asked for")
+    return session, with_drift(session.odometry, signs[1] * task.noise.drift_rad_per_m)
+
+
+def with_drift(odometry: Trajectory, drift_rad_per_m: float) -> Trajectory:
+    """Return odometry whose heading drifts by an angle per metre, besides its other errors."""
+    position = odometry.position[:, 0] + 1j * odometry.position[:, 1]
+    steps = np.diff(position)
+    rotation = np.r_[0.0, drift_rad_per_m * np.cumsum(np.abs(steps))]
+    drifted = np.r_[0.0, np.cumsum(steps * np.exp(1j * (rotation[1:] + rotation[:-1]) / 2))]
+    heading = heading_from_quaternion(odometry.quaternion) + rotation
+    return replace(
+        odometry,
+        position=np.column_stack([drifted.real, drifted.imag, odometry.position[:, 2]]),
+        quaternion=quaternion_from_heading(heading),
+    )
+
+
+def _sigmas(tags: Tags) -> list[Array]:
+    return [np.array(tags.site_sigma[tag_id]) for tag_id in tags.site]
+
+
+def _order_along(task: PlanningTask) -> tuple[int, ...]:
+    """Return the ids of the tags in the order of the route."""
+    position = np.array([[p.x_m, p.y_m] for p in task.tags.site.values()])
+    ids = np.array(list(task.tags.site))
+    middle_m = task.route.waypoint_m[1:-1]
+    distance = np.hypot(*(position[None] - middle_m[:, None]).transpose(2, 0, 1))
+    return tuple(ids[distance.argmin(axis=1)].tolist())
+
+
+# ---- reached errors
+
+
+def errors_at_tags(task: PlanningTask, session: SimulatedSession, odometry: Trajectory) -> Array:
+    """Return the errors (k, 3) of x, y [m] and heading [rad] of solved poses over the tags."""
+    solution = solve([session.samples], task.tags, odometry=(odometry,))
+    read = {detection.tag_id for detection in solution.detections}
+    times = [each.time_ns for each in session.crossings if each.tag_id in read]
+    if not solution.trajectories or not times:
+        return np.empty((0, 3))
+    return _errors(solution.trajectories[0], session.truth, np.array(times))
+
+
+def errors_along(task: PlanningTask, session: SimulatedSession, odometry: Trajectory) -> Array:
+    """Return the errors (n, 3) of live poses from the first tag to the last one."""
+    settings = replace(DEFAULT_SETTINGS["polaris"], odometry=task.noise)
+    localizer = LiveLocalizer(PolarisStream(task.tags), settings)
+    samples, events = session.samples, []
+    for first in range(0, len(samples.time_ns), CHUNK_SAMPLES):
+        rows = np.arange(first, min(first + CHUNK_SAMPLES, len(samples.time_ns)))
+        events += localizer.push(
+            replace(samples, time_ns=samples.time_ns[rows], field_t=samples.field_t[rows])
+        )
+        events += localizer.push(odometry.select(rows))
+    poses = {each.time_ns: each for each in events if isinstance(each, PoseEstimate)}
+    first_ns, last_ns = session.crossings[0].time_ns, session.crossings[-1].time_ns
+    times = np.array(sorted(time for time in poses if first_ns <= time <= last_ns), np.int64)
+    if not len(times):
+        return np.empty((0, 3))
+    live = Trajectory(
+        samples.device,
+        "site",
+        times,
+        np.array([poses[time].position for time in times.tolist()]),
+        np.array([poses[time].quaternion for time in times.tolist()]),
+        np.array([poses[time].covariance for time in times.tolist()]),
+    )
+    return _errors(live, session.truth, times)
+
+
+def _errors(estimate: Trajectory, truth: Trajectory, time_ns: NDArray[np.int64]) -> Array:
+    difference = _planar(estimate, time_ns) - _planar(truth, time_ns)
+    difference[:, 2] = np.remainder(difference[:, 2] + math.pi, math.tau) - math.pi
+    return difference
+
+
+def _planar(trajectory: Trajectory, time_ns: NDArray[np.int64]) -> Array:
+    """Return x, y and heading (n, 3) at some times."""
+    heading = np.unwrap(heading_from_quaternion(trajectory.quaternion))
+    columns = (*trajectory.position[:, :2].T, heading)
+    start_ns = trajectory.time_ns[0]
+    known_s = (trajectory.time_ns - start_ns) * 1e-9
+    wanted_s = (time_ns - start_ns) * 1e-9
+    return np.column_stack([np.interp(wanted_s, known_s, column) for column in columns])
+
+
+@dataclass(frozen=True)
+class TaskErrors:
+    """Predicted and reached rms errors of a task, in the order of :data:`KINDS`.
+
+    Attributes
+    ----------
+    predicted, reached : (4,) ndarray
+        In m and rad.
+    read, passed : int
+        Tags that were read, and that were passed, in all drives.
+    """
+
+    predicted: Array
+    reached: Array
+    read: int
+    passed: int
+
+    @property
+    def ratio(self) -> Array:
+        """(4,) predicted over reached."""
+        return self.predicted / self.reached
+
+
+def measure_task(task: PlanningTask, seed: int, drives: int = DRIVES) -> TaskErrors:
+    """Predict a task, and simulate and solve its drives."""
+    (route,) = task.predict().routes
+    accuracy = route.accuracy
+    fixes = np.array(
+        [
+            tag_fix_covariance(
+                task.tags,
+                task.use,
+                tag_id=each.tag_id,
+                heading_rad=each.heading_rad,
+                offset_m=each.offset_m,
+            )
+            for each in route.passes
+        ]
+    )
+    first_m, last_m = route.passes[0].distance_m, route.passes[-1].distance_m
+    weight = np.diff(accuracy.distance_m, prepend=0.0)
+    weight[(accuracy.distance_m <= first_m) | (accuracy.distance_m > last_m)] = 0.0
+    predicted2 = [
+        np.trace(fixes[:, :2, :2], axis1=1, axis2=2).mean(),
+        fixes[:, 2, 2].mean(),
+        _weighted_mean(accuracy.position_sigma_m**2, weight),
+        _weighted_mean(accuracy.heading_sigma_rad**2, weight),
+    ]
+    at_tags, along, passed = [], [], 0
+    for number in range(drives):
+        session, odometry = drive(task, seed + number, SIGNS[number % len(SIGNS)])
+        at_tags.append(errors_at_tags(task, session, odometry))
+        along.append(errors_along(task, session, odometry))
+        passed += len(session.crossings)
+    reached2 = []
+    for part in (at_tags, along):
+        x, y, heading = np.mean(np.concatenate(part) ** 2, axis=0)
+        reached2 += [x + y, heading]
+    read = sum(len(part) for part in at_tags)
+    return TaskErrors(np.sqrt(predicted2), np.sqrt(reached2), read, passed)
+
+
+def _weighted_mean(values: Array, weight: Array) -> float:
+    return float((values[weight > 0] * weight[weight > 0]).sum() / weight.sum())
+
+
+def simulated_figures(tasks: int = TASKS, drives: int = DRIVES) -> list[Figure]:
+    """Compare the predictions of random tasks with simulated drives."""
+    results = [
+        measure_task(make_task(number), FIRST_SEED + DRIVES * number, drives)
+        for number in range(tasks)
+    ]
+    ratios = np.array([result.ratio for result in results])
+    read, passed = sum(r.read for r in results), sum(r.passed for r in results)
+    how = (
+        f"{tasks} random tasks, {drives} simulated drives over {TAGS} tags each, "
+        f"{read} of {passed} tags read"
+    )
+    figures = []
+    for kind, ratio in zip(KINDS, ratios.T, strict=True):
+        solver = "`locatk solve`" if kind.endswith("tags") else "`locatk live`"
+        figures += ratio_figures(
+            f"polaris: predicted over reached, {kind}", ratio, f"{how}; {solver}"
+        )
+    return figures
+
+
+def ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
+    """Return median and tails of ratios as figures; targets are given as the larger of a ratio and
+    its inverse."""
+    low, middle, high = np.percentile(ratio, [5, 50, 95])
+    return [
+        Figure(f"{name}: median", float(middle), "", f"{how}; goal 0.8 to 1.25"),
+        Figure(
+            f"{name}: median, larger of ratio and inverse",
+            float(max(middle, 1 / middle)),
+            "",
+            how,
+            MEDIAN_RATIO,
+        ),
+        Figure(f"{name}: 5th percentile", float(low), "", how, 1 / TAIL_RATIO, "higher"),
+        Figure(f"{name}: 95th percentile", float(high), "", how, TAIL_RATIO),
+    ]
