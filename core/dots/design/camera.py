@@ -39,9 +39,16 @@ PAPER_LEVEL = 210.0
 
 MAX_LEVEL = 255.0
 
+GOOD_NOISE_LEVELS = 4.0
+"""Noise of a pixel of paper, in grey values, from which more light hardly helps: other errors of a
+dot are larger."""
+
 
 EXPOSURE_MOTION_PITCHES = 1 / 11
 """Motion during a chosen exposure: one pixel of the paper's camera, whose pitch is 11 px."""
+
+MAX_LIGHT_DEFICIT = 4.0
+"""Ratio of the light that is needed to the least that passes without a warning."""
 
 LUMEN_PHOTONS_PER_S = 4.09e15
 """Photons of one lumen at 555 nm: 1 / 683 W over the energy of a photon, 3.58e-19 J (SI: candela).
@@ -327,8 +334,9 @@ class CameraReport:
         Longest exposure with which the frames at the wanted speeds are decoded.
     max_speed_mps, max_yaw_rate_rps : float
         Largest speeds at which frames with this exposure are decoded, each without the other.
-    needed_illuminance_lx : float
-        On the paper, for a well exposed frame.
+    needed_illuminance_lx, full_illuminance_lx : float
+        On the paper: for a noise of :data:`GOOD_NOISE_LEVELS` with gain, and for a well exposed
+        frame without gain.
     noise_levels : float
         Standard deviation of a pixel of paper in grey values.
     dot_sigma_m : float
@@ -376,6 +384,7 @@ class CameraReport:
     max_speed_mps: float
     max_yaw_rate_rps: float
     needed_illuminance_lx: float
+    full_illuminance_lx: float
     noise_levels: float
     dot_sigma_m: float
     position_sigma_m: float
@@ -438,6 +447,7 @@ def design_camera(setup: CameraSetup) -> CameraReport:
         max_speed_mps=tolerated_m / setup.exposure_s,
         max_yaw_rate_rps=tolerated_m / (setup.exposure_s * corner_m),
         needed_illuminance_lx=needed_illuminance_lx(setup),
+        full_illuminance_lx=full_illuminance_lx(setup),
         noise_levels=noise,
         dot_sigma_m=quality.dot_sigma_m,
         position_sigma_m=quality.accuracy.position_pitches * setup.pitch_m,
@@ -543,7 +553,15 @@ def full_well_e(setup: CameraSetup) -> float:
 
 
 def needed_illuminance_lx(setup: CameraSetup) -> float:
-    """Return the illuminance of the paper with which its grey value is :data:`PAPER_LEVEL`."""
+    """Return the illuminance of the paper with which its noise is :data:`GOOD_NOISE_LEVELS`."""
+    relative = (GOOD_NOISE_LEVELS / PAPER_LEVEL) ** 2
+    read_variance = (setup.sensor.read_noise_e * setup.binning) ** 2
+    electrons = (1 + math.sqrt(1 + 4 * relative * read_variance)) / (2 * relative)
+    return electrons / electrons_of_paper(setup, 1.0)
+
+
+def full_illuminance_lx(setup: CameraSetup) -> float:
+    """Return the illuminance with which the paper has :data:`PAPER_LEVEL` without gain."""
     return PAPER_LEVEL / MAX_LEVEL * full_well_e(setup) / electrons_of_paper(setup, 1.0)
 
 
@@ -693,12 +711,18 @@ def _light_warnings(report: CameraReport) -> Iterator[str]:
             f"{setup.exposure_s * 1e6:.0f} us: pulse the LEDs instead"
         )
     if setup.illuminance_lx is not None and setup.noise_levels is None:
-        ratio = setup.illuminance_lx / report.needed_illuminance_lx
-        if ratio > MAX_LEVEL / PAPER_LEVEL:
+        excess = setup.illuminance_lx / report.full_illuminance_lx
+        if excess > MAX_LEVEL / PAPER_LEVEL:
             yield (
-                f"the paper is overexposed {ratio:.1f} times: expose "
-                f"{setup.exposure_s / ratio * 1e6:.0f} us, or dim the light to "
-                f"{report.needed_illuminance_lx:.3g} lx"
+                f"the paper is overexposed {excess:.1f} times: expose "
+                f"{setup.exposure_s / excess * 1e6:.0f} us, or dim the light to "
+                f"{report.full_illuminance_lx:.3g} lx"
+            )
+        elif setup.illuminance_lx < report.needed_illuminance_lx / MAX_LIGHT_DEFICIT:
+            yield (
+                f"{setup.illuminance_lx:.3g} lx on the paper give a noise of "
+                f"{report.noise_levels:.0f} grey values: light it with "
+                f"{report.needed_illuminance_lx:.3g} lx, as by pulsed LEDs"
             )
 
 
