@@ -164,7 +164,9 @@ def command(
     if len(sources) != 1:
         raise click.UsageError("Give one of --grid, --points and --route.")
     if points is None and spacing is None and accuracy is None:
-        raise click.UsageError("--grid and --route need --spacing, or --route an --accuracy.")
+        raise click.UsageError(
+            "--grid and --route need --spacing. --route may have --accuracy instead."
+        )
     if accuracy is not None and (route is None or spacing is not None):
         raise click.UsageError("--accuracy is for --route, instead of --spacing.")
     if accuracy is None and any(each is not None for each in (drift, slip, laying)):

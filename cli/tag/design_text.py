@@ -13,6 +13,7 @@ from locatk.core.units import length_text
 
 if TYPE_CHECKING:
     from locatk.core.polaris.design.accuracy_bound import AccuracyBound
+    from locatk.core.polaris.design.environment import Environment
     from locatk.core.polaris.design.planning import DesignReport
     from locatk.core.polaris.tag import Tags
 
@@ -52,11 +53,14 @@ def text(report: DesignReport) -> str:
                     _accuracy("magnet, each step free", report.free_speed, False),
                     _accuracy("tag, speed known", report.known_speed, True),
                     _accuracy("tag, each step free", report.free_speed, True),
+                    _accuracy("magnet, as placed", report.placed, False),
+                    _accuracy("tag, as placed", report.placed, True),
                 ),
             ),
+            "As placed: with errors of the magnets in the tag of "
+            f"{length_text(report.build_m)} and {math.degrees(report.placement_rad):.2g} deg; the\n"
+            "others are bounds by noise and environment.",
             _materials_text(report),
-            "Accuracies are bounds by noise alone: errors of the published recordings are at\n"
-            "most 2 times as large in angle, and 10 times in position.",
         )
     )
 
@@ -142,6 +146,7 @@ def _limits(report: DesignReport) -> list[tuple[str, str, str, str]]:
         ),
         ("field midway of sensors", _ut(report.between_t), "", ""),
         ("noise x, y, z", f"{noise} uT", "", report.noise_from),
+        *_environment(use.environment),
         (
             "signal to noise, both",
             f"{report.signal_to_noise:.0f}, {report.between_to_noise:.0f}",
@@ -182,6 +187,15 @@ def _limits(report: DesignReport) -> list[tuple[str, str, str, str]]:
             f"array, {length_text(report.play_m)} free",
         ),
     ]
+
+
+def _environment(environment: Environment) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the row of an environment with varying fields."""
+    if environment.field_t > 0:
+        extent = (
+            "all sensors" if environment.is_common else f"in {length_text(environment.length_m)}"
+        )
+        yield "environment", _ut(environment.field_t), extent, environment.name
 
 
 def _materials_text(report: DesignReport) -> str:

@@ -150,9 +150,6 @@ def magnet_covariance(
     columns, path_column = _derivatives(tags, position_m, angle_rad, array, path_m, nuisance)
     columns, path_column = columns / noise, path_column / noise
     has_environment = environment.field_t > 0
-    if has_environment and environment.is_common:
-        columns = columns - columns.mean(2, keepdims=True)
-        path_column = path_column - path_column.mean(1, keepdims=True)
     # Offsets (and drifts) are linear unknowns: removing their part of each sensor's axis
     # marginalizes them.
     remaining = _without_background(path_m, 1 if has_environment else 0)
@@ -210,12 +207,15 @@ def accuracy_bound(
     offset_m: float = 0.0,
     nuisance: NuisanceModel = "steps",
     environment: Environment = QUIET,
+    build_m: float = 0.0,
+    build_rad: float = 0.0,
 ) -> AccuracyBound:
     """Return the bound as rms over the magnets of all ``layouts``.
 
     A magnet below a sensor is measured better than one between two sensors. The layouts are
-    therefore distributed evenly over the spacing of the sensors, around ``offset_m``. The other
-    parameters and the errors are those of :func:`magnet_covariance`.
+    therefore distributed evenly over the spacing of the sensors, around ``offset_m``.
+    ``build_m`` and ``build_rad`` are standard deviations of the magnets in the tag, along each axis
+    and of the angle. The other parameters and the errors are those of :func:`magnet_covariance`.
     """
     spacing_m = float(np.diff(array.position_m[:2, 1])[0]) if len(array) > 1 else 0.0
     count = len(layouts)
@@ -231,6 +231,8 @@ def accuracy_bound(
             nuisance=nuisance,
             environment=environment,
         )
+        built = np.square([build_m, build_m, build_rad])
+        covariance = covariance + np.diag(np.tile(built, len(layout.cells)))
         magnets.append(np.diag(covariance).reshape(-1, 3).mean(0))
         poses.append(np.diag(pose_covariance(tags, layout, covariance, heading_rad)))
     variances = np.concatenate([np.mean(magnets, 0), np.mean(poses, 0)])

@@ -29,6 +29,7 @@ from locatk.core.polaris.design.accuracy_bound import (
 )
 from locatk.core.polaris.design.environment import QUIET, Environment
 from locatk.core.polaris.design.materials import bill_of_materials
+from locatk.core.polaris.identification.matching import AS_BUILT_SIGMA_M, HAND_BUILT_SIGMA_M
 from locatk.core.polaris.mlx90393 import Settings, published_bar, settings_for_rate
 from locatk.core.polaris.tag import Magnet, TagLayout, Tags
 from locatk.core.units import length_text
@@ -127,7 +128,8 @@ class DesignReport:
     noise_from : {"given", "measured", "assumed"}
         Origin of ``noise_t``.
     signal_to_noise, between_to_noise : float
-        ``peak_t`` and ``between_t`` over the noise of the horizontal axes.
+        ``peak_t`` and ``between_t`` over the noise of the horizontal axes, which includes the
+        fields of the environment that differ between sensors.
     max_rate_hz, rate_hz : float
         Highest rate of the magnetometer, and the rate of this report.
     step_m : float
@@ -141,6 +143,11 @@ class DesignReport:
     known_speed, free_speed : AccuracyBound
         Accuracy of one pass if the speed is known, and if each step is unknown; ``nan`` if there
         are too few samples.
+    placed : AccuracyBound
+        ``free_speed`` with the errors of the magnets in the tag: of their positions
+        (``build_m``) and orientations (``placement_rad``).
+    build_m : float
+        Standard deviation of the position of a magnet in the tag along each axis.
     placement_rad : float
         Standard deviation of the orientations of the placed magnets.
     max_orientations : int
@@ -178,6 +185,8 @@ class DesignReport:
     range_t: float
     known_speed: AccuracyBound
     free_speed: AccuracyBound
+    placed: AccuracyBound
+    build_m: float
     placement_rad: float
     max_orientations: int
     misread: float
@@ -304,7 +313,8 @@ def evaluate_design(
         )
 
     array, noise_from = sensor_array(use)
-    horizontal_noise = float(np.sqrt(np.mean(array.noise_t[:2] ** 2)))
+    varying_t = 0.0 if use.environment.is_common else use.environment.field_t
+    horizontal_noise = float(np.sqrt(np.mean(array.noise_t[:2] ** 2) + varying_t**2))
     midway = use.sensor_spacing_m / 2 if use.sensors > 1 else 0.0
     peak = _field_strength(magnet, [0, 0, clearance])
     between = min(
@@ -316,8 +326,10 @@ def evaluate_design(
     rate = min(use.rate_hz or math.inf, part.max_rate_hz)
     step = use.speed_mps / rate
     layouts = sample_layouts(tags, SAMPLED_LAYOUTS)
-    free_speed = _accuracy(tags, layouts, array, step, "steps")
+    environment = use.environment
     placement = _placement_sigma(tags) if use.placement_rad is None else use.placement_rad
+    build = AS_BUILT_SIGMA_M if tags.built else HAND_BUILT_SIGMA_M
+    free_speed = _accuracy(tags, layouts, array, step, "steps", environment)
     reading = free_speed.angle_rad if math.isfinite(free_speed.angle_rad) else 0.0
     angle_sigma = math.hypot(placement, reading)
     half_step_sigmas = math.pi / tags.orientations / angle_sigma
@@ -346,8 +358,10 @@ def evaluate_design(
         samples=half_across / step,
         max_speed_mps=half_across * rate / MIN_SAMPLES_PER_FIELD,
         range_t=float(np.min(array.range_t)),
-        known_speed=_accuracy(tags, layouts, array, step, "strength"),
+        known_speed=_accuracy(tags, layouts, array, step, "strength", environment),
         free_speed=free_speed,
+        placed=_accuracy(tags, layouts, array, step, "steps", environment, build, placement),
+        build_m=build,
         placement_rad=placement,
         max_orientations=int(math.pi / (ORIENTATION_MARGIN_SIGMAS * angle_sigma)),
         misread=1 - math.erf(half_step_sigmas / math.sqrt(2)) ** tags.magnets,
@@ -374,10 +388,22 @@ def _accuracy(
     array: SensorArray,
     step_m: float,
     nuisance: NuisanceModel,
+    environment: Environment,
+    build_m: float = 0.0,
+    build_rad: float = 0.0,
 ) -> AccuracyBound:
     """Return the accuracy bound; ``nan`` if there are too few samples to determine the magnets."""
     try:
-        return accuracy_bound(tags, layouts, array, step_m=step_m, nuisance=nuisance)
+        return accuracy_bound(
+            tags,
+            layouts,
+            array,
+            step_m=step_m,
+            nuisance=nuisance,
+            environment=environment,
+            build_m=build_m,
+            build_rad=build_rad,
+        )
     except InputError:
         return AccuracyBound(*[math.nan] * 6)
 
@@ -443,10 +469,12 @@ def _warnings(report: DesignReport) -> Iterator[str]:
             f"{report.max_speed_mps:.2f} m/s, or sample faster"
         )
     if report.between_to_noise < MIN_SIGNAL_TO_NOISE:
+        disturbance = use.environment.field_t and not use.environment.is_common
+        noise = f"noise and the {use.environment.name} environment" if disturbance else "noise"
         yield (
             f"the field is too weak: {report.between_t * 1e6:.2g} uT midway between two sensors, "
-            f"{report.between_to_noise:.1f} times the noise and not {MIN_SIGNAL_TO_NOISE:g}; take "
-            "larger magnets, less clearance or sensors closer together"
+            f"{report.between_to_noise:.1f} times the {noise} and not {MIN_SIGNAL_TO_NOISE:g}; "
+            "take larger magnets, less clearance or sensors closer together"
         )
     if report.peak_t + MAX_EARTH_FIELD_T > report.range_t:
         yield (
@@ -523,6 +551,14 @@ def _notes(report: DesignReport) -> Iterator[str]:
         yield (
             f"Crossed at 45 degrees the tag is {length_text(report.diagonal_m)} wide, more than "
             f"the array's {length_text(report.array_m)}: keep its heading near 0, 90, 180 or 270."
+        )
+    if use.environment.field_t > 0:
+        yield (
+            f"The environment {use.environment.name} is assumed to vary by "
+            f"{use.environment.field_t * 1e6:.2g} uT during a pass. Drive the array over your "
+            "floor without tags, and give the standard deviation of that recording as "
+            "--environment; stronger magnets and less clearance reduce its effect, more sensors "
+            "only that of noise."
         )
     if tags.codec == "mosk" and tags.min_distance < 2:
         yield (
