@@ -5,8 +5,14 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from locatk.core.advice.answer import Certainty, Check
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.advice.answer import AccuracyMap, Certainty, Check
 from locatk.core.advice.task import Task
+from locatk.core.lighthouse.design.visibility import is_inside
+
+Array = NDArray[np.float64]
 
 IRON_FIELDS_T = {"none": 0.0, "reinforced": 3e-6, "plates": 30e-6}
 """Standard deviation [T] of the field of iron in the floor over a few centimetres. Reinforced: see
@@ -16,6 +22,9 @@ centimetres below the sensors differs by tens of microtesla from place to place;
 MOTOR_FIELD_T = 2.6e-6
 """Standard deviation [T] of the field of motors during a pass, see
 :data:`locatk.core.polaris.design.environment.MOTORS`."""
+
+MAP_POINTS = 42
+"""Points of a map along each side of the area, both ends included."""
 
 MIN_COVERAGE = 0.95
 """Fraction of area or routes on which a position must be known."""
@@ -79,6 +88,19 @@ def driving_check(what: str) -> Check:
         "ranges of the sensors in the papers",
         "Robots that drive",
     )
+
+
+def uniform_map(
+    task: Task, error_m: float, infrastructure_m: Array, infrastructure: str
+) -> AccuracyMap:
+    """Return the map of an error that is the same in the whole area."""
+    low, high = task.corners_m.min(axis=0), task.corners_m.max(axis=0)
+    x, y = (
+        np.linspace(first, last, MAP_POINTS)[1:-1] for first, last in zip(low, high, strict=True)
+    )
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    points = points[is_inside(task.corners_m, points)]
+    return AccuracyMap(points, np.full(len(points), error_m), infrastructure_m, infrastructure)
 
 
 def disturbance_t(task: Task) -> float:

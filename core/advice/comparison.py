@@ -134,7 +134,7 @@ def _budget_check(advice: SystemAdvice, task: Task) -> Check:
         is_met = False if total.amount > task.budget else True if is_complete else None
     return Check(
         "cost",
-        task.currency if is_comparable else "",
+        task.currency,
         total.amount if is_complete else text,
         task.budget,
         is_met,

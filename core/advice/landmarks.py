@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from locatk.core.advice.answer import AccuracyMap, Check, Power, SystemAdvice
+from locatk.core.advice.answer import Check, Power, SystemAdvice
 from locatk.core.advice.checks import (
     MIN_COVERAGE,
     condition_check,
     disturbance_t,
     limit_check,
     magnetic_checks,
+    uniform_map,
 )
 from locatk.core.advice.task import Task
 from locatk.core.advice.work import work_steps
@@ -128,7 +129,6 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
         *magnetic_checks(task, "bars"),
         *_outdoor_check(task),
     ]
-    points = floor_points(floor)
     return SystemAdvice(
         "landmarks",
         f"{landmarks} landmarks of four bars, {1e3 * pitch_m:.0f} mm apart, {rows} x {columns}, "
@@ -171,9 +171,7 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
             "locatk solve drive.mcap -o solved.mcap",
             "locatk eval solved.mcap --truth drive.mcap",
         ),
-        accuracy_map=AccuracyMap(
-            points, np.full(len(points), forecast.position_p95_m), points, "landmarks"
-        ),
+        accuracy_map=uniform_map(task, forecast.position_p95_m, floor_points(floor), "landmarks"),
     )
 
 

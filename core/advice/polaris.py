@@ -185,10 +185,9 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
         commands=(
             f"locatk tag design --clearance {1e3 * task.clearance_m:g} --count {max(count, 1)} "
             "-o tag.toml",
-            f"locatk site design tag.toml --route route.csv --accuracy {1e3 * task.position_m:g} "
-            "-o site.toml",
+            _site_command(task, routes, plan),
             "locatk print site site.toml -o site.pdf",
-            "locatk simulate polaris site.toml -o drive.mcap",
+            "locatk simulate polaris site.toml -o drive.mcap --odometry",
             "locatk solve drive.mcap -o solved.mcap",
             "locatk eval solved.mcap --truth drive.mcap",
         ),
@@ -198,6 +197,21 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
 
 ROBOT_PARTS = ("magnetometer", "microcontroller")
 POWER_SOURCE = "Polaris paper, section 8.5, array and computing"
+
+
+def _site_command(task: Task, routes: tuple[Route, ...], plan: SpacingPlan) -> str:
+    """Return the command that places the tags along the first route, or on a grid of lanes."""
+    if task.routes:
+        return (
+            f"locatk site design tag.toml --route {task.routes[0].name}.csv "
+            f"--accuracy {1e3 * task.position_m:g} -o site.toml"
+        )
+    spacing_m = LANE_SPACING_M if math.isnan(plan.spacing_m) else plan.spacing_m
+    columns = math.ceil(max((route.length_m for route in routes), default=0.0) / spacing_m) + 1
+    return (
+        f"locatk site design tag.toml --grid {max(len(routes), 1)}x{columns} "
+        f"--spacing {1e3 * spacing_m:.0f} -o site.toml"
+    )
 
 
 def environment_of(task: Task) -> Environment:

@@ -135,13 +135,13 @@ class Task:
                 _require(value, name, math.inf, "above 0")
         if self.robots < 1:
             raise InputError("no robots", hint="Give 1 or more")
-        for value, choices, name in (
+        for word, choices, name in (
             (self.infrared, INFRARED, "infrared"),
             (self.iron, IRON, "iron"),
             *((work, FLOOR_WORK, "floor") for work in self.floor_work),
         ):
-            if value not in choices:
-                raise InputError(f"{name} {value!r}", hint=f"One of {', '.join(choices)}")
+            if word not in choices:
+                raise InputError(f"{name} {word!r}", hint=f"One of {', '.join(choices)}")
         if self.outline_m is not None:
             object.__setattr__(self, "outline_m", checked_outline(self.outline_m))
 

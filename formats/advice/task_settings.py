@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from locatk.core.advice.task import FLOOR_WORK, INFRARED, IRON, Task
 from locatk.core.errors import error_context
+from locatk.core.lighthouse.room import rectangle
 from locatk.core.routes import Route
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
@@ -43,7 +45,8 @@ class Rectangle:
 
     def parse(self, value: Any, unit: Unit = NO_UNIT) -> tuple[float, float]:
         try:
-            return Row(POSITIVE, 2).parse(value)  # type: ignore[return-value]
+            first, second = Row(POSITIVE, 2).parse(value)
+            return first, second
         except InvalidValueError:
             raise InvalidValueError(f"expected {self.expected}") from None
 
@@ -246,15 +249,25 @@ def task_of(settings: Mapping[str, Any]) -> Task:
     """
     values = CONFIG.in_si(settings)
     routes = tuple(_read_route(Path(path)) for path in values.pop("area.routes", None) or ())
+    if routes and not {"size_m", "outline_m"} & set(values):
+        values["outline_m"] = _around(routes, values.get("diameter_m", Task.diameter_m))
     floor = values.pop("area.floor", None)
     if floor is not None:
         values["floor_work"] = frozenset(floor) - {UNTOUCHED}
     if values.get("outline_m") is not None:
         values["outline_m"] = np.array(values["outline_m"], float)
-    return with_values(Task(), {**values, "routes": routes})  # type: ignore[no-any-return]
+    task: Task = with_values(Task(), {**values, "routes": routes})
+    return task
+
+
+def _around(routes: Sequence[Route], margin_m: float) -> NDArray[np.float64]:
+    """Return the rectangle (4, 2) around routes and the robots on them."""
+    waypoints = np.concatenate([route.waypoint_m for route in routes])
+    low, high = waypoints.min(axis=0) - margin_m, waypoints.max(axis=0) + margin_m
+    return rectangle(*(high - low).tolist(), (float(low[0]), float(low[1])))
 
 
 def _read_route(path: Path) -> Route:
-    points, _ = read_site_points(path, None, ("mm",))
+    points, _ = read_site_points(path)
     with error_context(path):
         return Route(np.array([[point.x_m, point.y_m] for point in points]), path.stem)
