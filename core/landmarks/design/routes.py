@@ -13,6 +13,7 @@ Nothing here is simulated or measured. Landmarks count as they were built, as fa
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -100,9 +101,9 @@ class RouteVisit:
     offset_m : float
         Distance of that point from the centre.
     accuracy : VisitAccuracy
-        Relative to the landmark.
+        Relative to the landmark, at the point of the fix.
     fix : RouteFix
-        On the map, installation of the landmark included.
+        On the map, installation of the landmark included (:func:`find_visits`).
     """
 
     cell: Cell
@@ -137,7 +138,7 @@ class RouteCheck:
         Places and headings of the map, besides the true one, that read the same along the whole
         route; 0 if the robot is localized.
     accuracy : RouteAccuracy
-        Of a filter or smoother with the fixes of all visits that give a pose.
+        Of a filter with the fixes since the robot was localized, or of a smoother with all fixes.
     longest_m : (float, float)
         Start and end of the longest stretch without a fix, along the route.
     covered_fraction : float
@@ -228,7 +229,13 @@ def check_routes(
     checks = []
     for route in routes:
         visits = find_visits(
-            floor, route, noise, errors=errors, speed_mps=speed_mps, sensors_m=sensors_m
+            floor,
+            route,
+            noise,
+            errors=errors,
+            speed_mps=speed_mps,
+            sensors_m=sensors_m,
+            is_smoothed=is_smoothed,
         )
         check = _check_route(
             floor, route, visits, noise, evidence, speed_mps=speed_mps, is_smoothed=is_smoothed
@@ -249,11 +256,14 @@ def find_visits(
     errors: VisitErrors | None = None,
     speed_mps: float = 0.1,
     sensors_m: Array | None = None,
+    is_smoothed: bool = False,
 ) -> tuple[RouteVisit, ...]:
     """Return the passes of a route over landmarks, in order.
 
     A pass is an interval in which a sensor is in the territory of a landmark, plus
-    :data:`~.visit_accuracy.REACH_M` on both sides. If a landmark is visited several times, the
+    :data:`~.visit_accuracy.REACH_M` on both sides. Its fix is at the point next to the centre of
+    the landmark if ``is_smoothed``. Otherwise it is where the last sensor leaves the territory,
+    because a live robot has no fix before. If a landmark is visited several times, the
     errors of its installation are those of all visits; each of n fixes has n times their
     variance, so that all together count them once.
     """
@@ -286,7 +296,9 @@ def find_visits(
             kept = np.arange(first, stop, math.ceil((stop - first) / MAX_VISIT_POINTS))
             path = _in_landmark_frame(poses[kept], landmark)
             gap_m = np.hypot(path[:, 0], path[:, 1])
-            reference = int(np.argmin(gap_m))
+            nearest = int(np.argmin(gap_m))
+            leaving = int(np.searchsorted(kept, part[-1]))
+            reference = nearest if is_smoothed else min(leaving, len(kept) - 1)
             accuracy = predict_visit(
                 floor.geometry,
                 path,
@@ -297,26 +309,22 @@ def find_visits(
                 noise=noise,
                 errors=errors,
             )
-            found.append(
-                (cell, float(distance_m[kept[reference]]), path[reference], accuracy, landmark)
-            )
-    counts: dict[Cell, int] = {}
-    for cell, *_ in found:
-        counts[cell] = counts.get(cell, 0) + 1
-    visits = []
-    for cell, along_m, pose, accuracy, landmark in sorted(found, key=lambda item: item[1]):
-        installed = installation_covariance(pose, _installation(floor, cell, errors))
-        covariance = accuracy.covariance + counts[cell] * installed
-        heading = route.at(np.array([along_m]))[1][0] - landmark[2]
-        visits.append(
-            RouteVisit(
+            fix_m = float(distance_m[kept[reference]])
+            visit = RouteVisit(
                 cell,
-                along_m,
-                float(math.hypot(pose[0], pose[1])),
+                float(distance_m[kept[nearest]]),
+                float(gap_m[nearest]),
                 accuracy,
-                RouteFix(along_m, _rotated(covariance, -heading)),
+                RouteFix(fix_m, accuracy.covariance),
             )
-        )
+            found.append((visit, path[reference]))
+    counts = Counter(visit.cell for visit, _ in found)
+    visits = []
+    for visit, pose in sorted(found, key=lambda item: item[0].fix.distance_m):
+        installed = installation_covariance(pose, _installation(floor, visit.cell, errors))
+        covariance = visit.accuracy.covariance + counts[visit.cell] * installed
+        fix = RouteFix(visit.fix.distance_m, _rotated(covariance, -pose[2]))
+        visits.append(replace(visit, fix=fix))
     return tuple(visits)
 
 
@@ -438,7 +446,7 @@ def _localization(
     for visit in visits:
         if not visit.accuracy.is_usable:
             continue
-        before = np.searchsorted(accuracy.distance_m, visit.distance_m - 1e-12)
+        before = np.searchsorted(accuracy.distance_m, visit.fix.distance_m - 1e-9)
         sigma_m = accuracy.position_sigma_m[before]
         is_linked = bool(MAX_LINK_SIGMAS * sigma_m <= floor.pitch_m / 2)
         if not chains or not is_linked:
@@ -463,34 +471,30 @@ def _check_route(
 ) -> RouteCheck:
     usable = [visit for visit in visits if visit.accuracy.is_usable]
     fixes = [visit.fix for visit in usable]
-    filtered = predict_accuracy(route, fixes, noise, speed_mps)
-    accuracy = filtered
-    if is_smoothed:
-        accuracy = predict_accuracy(route, fixes, noise, speed_mps, is_smoothed=True)
+    accuracy = predict_accuracy(route, fixes, noise, speed_mps)
+    chains = _localization(floor, visits, accuracy)
     built = replace(floor, codes=as_built_codes(floor))
     localized_after = localized_m = final_after = final_m = None
     ambiguous = 4 * len(floor.cells())
-    for chain in _localization(floor, visits, filtered):
+    for chain in chains:
         cells = [visit.cell for visit in chain]
         places = count_places(built, cells)
         ambiguous = min(ambiguous, int(places[-1]) if len(places) else ambiguous)
         unique = count_landmarks_until_unique(built, cells)
         if localized_after is None and unique is not None:
-            localized_after, localized_m = unique, chain[unique - 1].distance_m
+            localized_after, localized_m = unique, chain[unique - 1].fix.distance_m
         if final_after is None and evidence is not None:
             for count, probability in enumerate(evidence.posteriors(cells), 1):
                 if probability >= PROVISIONAL_PROBABILITY:
-                    final_after, final_m = count, chain[count - 1].distance_m
+                    final_after, final_m = count, chain[count - 1].fix.distance_m
                     break
     length_m = route.length_m
-    stops = np.array([0.0, *(visit.distance_m for visit in usable), length_m])
+    stops = np.array([0.0, *(fix.distance_m for fix in fixes), length_m])
     longest = int(np.argmax(np.diff(stops)))
-    if localized_m is None:
-        is_covered = np.zeros(len(accuracy.distance_m), bool)
-    elif is_smoothed:
-        is_covered = np.ones(len(accuracy.distance_m), bool)
-    else:
-        is_covered = accuracy.distance_m >= localized_m
+    # Before a live robot is localized, its fixes are not used.
+    used = [fix for fix in fixes if is_smoothed or (localized_m or 0.0) <= fix.distance_m]
+    accuracy = predict_accuracy(route, used, noise, speed_mps, is_smoothed=is_smoothed)
+    is_covered = np.isfinite(accuracy.covariance).all(axis=(1, 2)) & (localized_m is not None)
     weight = np.where(is_covered, np.diff(accuracy.distance_m, prepend=0.0), 0.0)
     covariance = accuracy.covariance[is_covered]
     worst_m = worst_rad = p95_m = p95_rad = math.nan
@@ -566,7 +570,8 @@ def _notes(floor: FloorMap, check: RouteCheck) -> list[str]:
         limit = 1e3 * max_pass_offset(floor.geometry)
         notes.append(
             f"{check.route.name} only grazes {len(doubtful)} of {len(check.visits)} landmarks "
-            f"({first}{more}), so that they may be misread; pass within {limit:.0f} mm of their centres"
+            f"({first}{more}), so that they may be misread; pass within {limit:.0f} mm of their "
+            "centres"
         )
     return notes
 
@@ -753,7 +758,9 @@ def forecast_floor(
         route = Route(
             np.array([centre - half * np.array([c, s]), centre + half * np.array([c, s])])
         )
-        visits = find_visits(floor, route, noise, errors=errors, speed_mps=speed_mps)
+        visits = find_visits(
+            floor, route, noise, errors=errors, speed_mps=speed_mps, is_smoothed=is_smoothed
+        )
         fixes = [visit.fix for visit in visits if visit.accuracy.is_usable]
         accuracy = predict_accuracy(route, fixes, noise, speed_mps, is_smoothed=is_smoothed)
         passes, read = passes + len(visits), read + sum(visit.is_read for visit in visits)
