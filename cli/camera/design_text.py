@@ -116,6 +116,8 @@ def _number(value: Any) -> Any:
 
 
 def _head(report: CameraReport) -> Iterator[tuple[str, str]]:
+    from locatk.core.dots.design.camera import illuminance_text
+
     setup = report.setup
     width, height = setup.size_px
     yield (
@@ -137,9 +139,9 @@ def _head(report: CameraReport) -> Iterator[tuple[str, str]]:
     )
     yield (
         "Exposure",
-        f"{setup.exposure_s * 1e6:.0f} us, {report.needed_illuminance_lx:.3g} lx "
-        f"(without gain {report.full_illuminance_lx:.3g} lx), noise {report.noise_levels:.2g} "
-        "grey values",
+        f"{setup.exposure_s * 1e6:.0f} us, light {illuminance_text(report.needed_illuminance_lx)} "
+        f"(without gain {illuminance_text(report.full_illuminance_lx)}), "
+        f"noise {report.noise_levels:.2g} grey values",
     )
     yield (
         "Task",

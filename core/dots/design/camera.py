@@ -13,7 +13,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from locatk.core.dots.design.camera_materials import camera_materials
-from locatk.core.dots.design.dot_noise import ROUNDING_VARIANCE, DotImage, dot_error
+from locatk.core.dots.design.dot_noise import (
+    PAPER_LEVEL,
+    ROUNDING_VARIANCE,
+    DotImage,
+    dot_error,
+)
 from locatk.core.dots.design.pose_accuracy import PoseAccuracy, pose_accuracy
 from locatk.core.dots.design.read_rate import (
     MAX_BLUR_PITCHES,
@@ -34,9 +39,6 @@ MIN_WINDOW_DOTS = 8
 GOOD_WINDOW_DOTS = 12
 """Columns and rows with which missing and wrong dots do no harm."""
 
-PAPER_LEVEL = 210.0
-"""Grey value of paper in a well exposed frame of 8 bits."""
-
 MAX_LEVEL = 255.0
 
 GOOD_NOISE_LEVELS = 4.0
@@ -46,6 +48,9 @@ dot are larger."""
 
 EXPOSURE_MOTION_PITCHES = 1 / 11
 """Motion during a chosen exposure: one pixel of the paper's camera, whose pitch is 11 px."""
+
+NEGLIGIBLE_FRACTION = 0.01
+"""Fraction of frames not decoded at one size from which no other size is considered."""
 
 MAX_LIGHT_DEFICIT = 4.0
 """Ratio of the light that is needed to the least that passes without a warning."""
@@ -580,6 +585,16 @@ def noise_levels(setup: CameraSetup) -> float:
     return PAPER_LEVEL * math.sqrt(electrons + read_noise**2) / electrons
 
 
+def illuminance_text(illuminance_lx: float) -> str:
+    """Format an illuminance with three digits.
+
+    >>> illuminance_text(44380.2), illuminance_text(9.4567)
+    ('44400 lx', '9.46 lx')
+    """
+    rounded = float(f"{illuminance_lx:.3g}")
+    return f"{rounded:.0f} lx" if rounded >= 100 else f"{rounded:g} lx"
+
+
 # ---- read rate and accuracy
 
 
@@ -598,16 +613,20 @@ def _frame_quality(setup: CameraSetup, blur_px: float, noise: float) -> _FrameQu
 
     The accuracy is that of the first size at which most frames are decoded, otherwise of the best.
     """
-    candidates = []
+    accurate = None
+    best = None
     missed = 1.0
     for level in searched_levels(setup.size_px):
         candidate = _quality_at_level(setup, blur_px, noise, level)
         missed *= 1 - candidate.read_rate
-        candidates.append(candidate)
-        if candidate.read_rate > 0.5:
+        if accurate is None and candidate.read_rate > 0.5:
+            accurate = candidate
+        if best is None or candidate.read_rate > best.read_rate:
+            best = candidate
+        if missed < NEGLIGIBLE_FRACTION:
             break
-    best = max(candidates, key=lambda candidate: candidate.read_rate)
-    return replace(best, read_rate=1 - missed)
+    assert best is not None
+    return replace(accurate or best, read_rate=1 - missed)
 
 
 def _quality_at_level(
@@ -716,13 +735,13 @@ def _light_warnings(report: CameraReport) -> Iterator[str]:
             yield (
                 f"the paper is overexposed {excess:.1f} times: expose "
                 f"{setup.exposure_s / excess * 1e6:.0f} us, or dim the light to "
-                f"{report.full_illuminance_lx:.3g} lx"
+                f"{illuminance_text(report.full_illuminance_lx)}"
             )
         elif setup.illuminance_lx < report.needed_illuminance_lx / MAX_LIGHT_DEFICIT:
             yield (
-                f"{setup.illuminance_lx:.3g} lx on the paper give a noise of "
+                f"{illuminance_text(setup.illuminance_lx)} on the paper give a noise of "
                 f"{report.noise_levels:.0f} grey values: light it with "
-                f"{report.needed_illuminance_lx:.3g} lx, as by pulsed LEDs"
+                f"{illuminance_text(report.needed_illuminance_lx)}, as by pulsed LEDs"
             )
 
 

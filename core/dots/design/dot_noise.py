@@ -28,6 +28,9 @@ from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 
 Array = NDArray[np.float64]
 
+PAPER_LEVEL = 210.0
+"""Grey value of paper in a well exposed frame of 8 bits."""
+
 PHASES_PER_PX = 8
 """Positions of a dot within a pixel along each axis; also the samples per pixel of its image."""
 

@@ -9,24 +9,33 @@ from __future__ import annotations
 
 import math
 
-from locatk.core.dots.design.dot_noise import DotError
+from locatk.core.dots.design.dot_noise import PAPER_LEVEL, DotError
 from locatk.core.dots.localization.frames import MIN_SIDE_PX, MIN_TRIED_LEVELS, PREFERRED_SIDE_PX
 
 MIN_DOTS, DOTS_SPREAD = 48.0, 3.0
 """Dots of a frame with which half of the frames are read, and the width of the transition.
 Measured: 56 dots 95 %, 50 dots 70 %, 40 dots none."""
 
-MAX_SIGMA_PITCHES, SIGMA_SPREAD_PITCHES = 0.10, 0.007
-"""Error of a dot per axis with which half of the frames are read. Measured with Gaussian errors:
-0.08 pitches 90 %, 0.10 pitches 25 %."""
+MAX_SIGMA_PITCHES, SIGMA_SPREAD_PITCHES = 0.092, 0.006
+"""Error of a dot per axis with which half of the frames are read. Measured with Gaussian errors of
+the print: 0.08 pitches 90 %, 0.10 pitches 25 %."""
 
-SAMPLING_WEIGHT = 0.7
-"""Weight of sampling errors relative to Gaussian ones, because they are bounded: blur that gives
-0.12 pitches is read as Gaussian errors of 0.08."""
+MIN_USED_FRACTION, USED_FRACTION_SPREAD = 0.58, 0.03
+"""Fraction of the dots within the gates of the solver with which half of the frames are read; the
+others are displaced by their neighbours. Measured with blur and motion: 0.70 100 %, 0.65 57 %,
+0.54 33 %, 0.42 10 %."""
 
-MIN_SIGNAL_TO_NOISE, SIGNAL_TO_NOISE_SPREAD = 3.2, 0.2
+MIN_SIGNAL_TO_NOISE, SIGNAL_TO_NOISE_SPREAD = 3.1, 0.2
 """Depth of a smoothed dot over the noise with which half of the frames are read; below, minima of
 the noise are taken for dots. Measured: 4.1 100 %, 3.3 68 %, 2.6 5 %."""
+
+MIN_PEAK_LEVELS, PEAK_SPREAD_LEVELS = 2.3, 0.25
+"""Depth of a smoothed dot in grey values with which half of the frames are read; the detector
+ignores minima of less than 1.5. Measured: 3.8 100 %, 1.8 5 %."""
+
+HALF_READ_PX_PER_PITCH, PX_PER_PITCH_SPREAD = 4.0, 0.1
+"""Pixels per pitch with which half of the frames are read: the minima of neighbours are then as
+near as those that the detector compares. Measured: 4.25 px 100 %, 4 px 57 %, 3.5 px none."""
 
 MAX_BLUR_PITCHES = 0.28
 """Standard deviation of the blur of the lens with which sharp sensors are read. Measured: 0.30 of
@@ -56,17 +65,16 @@ def read_rate(error: DotError, dots: float, pitch_px: float) -> float:
         Number of dots in view that are used.
     pitch_px : float
     """
-    sigma = (
-        math.hypot(error.noise_px, error.jitter_px, SAMPLING_WEIGHT * error.sampling_px) / pitch_px
+    conditions = (
+        (dots - MIN_DOTS) / DOTS_SPREAD,
+        (MAX_SIGMA_PITCHES - error.total_px / pitch_px) / SIGMA_SPREAD_PITCHES,
+        (error.used_fraction - MIN_USED_FRACTION) / USED_FRACTION_SPREAD,
+        (error.peak / max(error.smoothed_noise, 1e-9) - MIN_SIGNAL_TO_NOISE)
+        / SIGNAL_TO_NOISE_SPREAD,
+        (PAPER_LEVEL * error.peak - MIN_PEAK_LEVELS) / PEAK_SPREAD_LEVELS,
+        (pitch_px - HALF_READ_PX_PER_PITCH) / PX_PER_PITCH_SPREAD,
     )
-    return (
-        _logistic((dots - MIN_DOTS) / DOTS_SPREAD)
-        * _logistic((MAX_SIGMA_PITCHES - sigma) / SIGMA_SPREAD_PITCHES)
-        * _logistic(
-            (error.peak / max(error.smoothed_noise, 1e-9) - MIN_SIGNAL_TO_NOISE)
-            / SIGNAL_TO_NOISE_SPREAD
-        )
-    )
+    return math.prod(map(_logistic, conditions))
 
 
 def searched_levels(size_px: tuple[int, int]) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from locatk.core.dots.codec import DOT_DIRECTIONS
-from locatk.core.dots.design.camera import MIN_WINDOW_DOTS, CameraReport
+from locatk.core.dots.design.camera import MIN_WINDOW_DOTS, CameraReport, illuminance_text
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 from locatk.core.drawing.marks import (
     TRUE_SIZE_INSTRUCTION,
@@ -45,15 +45,20 @@ from locatk.core.units import length_text
 
 HOLDER_TITLE = "Camera over printed dots"
 
-LABEL_MM = 62.0
+LEFT_MM = 14.0
+"""Space at the left of the side view for the depth of field."""
+
+LABEL_MM = 58.0
 """Space at the right of the side view for dimensions and their texts."""
+
+BELOW_MM = 8.0
+"""Space below the paper for the width of the field."""
 
 MIN_TOP_VIEW_MM = 45.0
 """Least width of the enlarged field."""
 
 MAX_TOP_VIEW_MM = 90.0
-
-GAP_MM = 8.0
+"""Largest side of the enlarged field."""
 
 HEAD_MM = 1.8
 """Length of the heads of dimension arrows."""
@@ -83,14 +88,16 @@ def draw_holder(report: CameraReport, paper_mm: Point, margin_mm: float = 10.0) 
     setup = report.setup
     width = max(1e3 * report.field_m[0], 1e3 * setup.size_px[0] * setup.pixel_m, 14.0)
     height = 1e3 * (setup.distance_m + report.image_distance_m) + 12.0
-    needed = (width + LABEL_MM + GAP_MM + MIN_TOP_VIEW_MM, height + TABLE_MM)
+    needed = (LEFT_MM + width + LABEL_MM + MIN_TOP_VIEW_MM, height + BELOW_MM + TABLE_MM)
     frame = _frame(report, paper_mm, margin_mm, needed)
-    left, bottom, right, top = frame.content_box
-    base = bottom + TABLE_MM
-    middle = left + width / 2
-    top_left = left + width + LABEL_MM + GAP_MM
-    side = Group("side view", tuple(_side_view(report, (middle, base + 8.0), width)))
-    field = Group("field", tuple(_field_view(report, (top_left, base), right - top_left, top)))
+    left, _, right, top = frame.content_box
+    top_left = left + LEFT_MM + width + LABEL_MM
+    scale, field_height = _field_scale(report, right - top_left)
+    # Both views stand on one line; the taller one is below the notes.
+    base = top - max(height, field_height + 10.0) - BELOW_MM
+    middle = left + LEFT_MM + width / 2
+    side = Group("side view", tuple(_side_view(report, (middle, base + BELOW_MM), width)))
+    field = Group("field", tuple(_field_view(report, (top_left, base + BELOW_MM), scale)))
     dimensions = Group("dimensions", tuple(_table(report, frame, base)))
     return number_pages([UnnumberedPage(frame, (side, field, dimensions))])
 
@@ -151,7 +158,7 @@ def _side_view(report: CameraReport, origin: Point, width_mm: float) -> list[Mar
         marks.append(Line((x + half * 0.7, level), (column + 1.5, level), 0.06))
     baseline = y - 2.0 - capital_height(TEXT_POINTS)
     field = f"field {1e3 * report.field_m[0]:.3g} x {length_text(report.field_m[1])}"
-    marks.append(Text(field, (x, baseline - 1.5), TEXT_POINTS, "middle"))
+    marks.append(Text(field, (x - half + 1.5, baseline - 1.0), TEXT_POINTS))
     marks.append(
         Text(
             f"sensor {2 * half_sensor:.3g} mm wide",
@@ -189,8 +196,9 @@ def _depth_of_field(report: CameraReport, origin: Point, half: float) -> list[Ma
         *arrow((column, y), (column, y - low), min(HEAD_MM, low / 2), 0.12),
         Text(
             "sharp enough",
-            (column - 1.0, y + max(high / 2 - 8.0, 0.0)),
+            (column - 1.0, y + (high - low) / 2),
             TEXT_POINTS,
+            "middle",
             angle_deg=90,
         ),
     ]
@@ -207,15 +215,19 @@ def _dimension(x: float, low: float, high: float, text: str) -> list[Mark]:
     ]
 
 
-def _field_view(report: CameraReport, corner: Point, width_mm: float, top_mm: float) -> list[Mark]:
+def _field_scale(report: CameraReport, width_mm: float) -> tuple[float, float]:
+    """Return the scale of the enlarged field, and its height."""
+    field = (1e3 * report.field_m[0], 1e3 * report.field_m[1])
+    scale = min(min(width_mm, MAX_TOP_VIEW_MM) / field[0], MAX_TOP_VIEW_MM / field[1])
+    scale = float(math.floor(scale)) if scale >= 1 else round(scale, 2)
+    return scale, scale * field[1]
+
+
+def _field_view(report: CameraReport, corner: Point, scale: float) -> list[Mark]:
     """Draw the field from above, enlarged, with dots and the smallest window at 45 degrees."""
     setup = report.setup
-    field = (1e3 * report.field_m[0], 1e3 * report.field_m[1])
-    space = (min(width_mm, MAX_TOP_VIEW_MM), top_mm - corner[1] - 16.0)
-    scale = min(space[0] / field[0], space[1] / field[1])
-    scale = float(math.floor(scale)) if scale >= 1 else scale
-    size = (scale * field[0], scale * field[1])
-    x, y = corner[0], corner[1] + 8.0
+    size = (1e3 * scale * report.field_m[0], 1e3 * scale * report.field_m[1])
+    x, y = corner
     middle = (x + size[0] / 2, y + size[1] / 2)
     pitch = 1e3 * setup.pitch_m * scale
     columns, rows = (math.ceil(side / pitch) + 1 for side in size)
@@ -277,12 +289,12 @@ def _table(report: CameraReport, frame: PageFrame, top_mm: float) -> list[Mark]:
         ("diagonal of the field", length_text(2 * setup.corner_m, 4)),
         ("dots in view, at least", f"{report.window_dots} x {report.window_dots}"),
         ("exposure, LEDs pulsed", f"{setup.exposure_s * 1e6:.0f} us"),
-        ("light on the paper", f"{report.needed_illuminance_lx:.3g} lx"),
+        ("light on the paper", illuminance_text(report.needed_illuminance_lx)),
     )
     columns = (TableColumn("dimension", 60.0), TableColumn("", 60.0))
     below = PageFrame(
         (frame.size_mm[0], frame.size_mm[1]), frame.margin_mm, "", (), has_rulers=frame.has_rulers
     )
     page = table_pages(rows, columns, below)[0]
-    shift = top_mm - 6.0 - below.content_box[3]
+    shift = top_mm - 8.0 - below.content_box[3]
     return [shifted(mark, 0.0, shift) for group in page.groups for mark in group.marks]
