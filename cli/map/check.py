@@ -5,18 +5,26 @@ from __future__ import annotations
 import contextlib
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
 from locatk.cli.command import Command
 from locatk.cli.map import proof_text
+from locatk.cli.map.route_text import (
+    RouteRequest,
+    route_entry,
+    route_explanation,
+    route_options,
+    route_table,
+)
 from locatk.core.errors import InputError
 
 if TYPE_CHECKING:
     from locatk.core.landmarks.design.final_poses import FinalPoses
     from locatk.core.landmarks.design.proof import MapProof
+    from locatk.core.landmarks.design.routes import RouteCheck
     from locatk.core.landmarks.map.floor import FloorMap
 
 
@@ -26,10 +34,12 @@ MAX_NAMED_CELLS = 5
 
 @click.command(cls=Command)
 @options.input_argument("maps", many=True)
+@route_options
+@options.overwrite
 @options.as_json
 @options.verbosity
-def command(maps: tuple[Path, ...], as_json: bool) -> None:
-    """Prove that every window of MAPS is unique, or list the duplicates.
+def command(maps: tuple[Path, ...], overwrite: bool, as_json: bool, **route_values: Any) -> None:
+    """Prove that every window of MAPS is unique, or list the duplicates; check routes over a map.
 
     The readings of all windows under all headings are compared. The output lists duplicates with
     both positions, the minimum number of landmarks in which two readings differ, the number of
@@ -37,15 +47,32 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
     provisional, and the effect of one fault. For a map as built (`locatk calibrate map`), the bars
     are compared as they were installed.
 
+    With --route, the landmarks that a robot passes are predicted, and from where on it is
+    localised without knowing its start. Its errors follow from the field of the bars, the noise of
+    the sensors, the installation of the landmarks, and the odometry between them.
+
     The exit status is 0 if every map is unique and detects as many misread landmarks as its file
-    specifies (`detect`), otherwise 1.
+    specifies (`detect`), otherwise 1. It is 3 if a route is not localisable, or less accurate than
+    --accuracy.
 
     \b
     Examples:
       locatk map check map.toml
       locatk map check floors/*.toml -q && echo unique
       locatk map check map.toml --json | jq '.maps[0].proof.duplicates'
+      locatk map check map.toml --route drive.csv --accuracy 5 -o routes.png
     """
+    request = RouteRequest(**route_values)
+    if request.picture is not None and not request.route_paths:
+        raise click.UsageError("--picture shows routes: give --route as well.")
+    if request.accuracy is not None and not request.route_paths:
+        raise click.UsageError("--accuracy is that of routes: give --route as well.")
+    if request.route_paths and len(maps) > 1:
+        raise click.UsageError("--route needs one map.")
+    if request.picture is not None:
+        options.guard_output(
+            request.picture, overwrite=overwrite, inputs=[*maps, *request.route_paths]
+        )
     from locatk.core.landmarks.design.final_poses import count_landmarks_until_final
     from locatk.core.landmarks.design.proof import prove_map
     from locatk.core.landmarks.map.floor import as_built_codes
@@ -60,10 +87,23 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
             built = replace(floor, codes=as_built_codes(floor))
             final = count_landmarks_until_final(built)
             proved.append((path, floor, prove_map(built), final))
+    checks: tuple[RouteCheck, ...] = ()
+    if request.route_paths:
+        with console.working("Predicting"):
+            checks = request.check(floors[0][1])
     for number, (path, floor, proof, final) in enumerate(proved):
         if number:
             console.result("")
         _print_proof(path, floor, proof, final)
+    if checks:
+        console.result(f"\n{route_table(checks)}")
+        console.result(f"\n{route_explanation(is_offline=request.offline)}")
+    if request.picture is not None:
+        # matplotlib takes 0.5 s to import.
+        from locatk.formats.plots.landmark_routes import write_routes_picture
+
+        write_routes_picture(request.picture, floors[0][1], checks, overwrite=overwrite)
+        console.say(f"Wrote {request.picture}")
     if as_json:
         console.emit_json(
             {
@@ -78,6 +118,7 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
                     }
                     for path, floor, proof, final in proved
                 ],
+                **({"routes": [route_entry(check) for check in checks]} if checks else {}),
             }
         )
     failed = [(path, proof) for path, _, proof, _ in proved if not proof.holds]
@@ -89,6 +130,10 @@ def command(maps: tuple[Path, ...], as_json: bool) -> None:
             f"{len(failed)} of {len(proved)} maps do not hold: "
             + ", ".join(str(path) for path, _ in failed)
         )
+    for check in checks:
+        for note in check.notes:
+            console.warn(f"{note[0].upper()}{note[1:]}.")
+    failures.finish_with_warnings([text for check in checks for text in check.warnings])
 
 
 def _print_proof(path: Path, floor: FloorMap, proof: MapProof, final: FinalPoses) -> None:

@@ -66,7 +66,7 @@ MAX_VISIT_POINTS = 400
 """Points of a visit at most; a longer one is evaluated at every second, third ... point."""
 
 MAX_ROUTE_M = 10_000.0
-"""Longest route; 10 km have five million points."""
+"""Longest route; 10 km have 2.5 million points."""
 
 SHIFT_STEPS = 8
 """Shifts of a route that are tried along each axis, over one pitch."""
@@ -539,11 +539,11 @@ def _warnings(
         if read:
             count = len({visit.cell for visit in read})
             problem = (
-                f"{name} is not localizable: of {count} landmark{'s' * (count != 1)} that are "
+                f"route {name} is not localisable: of {count} landmark{'s' * (count != 1)} that are "
                 f"read, {check.ambiguous_places} other places of the map read the same"
             )
         else:
-            problem = f"{name} is not localizable: no landmark is read on {_length(check)}"
+            problem = f"route {name} is not localisable: no landmark is read on {_length(check)}"
         warnings.append(f"{problem}; {_remedy(floor, check, LONGER_ROUTE)}")
     for wanted, reached, quantity, unit, scale in (
         (wanted_position_m, check.position_p95_m, "position", "mm", 1e3),
@@ -551,7 +551,7 @@ def _warnings(
     ):
         if wanted is not None and reached > wanted:
             warnings.append(
-                f"{name} has a {quantity} error of up to {scale * reached:.2g} {unit} on 95 % of "
+                f"route {name} has a {quantity} error of up to {scale * reached:.2g} {unit} on 95 % of "
                 f"it, not {scale * wanted:.2g} {unit}; {_accuracy_remedy(floor, check)}"
             )
     return warnings
@@ -569,7 +569,7 @@ def _notes(floor: FloorMap, check: RouteCheck) -> list[str]:
         more = " ..." if len(doubtful) > MAX_NAMED_LANDMARKS else ""
         limit = 1e3 * max_pass_offset(floor.geometry)
         notes.append(
-            f"{check.route.name} only grazes {len(doubtful)} of {len(check.visits)} landmarks "
+            f"route {check.route.name} only grazes {len(doubtful)} of {len(check.visits)} landmarks "
             f"({first}{more}), so that they may be misread; pass within {limit:.0f} mm of their "
             "centres"
         )

@@ -37,9 +37,9 @@ from locatk.core.streaming.planar_filter import OdometryNoise
 
 Array = NDArray[np.float64]
 
-STEP_M = 2e-3
-"""Distance between the points of a path at which the field is evaluated [m]: a twelfth of the
-circle of the sensors, over which the field is smooth."""
+STEP_M = 4e-3
+"""Distance between the points of a path at which the field is evaluated [m]. With 1 mm, standard
+deviations change by less than 1 % at heights of 6 mm and more."""
 
 STEP_RAD = math.radians(3)
 """Rotation on the spot between two points: the sensors then move by 1.3 mm."""
