@@ -539,8 +539,8 @@ def _warnings(
         if read:
             count = len({visit.cell for visit in read})
             problem = (
-                f"route {name} is not localisable: of {count} landmark{'s' * (count != 1)} that are "
-                f"read, {check.ambiguous_places} other places of the map read the same"
+                f"route {name} is not localisable: {check.ambiguous_places} other places of the map "
+                f"have the {count} landmark{'s' * (count != 1)} that are read on it"
             )
         else:
             problem = f"route {name} is not localisable: no landmark is read on {_length(check)}"
@@ -551,8 +551,8 @@ def _warnings(
     ):
         if wanted is not None and reached > wanted:
             warnings.append(
-                f"route {name} has a {quantity} error of up to {scale * reached:.2g} {unit} on 95 % of "
-                f"it, not {scale * wanted:.2g} {unit}; {_accuracy_remedy(floor, check)}"
+                f"route {name} has a {quantity} error of up to {scale * reached:.2g} {unit} on 95 % "
+                f"of it, not {scale * wanted:.2g} {unit}; {_accuracy_remedy(floor, check)}"
             )
     return warnings
 
@@ -569,8 +569,8 @@ def _notes(floor: FloorMap, check: RouteCheck) -> list[str]:
         more = " ..." if len(doubtful) > MAX_NAMED_LANDMARKS else ""
         limit = 1e3 * max_pass_offset(floor.geometry)
         notes.append(
-            f"route {check.route.name} only grazes {len(doubtful)} of {len(check.visits)} landmarks "
-            f"({first}{more}), so that they may be misread; pass within {limit:.0f} mm of their "
+            f"route {check.route.name} only grazes {len(doubtful)} of {len(check.visits)} "
+            f"landmarks ({first}{more}), so that they may be misread; pass within {limit:.0f} mm of their "
             "centres"
         )
     return notes
