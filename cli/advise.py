@@ -119,7 +119,7 @@ def _ask(config: Any) -> dict[str, Any]:
     UsageError
         There is no terminal.
     """
-    if not sys.stdin.isatty():
+    if not _has_terminal():
         raise click.UsageError(
             "No task: give --area, --accuracy and others, or --task. --print-task prints all "
             "settings."
@@ -131,6 +131,10 @@ def _ask(config: Any) -> dict[str, Any]:
         answers |= _answer(question, key, setting, config.default_text(setting))
     console.say("\nThe same again, and all other settings:\n  " + _command_line(config, answers))
     return answers
+
+
+def _has_terminal() -> bool:
+    return sys.stdin.isatty()
 
 
 def _answer(question: str, key: str, setting: Any, default_text: str) -> dict[str, Any]:

@@ -7,10 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from locatk.core.advice.work import WORK_MINUTES
+from locatk.core.dots.design.camera_materials import PAPER_PRICES as CAMERA_PRICES
+from locatk.core.dots.design.camera_materials import PARTS as CAMERA_PARTS
 from locatk.core.landmarks.design.materials import PARTS as LANDMARK_PARTS
+from locatk.core.lighthouse.design.materials import PARTS as STATION_PARTS
+from locatk.core.lighthouse.design.materials import PUBLISHED_PRICES as STATION_PRICES
 from locatk.core.materials import Price
 from locatk.core.polaris.design.materials import PARTS as TAG_PARTS
-from locatk.core.polaris.design.materials import PUBLISHED_PRICES
+from locatk.core.polaris.design.materials import PUBLISHED_PRICES as TAG_PRICES
 from locatk.formats.artifacts.kinds import (
     InvalidValueError,
     Number,
@@ -26,8 +30,23 @@ from locatk.formats.artifacts.schema import (
     refuse_repeated,
 )
 
-PARTS = (*TAG_PARTS, *LANDMARK_PARTS)
-"""Parts that can have a price."""
+PARTS = tuple(
+    dict.fromkeys(
+        (
+            *TAG_PARTS,
+            *LANDMARK_PARTS,
+            *STATION_PARTS,
+            *CAMERA_PARTS,
+            "printed sheet",
+            "computer",
+            "hall sensor",
+        )
+    )
+)
+"""Parts that can have a price, of all bills of materials and of `locatk advise`."""
+
+PUBLISHED_PRICES = {**TAG_PRICES, **STATION_PRICES, **CAMERA_PRICES}
+"""Prices that the papers state, by part."""
 
 Prices = dict[str, Price]
 """Prices by part."""
