@@ -13,7 +13,6 @@ from locatk.cli.command import Command, section
 from locatk.cli.map.options import Size
 from locatk.cli.options import number
 from locatk.cli.site.forecast import (
-    LengthAndAngle,
     laying_of,
     odometry_noise,
     odometry_options,
@@ -24,7 +23,7 @@ from locatk.cli.site.forecast import (
 )
 from locatk.cli.site.site_text import report_check, site_entry, written_text
 from locatk.cli.table_options import site_table_options
-from locatk.cli.tag.options import reading_conditions, reading_options
+from locatk.cli.tag.options import LengthAndAngle, reading_conditions, reading_options
 from locatk.core.units import metres
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ import click
 
 from locatk.cli import console
 from locatk.cli.command import section
-from locatk.core.units import length_text, metres
+from locatk.cli.tag.options import LengthAndAngle
+from locatk.core.units import length_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,33 +29,6 @@ LIMITS = {
 }
 """Descriptions of the limits of a spacing."""
 
-
-class LengthAndAngle(click.ParamType):
-    """Length in mm and, optionally, angle in degrees, as in ``20`` or ``20,1.5``."""
-
-    name = "MM[,DEG]"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, float | None]:
-        """Parse the text to m and rad; fail with the expected form."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            length, *angle = (float(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not MM or MM,DEG as in 20,1.5.", param, ctx)
-        numbers = [length, *angle]
-        if len(angle) > 1 or not all(number > 0 and math.isfinite(number) for number in numbers):
-            self.fail(
-                f"{value!r} is not one or two numbers above 0, in mm and degrees.", param, ctx
-            )
-        if length > MAX_ACCURACY_MM or any(number > 180 for number in angle):
-            self.fail(f"{value!r} is not within 100000 mm and 180 degrees.", param, ctx)
-        return metres(length), math.radians(angle[0]) if angle else None
-
-
-MAX_ACCURACY_MM = 1e5
 
 odometry_options = section(
     "Odometry and tags on the floor",

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
-from locatk.cli import console, options
+from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
 from locatk.cli.options import number
 from locatk.cli.price_options import price_options
-from locatk.cli.tag.design_text import report_evaluation
-from locatk.cli.tag.options import LENGTH_MM, code_options, reading_conditions, reading_options
+from locatk.cli.tag.design_text import report_evaluation, search_entry, search_text
+from locatk.cli.tag.options import (
+    LENGTH_MM,
+    LengthAndAngle,
+    code_options,
+    reading_conditions,
+    reading_options,
+)
 from locatk.core.errors import OutputExistsError
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
+    from locatk.core.polaris.design.planning import ReadingConditions
+    from locatk.core.polaris.design.search import DesignSearch
     from locatk.core.polaris.tag import Magnet
 
 GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
@@ -29,6 +39,27 @@ GRADES = ("N35", "N38", "N40", "N42", "N45", "N48", "N50", "N52")
     "--bom", endings=(".csv",), metavar="FILE", help="Also write the bill of materials (.csv)."
 )
 @price_options
+@section(
+    "Search",
+    click.option(
+        "--search",
+        is_flag=True,
+        help="Choose magnets, clearance, spacing and code for --count tags, except those that are "
+        "given as options.",
+    ),
+    click.option(
+        "--accuracy",
+        type=LengthAndAngle(),
+        metavar="MM[,DEG]",
+        help="Error of a pass (position and heading) that must not be exceeded with 95 %.",
+    ),
+    click.option(
+        "--max-clearance",
+        type=LENGTH_MM,
+        metavar="MM",
+        help="Largest clearance to try; --clearance is the smallest.  [default: --clearance]",
+    ),
+)
 @code_options
 @section(
     "Family",
@@ -115,6 +146,9 @@ def command(
     min_distance: int,
     bom: Path | None,
     prices: Path | None,
+    search: bool,
+    accuracy: tuple[float, float | None] | None,
+    max_clearance: float | None,
     overwrite: bool,
     as_json: bool,
     **conditions: Any,
@@ -125,6 +159,9 @@ def command(
     met, a warning gives a remedy; the tag is written nevertheless, and the exit status is 3.
     Without --id and --count, a tag may have any id of the codec.
 
+    With --search, stocked magnets, clearances, spacings and codes are tried. The output lists the
+    best design of each magnet, by number of magnets and size; the first one is written.
+
     \b
     Examples:
       locatk tag design -o tag.toml
@@ -132,6 +169,8 @@ def command(
       locatk tag design --print-prices > prices.toml
       locatk tag design -o mini.toml --order 2 --magnets 3 --clearance 4
       locatk tag design -o tag.toml --spacing 16 --osr 2 --rate 100 --speed 0.3
+      locatk tag design --search --count 50 --accuracy 1,0.5 -o tag.toml
+      locatk tag design --search --count 9 --clearance 8 --max-clearance 15 -o tag.toml
     """
     from locatk.core.materials import with_prices
     from locatk.core.polaris.codec import families
@@ -151,7 +190,20 @@ def command(
         if bom.resolve() == output.resolve():
             raise OutputExistsError("tags and bill of materials would be one file", file=bom)
 
+    if not search and (accuracy is not None or max_clearance is not None):
+        raise click.UsageError("--accuracy and --max-clearance are for --search.")
+    use = reading_conditions(**conditions)
     part_prices = read_prices(prices)
+    found: DesignSearch | None = None
+    if search:
+        if count is None:
+            raise click.UsageError("--search needs --count, the number of tags.")
+        found = _search(count, min_distance, accuracy, max_clearance, use)
+        console.result(search_text(found) + "\n")
+        if not found.designs:
+            if as_json:
+                console.emit_json({"version": 1, "search": search_entry(found)})
+            failures.finish_with_warnings([found.reason])
     magnet = _magnet(diameter, height, grade, remanence)
     tags = Tags(
         order=order,
@@ -166,6 +218,8 @@ def command(
         min_distance=min_distance,
         ids=ids or None,
     )
+    if found is not None:
+        tags = replace(found.designs[0].tags, min_distance=min_distance)
     if count is not None:
         with console.steps(families.PROGRESS_STEPS, "Generating") as advance:
             ids = families.generate_family(tags, count, min_distance, advance)
@@ -175,16 +229,53 @@ def command(
         )
     families.check_family(tags)
     with console.working("Planning"):
-        report = evaluate_design(
-            tags, reading_conditions(**conditions), count=len(tags.ids or (0,))
-        )
+        report = evaluate_design(tags, use, count=len(tags.ids or (0,)))
     report = replace(report, materials=with_prices(report.materials, part_prices))
     write_tags(output, tags, overwrite=overwrite)
     if bom is not None:
         write_bill(bom, report.materials, overwrite=overwrite)
     written = [str(path) for path in (output, bom) if path is not None]
     console.result(f"Wrote {' and '.join(written)}\n")
-    report_evaluation(report, list(report.warnings), {"output": output, "bom": bom}, as_json)
+    more: dict[str, Any] = {"output": output, "bom": bom}
+    if found is not None:
+        more["search"] = search_entry(found)
+    report_evaluation(report, list(report.warnings), more, as_json)
+
+
+def _search(
+    count: int,
+    min_distance: int,
+    accuracy: tuple[float, float | None] | None,
+    max_clearance: float | None,
+    use: ReadingConditions,
+) -> DesignSearch:
+    """Search for designs; options that were given on the command line are fixed."""
+    from locatk.core.polaris.design.search import SearchSpace, search_designs
+
+    context = click.get_current_context()
+    given = {
+        name: value
+        for name, value in context.params.items()
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+    }
+    clearance = context.params["clearance"]
+    space = SearchSpace(
+        clearance_m=(metres(clearance), metres(max_clearance or clearance)),
+        codec=context.params["codec"],
+    )
+    fixed = {"order": "orders", "magnets": "counts", "orientations": "orientations"}
+    for option, name in fixed.items():
+        if option in given:
+            space = replace(space, **{name: (given[option],)})
+    if given.get("spacing") is not None:
+        space = replace(space, spacing_m=metres(given["spacing"]))
+    if given.keys() & {"diameter", "height", "grade", "remanence"}:
+        names = ("diameter", "height", "grade", "remanence")
+        space = replace(space, magnets=(_magnet(*(context.params[name] for name in names)),))
+    wanted = accuracy or (math.inf, None)
+    heading_rad = math.inf if wanted[1] is None else wanted[1]
+    with console.working("Searching"):
+        return search_designs(count, wanted[0], heading_rad, use, space, min_distance)
 
 
 def _magnet(diameter: float, height: float, grade: str | None, remanence: float | None) -> Magnet:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from locatk.core.polaris.design.accuracy_bound import AccuracyBound
     from locatk.core.polaris.design.environment import Environment
     from locatk.core.polaris.design.planning import DesignReport
+    from locatk.core.polaris.design.search import DesignSearch, TagDesign
     from locatk.core.polaris.tag import Tags
 
 MAX_ID_LIST_CHARACTERS = 36
@@ -82,6 +83,55 @@ def entry(report: DesignReport) -> dict[str, Any]:
         "materials_total": total_entry(report.materials),
         "warnings": warnings,
         "notes": notes,
+    }
+
+
+def search_text(found: DesignSearch) -> str:
+    """Format the designs that a search found in 80 columns."""
+    closest = (found.closest,) if found.closest is not None else ()
+    designs = found.designs or closest
+    if not designs:
+        return "No design was found."
+    head = ("magnets", "grid", "orient.", "spacing", "clearance", "side", "position", "heading")
+    rows = [
+        (
+            f"{design.tags.magnets} of {design.tags.magnet.diameter_m * 1e3:g} x "
+            f"{design.tags.magnet.height_m * 1e3:g} {design.tags.magnet.grade}".strip(),
+            f"{design.tags.order} x {design.tags.order}",
+            str(design.tags.orientations),
+            length_text(design.tags.spacing_m),
+            length_text(design.tags.clearance_m),
+            length_text(design.side_m),
+            length_text(design.position_p95_m, 2),
+            f"{math.degrees(design.heading_p95_rad):.2g} deg",
+        )
+        for design in designs
+    ]
+    title = "Designs, the first is written" if found.designs else "Nearest design, not written"
+    return f"{title} (errors of a pass, 95 %):\n{console.table(head, rows)}"
+
+
+def search_entry(found: DesignSearch) -> dict[str, Any]:
+    """Return the designs that a search found for ``--json``."""
+
+    def one(design: TagDesign) -> dict[str, Any]:
+        tags = design.tags
+        return {
+            "order": tags.order,
+            "magnets": tags.magnets,
+            "orientations": tags.orientations,
+            "spacing_m": tags.spacing_m,
+            "clearance_m": tags.clearance_m,
+            "magnet": asdict(tags.magnet),
+            "side_m": design.side_m,
+            "position_p95_m": design.position_p95_m,
+            "heading_p95_rad": design.heading_p95_rad,
+        }
+
+    return {
+        "designs": [one(design) for design in found.designs],
+        "closest": None if found.closest is None else one(found.closest),
+        "reason": found.reason or None,
     }
 
 
