@@ -9,8 +9,9 @@ and decodes them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from locatk.core.dots.design.camera_materials import camera_materials
 from locatk.core.dots.design.dot_noise import (
@@ -763,7 +764,7 @@ def suggest_camera(
     window_dots: int = GOOD_WINDOW_DOTS,
     f_number: float = 2.4,
     distortion: float = 0.02,
-    **conditions: object,
+    **conditions: Any,
 ) -> CameraSetup:
     """Choose focal length, distance and exposure that are not given, for a window of dots.
 
@@ -793,7 +794,7 @@ def suggest_camera(
 
     def setup_of(focal_m: float, distance_m: float, exposure_s: float = 1e-4) -> CameraSetup:
         lens = Lens(focal_m, f_number, distortion)
-        return CameraSetup(sensor, lens, distance_m, exposure_s, **conditions)  # type: ignore[arg-type]
+        return CameraSetup(sensor, lens, distance_m, exposure_s, **conditions)
 
     if focal_m is not None and distance_m is None:
         distance_m = _distance_for_dots(setup_of(focal_m, 2 * focal_m), window_dots)
@@ -813,7 +814,9 @@ def _distance_for_dots(setup: CameraSetup, window_dots: int) -> float:
     return distance_for_field(setup, window_diagonal_m(window_dots, setup.pitch_m))
 
 
-def _standard_lens(setup_of, aim_m: float, window_dots: int) -> tuple[float, float]:  # type: ignore[no-untyped-def]
+def _standard_lens(
+    setup_of: Callable[[float, float], CameraSetup], aim_m: float, window_dots: int
+) -> tuple[float, float]:
     """Return the standard focal length and its distance for the window, nearest to ``aim_m``.
 
     Of the lenses that show the window at ``aim_m`` or nearer, the longest is taken: its field is
@@ -851,14 +854,14 @@ class CameraFit:
         return not self.reasons
 
 
-def compare_sensors(sensors: Iterable[Sensor], **wanted: object) -> tuple[CameraFit, ...]:
+def compare_sensors(sensors: Iterable[Sensor], **wanted: Any) -> tuple[CameraFit, ...]:
     """Choose a setup for each sensor, with the arguments of :func:`suggest_camera`.
 
     Sensors that fit come first, then in the order given.
     """
     fits = []
     for sensor in sensors:
-        report = design_camera(suggest_camera(sensor, **wanted))  # type: ignore[arg-type]
+        report = design_camera(suggest_camera(sensor, **wanted))
         fits.append(CameraFit(sensor, report, report.warnings))
     return tuple(sorted(fits, key=lambda fit: not fit.fits))
 
