@@ -49,8 +49,8 @@ SEARCH_POINTS = 400
 REFINEMENT_POINTS = 1200
 """Number of points at which the result of the search is refined."""
 
-POSITION_STEP_M = 0.01
-"""Step to which positions are rounded [m]; angles are rounded to degrees."""
+POSITION_DECIMALS = 2
+"""Decimals to which positions are rounded, in metres; angles are rounded to degrees."""
 
 WALL_POSITIONS = 44
 """Number of positions along the walls that are tried, at each height."""
@@ -715,7 +715,7 @@ def place_stations(problem: PlacementProblem, count: int) -> StationPoses:
     poses = refine(PlacementProblem(problem.room, problem.request, fine), poses)
     return replace(
         poses,
-        position_m=np.round(poses.position_m / POSITION_STEP_M) * POSITION_STEP_M,
+        position_m=np.round(poses.position_m, POSITION_DECIMALS),
         yaw_rad=np.radians(np.round(np.degrees(poses.yaw_rad))),
         tilt_rad=np.radians(np.round(np.degrees(poses.tilt_rad))),
     )

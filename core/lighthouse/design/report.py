@@ -27,6 +27,7 @@ from locatk.core.lighthouse.design.visibility import (
     MEASURED_RANGE_M,
     blocked_fraction,
 )
+from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.room import (
     MOUNTING_POSITION_SIGMA_M,
     MOUNTING_ROTATION_SIGMA_RAD,
@@ -233,23 +234,17 @@ def report_room(
     )
 
 
-def heading_sigmas(
-    scene: Scene, report: RoomReport, room: Room, photodiodes_m: Array, request: RoomRequest
-) -> Array:
-    """Return the standard deviations (p,) of the heading of a level rigid device [rad].
+def deck_heading_sigma(scene: Scene, report: RoomReport, room: Room, request: RoomRequest) -> float:
+    """Return the standard deviation of the heading of a deck at 95 % of the places [rad].
 
-    Parameters
-    ----------
-    scene, report, room, request
-        As of :func:`report_room`.
-    photodiodes_m : (n, 3) ndarray
-        Offsets of the photodiodes from the centre of the device.
+    It is that of a single epoch of a level :data:`~locatk.core.lighthouse.receiver.DECK`.
     """
     position, rotation = _stacked(scene)
     is_seen = seen_stations(room, position, rotation, report.points_m, request)
-    return predict_poses(
-        position, rotation, report.points_m, is_seen, photodiodes_m, errors=request.errors
-    ).heading_sigma_rad
+    poses = predict_poses(
+        position, rotation, report.points_m, is_seen, DECK.position_m, errors=request.errors
+    )
+    return percentile(poses.heading_sigma_rad)
 
 
 def best_addition(

@@ -180,6 +180,64 @@ class DxfReader:
             raise self._no_objects(layers, ignored)
         return _assign_texts(objects, texts, unit, dict(ignored))
 
+    def unit_m(self, unit: str | None = None) -> float:
+        """Return the length of the drawing's unit in metres; ``unit`` takes precedence.
+
+        Raises
+        ------
+        FormatError
+            The unit is unknown.
+        """
+        return UNIT_M[unit or self._unit()]
+
+    def closed_outlines(
+        self, layers: Sequence[str] | None = None
+    ) -> tuple[list[tuple[str, Array]], list[str]]:
+        """Return the polygons of closed polylines in the unit of the drawing, by their handles.
+
+        Parameters
+        ----------
+        layers : sequence of str, optional
+            Names; by default all layers.
+
+        Returns
+        -------
+        outlines : list of (str, (n, 2) ndarray)
+            Arcs are replaced by chords; the first corner is not repeated.
+        open_handles : list of str
+            Handles of polylines that are not closed.
+
+        Raises
+        ------
+        FormatError
+            A layer is missing, or an entity is damaged.
+        """
+        from ezdxf import DXFError
+
+        if layers is not None:
+            self._check_layers(layers)
+        wanted = None if layers is None else {layer.casefold() for layer in layers}
+        outlines: list[tuple[str, Array]] = []
+        open_handles: list[str] = []
+        for entity in self._document.modelspace():
+            if entity.dxftype() not in OUTLINE_KINDS:
+                continue
+            if wanted is not None and _layer(entity).casefold() not in wanted:
+                continue
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):  # damaged coordinates
+                    corners = _outline_corners(entity)
+            except DXFError as error:
+                reason = escape_controls(str(error))[:MAX_REASON_CHARACTERS]
+                raise self.error(f"a damaged entity ({reason})", entity.dxf.handle) from error
+            if corners is None:
+                continue
+            if len(corners) > 3 and _is_closed(corners):
+                outlines.append((entity.dxf.handle, corners[:-1]))
+            else:
+                open_handles.append(entity.dxf.handle)
+        return outlines, open_handles
+
     def error(
         self, message: str, handle: str | None = None, hint: str | None = None
     ) -> FormatError:
@@ -315,6 +373,12 @@ def _layer(entity: Any) -> str:
 
 def _outline_centre(entity: Any) -> tuple[float, float] | None:
     """Return the centroid of the area of a closed outline; None for other lines."""
+    corners = _outline_corners(entity)
+    return None if corners is None or not _is_closed(corners) else _centroid(corners)
+
+
+def _outline_corners(entity: Any) -> Array | None:
+    """Return the points (n, 2) of a line, with chords for arcs; None if it has no size."""
     from ezdxf import path
 
     try:
@@ -326,10 +390,12 @@ def _outline_centre(entity: Any) -> tuple[float, float] | None:
     if not 0 < size < math.inf:
         return None
     flattened = outline.flattening(FLATTENING * size)
-    corners = np.array([(point.x, point.y) for point in flattened])
-    if not np.allclose(corners[0], corners[-1], rtol=0, atol=1e-6 * size):
-        return None
-    return _centroid(corners)
+    return np.array([(point.x, point.y) for point in flattened])
+
+
+def _is_closed(corners: Array) -> bool:
+    size = float(np.ptp(corners, axis=0).max())
+    return bool(np.allclose(corners[0], corners[-1], rtol=0, atol=1e-6 * size))
 
 
 def _centroid(corners: Array) -> tuple[float, float] | None:

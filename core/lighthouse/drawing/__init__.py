@@ -1,0 +1,1 @@
+"""Drawings for the installation of Lighthouse stations."""
