@@ -12,19 +12,13 @@ from locatk.core.advice.answer import Check, Power, SystemAdvice
 from locatk.core.advice.checks import condition_check, driving_check, limit_check, uniform_map
 from locatk.core.advice.task import Task
 from locatk.core.advice.work import work_steps
-from locatk.core.dots.design.camera import PRINT_SIGMA_M, CameraReport, Sensor, design_camera
-from locatk.core.dots.design.camera import suggest_camera as choose_camera
+from locatk.core.dots.design.camera import PRINT_SIGMA_M, CameraReport, compare_sensors
+from locatk.core.dots.design.camera_sensors import SENSORS
 from locatk.core.error_quantiles import error_quantile
 from locatk.core.lighthouse.design.visibility import is_inside
 from locatk.core.materials import BillItem
 from locatk.core.paper_sizes import PAPER_SIZES_MM
 from locatk.core.polaris.design.routes import LAYING_SIGMA_M
-
-SENSOR = Sensor("MT9V034", (752, 480), 6e-6, 60.0, source="onsemi MT9V034 data sheet")
-"""Image sensor of the paper."""
-
-BINNING = 4
-"""Pixels of this sensor along each side of one pixel of the paper's frames, 188 x 120."""
 
 PAPER_NAME = "A0"
 """Paper of large floors."""
@@ -42,13 +36,10 @@ section IV.A)."""
 
 def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
     """Design sheets over the area of a task, and a camera for them."""
-    setup = choose_camera(
-        SENSOR,
-        binning=BINNING,
-        speed_mps=task.speed_mps,
-        wanted_rate_hz=task.rate_hz,
-    )
-    camera = design_camera(setup)
+    camera = compare_sensors(SENSORS, speed_mps=task.speed_mps, wanted_rate_hz=task.rate_hz)[
+        0
+    ].report
+    setup = camera.setup
     sheets = _sheet_centres(task)
     count = len(sheets)
     position_m, heading_rad = _errors(camera, count > 1)
@@ -133,7 +124,7 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
     x_mm, y_mm = PAPER_SIZES_MM[PAPER_NAME]
     return SystemAdvice(
         "dots",
-        f"{count} sheets of {PAPER_NAME}, {SENSOR.name} with a lens of "
+        f"{count} sheets of {PAPER_NAME}, {setup.sensor.name} with a lens of "
         f"{1e3 * setup.lens.focal_m:g} mm, {1e3 * setup.distance_m:.0f} mm above them",
         tuple(checks),
         infrastructure=(
@@ -178,7 +169,8 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
             "A battery of 600 mAh lasts for more than 2.5 hours (section IV.B).",
         ),
         commands=(
-            f"locatk camera design --sensor mt9v034 --binning {BINNING} --speed {task.speed_mps:g}",
+            f"locatk camera design --sensor {setup.sensor.name} --speed {task.speed_mps:g} "
+            f"--rate {task.rate_hz:g}",
             f"locatk print pattern -o sheets.pdf --size {PAPER_NAME} --count {count}",
             "locatk simulate dots -o drive.mcap --sheet sheets.toml --duration 10",
             "locatk solve drive.mcap -o solved.mcap",

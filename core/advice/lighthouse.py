@@ -118,7 +118,7 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
             "Demodulation loads 19 % of a microcontroller (section II.B).",
         ),
         commands=(
-            f"locatk room design {_size_text(task)} --stations {stations} -o room.toml",
+            _design_command(task, design),
             f"locatk simulate lighthouse --artifact room.toml --robots {task.robots} -o drive.mcap",
             "locatk solve drive.mcap -o solved.mcap",
             "locatk eval solved.mcap --truth drive.mcap",
@@ -253,6 +253,27 @@ def _condition_checks(task: Task) -> list[Check]:
     return checks
 
 
-def _size_text(task: Task) -> str:
+def _design_command(task: Task, design: RoomDesign) -> str:
+    """Return the command that designs the room around the rectangle of the area."""
     x, y = np.ptp(task.corners_m, axis=0).tolist()
-    return f"{x:g}x{y:g}x{task.height_m:g}"
+    room = design.scene.room
+    assert room is not None
+    low_mm, high_mm = (1e3 * z for z in room.photodiode_z_m)
+    words = [
+        f"locatk room design {x:g}x{y:g}x{room.height_m:g}",
+        f"--stations {len(design.scene.stations)}",
+        f"--floor {low_mm:g}" if room.is_planar else f"--volume {low_mm:g}-{high_mm:g}",
+    ]
+    if room.robots is not None:
+        size = room.robots
+        words.append(
+            f"--robots {size.count} --robot-size {1e3 * size.radius_m:g}x{1e3 * size.height_m:g}"
+        )
+    if "tripod" in room.mounts:
+        corner = task.corners_m.min(axis=0)
+        words.append("--mount tripod")
+        words += [
+            f"--tripod {1e3 * (tx - corner[0]):.0f},{1e3 * (ty - corner[1]):.0f},{1e3 * tz:.0f}"
+            for tx, ty, tz in design.poses.position_m.tolist()
+        ]
+    return " ".join([*words, "-o room.toml"])
