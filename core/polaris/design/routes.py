@@ -102,11 +102,13 @@ def tag_fix_covariance(
     has_odometry: bool = True,
     laying: tuple[float, float] | None = None,
     build_m: float | None = None,
+    noise: OdometryNoise | None = None,
 ) -> Array:
     """Return the covariance of the pose of the array as it passes the middle of a tag.
 
     It is that of a weighted fit of the grid to the magnets, whose errors are the measurement
-    (:func:`.accuracy_bound.magnet_covariance`) and their placement, plus the tag's on the floor.
+    (:func:`.accuracy_bound.magnet_covariance`), the path of the array (:func:`path_covariance`)
+    and their placement, plus the error of the tag on the floor.
 
     Parameters
     ----------
@@ -125,6 +127,8 @@ def tag_fix_covariance(
     build_m : float, optional
         Standard deviation of the position of a magnet in the tag along each axis; by default that
         of magnets placed by hand, or of tags that were measured as built.
+    noise : OdometryNoise, optional
+        Errors of odometry, or of a path that is assumed to be straight.
 
     Returns
     -------
@@ -144,26 +148,25 @@ def tag_fix_covariance(
         layouts = [codec.layout_of(tags, tag_id)]
     if build_m is None:
         build_m = AS_BUILT_SIGMA_M if tag_id in tags.built else HAND_BUILT_SIGMA_M
-    matches = [
-        _match_covariance(
+    noise = noise or OdometryNoise()
+    matches = []
+    for layout in layouts:
+        measured = magnet_covariance(
             tags,
             layout,
-            magnet_covariance(
-                tags,
-                layout,
-                array,
-                step_m=step_m,
-                heading_rad=heading_rad,
-                offset_m=offset_m,
-                nuisance="strength" if has_odometry else "steps",
-                environment=use.environment,
-            ),
-            heading_rad,
-            build_m,
-            None if has_odometry else SCALE_SIGMA,
+            array,
+            step_m=step_m,
+            heading_rad=heading_rad,
+            offset_m=offset_m,
+            nuisance="strength" if has_odometry else "steps",
+            environment=use.environment,
         )
-        for layout in layouts
-    ]
+        along_m = rotate(cell_positions(tags, layout.cells), heading_rad)[:, 0]
+        by_path = path_covariance(along_m, noise, has_scale=has_odometry)
+        scale_sigma = None if has_odometry else SCALE_SIGMA
+        matches.append(
+            _match_covariance(tags, layout, measured + by_path, heading_rad, build_m, scale_sigma)
+        )
     # The error of the array is the opposite of the tag's in the array's frame, about the tag.
     jacobian = np.diag([-1.0, -1.0, -1.0])
     jacobian[0, 2] = -offset_m
@@ -178,6 +181,46 @@ def tag_fix_covariance(
     laid[:2, :2] = turn @ np.diag([x_m**2, y_m**2]) @ turn.T
     laid[2, 2] = tag_rad**2
     return np.asarray(covariance + by_tag @ laid @ by_tag.T)
+
+
+def path_covariance(along_m: Array, noise: OdometryNoise, *, has_scale: bool) -> Array:
+    """Return the covariance (3 M, 3 M) of x, y and angle of magnets by errors of the path.
+
+    The path over a tag is that of odometry, or straight. From the middle of the tag outwards, its
+    heading has a drift and a random walk, and the bar is displaced across by its integral. A magnet
+    is measured where the bar passes it.
+
+    Parameters
+    ----------
+    along_m : (M,) ndarray
+        Positions of the magnets along the path, from the middle of the tag.
+    noise : OdometryNoise
+    has_scale : bool
+        True if the scale of the path is that of odometry, with its error.
+    """
+    s = np.abs(along_m)
+    side = np.sign(along_m)
+    is_same_side = side[:, None] * side[None, :] > 0
+    first, last = np.minimum(s[:, None], s[None, :]), np.maximum(s[:, None], s[None, :])
+    variance = noise.heading_rad**2 * is_same_side
+    walk_angle = variance * first
+    walk_across = variance * first**2 * (3 * last - first) / 6
+    # Covariance of the heading at row i with the displacement at column j.
+    walk_mixed = np.where(
+        s[:, None] <= s[None, :], s[:, None] * (s[None, :] - s[:, None] / 2), s[None, :] ** 2 / 2
+    )
+    walk_mixed = variance * walk_mixed * side[None, :]
+    # The heading of a drift is proportional to the distance, its displacement to the square.
+    by_drift = np.zeros(3 * len(s))
+    by_drift[1::3], by_drift[2::3] = along_m**2 / 2, along_m
+    result = noise.drift_rad_per_m**2 * np.outer(by_drift, by_drift)
+    result[1::3, 1::3] += walk_across
+    result[2::3, 2::3] += walk_angle
+    result[2::3, 1::3] += walk_mixed
+    result[1::3, 2::3] += walk_mixed.T
+    if has_scale:
+        result[0::3, 0::3] += noise.scale**2 * np.outer(along_m, along_m)
+    return np.asarray(result)
 
 
 def laying_sigma(tags: Tags) -> tuple[float, float]:
@@ -398,7 +441,7 @@ def forecast_routes(
     if not routes:
         raise InputError("no route")
     codec.check_design(tags)
-    pass_covariance = _PassCovariances(tags, use, laying)
+    pass_covariance = _PassCovariances(tags, use, laying, noise)
     forecasts, fixes, warnings = [], [], list[str]()
     for route in routes:
         passes = tuple(find_tag_passes(tags, route, use))
@@ -446,9 +489,13 @@ class _PassCovariances:
     """Covariances of passes over the tags of a site; equal passes are computed once."""
 
     def __init__(
-        self, tags: Tags, use: ReadingConditions, laying: tuple[float, float] | None
+        self,
+        tags: Tags,
+        use: ReadingConditions,
+        laying: tuple[float, float] | None,
+        noise: OdometryNoise,
     ) -> None:
-        self._tags, self._use, self._laying = tags, use, laying
+        self._tags, self._use, self._laying, self._noise = tags, use, laying, noise
         self._known: dict[tuple[object, ...], Array] = {}
 
     def __call__(self, tag_pass: TagPass) -> Array:
@@ -465,6 +512,7 @@ class _PassCovariances:
                 heading_rad=heading * HEADING_RESOLUTION_RAD,
                 offset_m=offset * OFFSET_RESOLUTION_M,
                 laying=self._laying,
+                noise=self._noise,
             )
         return self._known[key]
 
@@ -583,7 +631,7 @@ def spacing_for_accuracy(
     codec.check_design(tags)
     smallest_m = pass_separation(tags, use)
     try:
-        fix = tag_fix_covariance(tags, use, laying=laying)
+        fix = tag_fix_covariance(tags, use, laying=laying, noise=noise)
     except InputError:
         smallest_m = math.nan
     if math.isnan(smallest_m):
@@ -643,7 +691,7 @@ def _remedies(
     if single[0] > wanted[0] or single[1] > wanted[1]:
 
         def after(build_m: float | None) -> str:
-            exact = tag_fix_covariance(tags, use, laying=(0.0, 0.0), build_m=build_m)
+            exact = tag_fix_covariance(tags, use, laying=(0.0, 0.0), build_m=build_m, noise=noise)
             return _errors_text(*_quantiles(exact[None], np.ones(1)))
 
         return (

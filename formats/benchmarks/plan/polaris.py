@@ -1,10 +1,10 @@
-"""Figures of the planning of Polaris: predictions against simulated drives and published recordings.
+"""Figures of the planning of Polaris: predictions against simulations and published recordings.
 
 Each of twenty tasks (fixed seeds) has a design of tags, a clearance, a speed, a route with tags at
-some spacing, and standard deviations of the odometry, of the magnets in the tags and of the tags on
-the floor. The prediction (:mod:`locatk.core.polaris.design.routes`) knows these standard deviations,
-the design and the route. Several drives are simulated, each over tags that were built and laid
-anew, with discs as cylinders (magpylib), conversions of the axes one after the other, and odometry
+some spacing, and standard deviations of the odometry, of the magnets in the tags and of the tags
+on the floor. The prediction (:mod:`locatk.core.polaris.design.routes`) knows these standard
+deviations, the design and the route. Several drives are simulated, each over tags that were built
+and laid anew, with discs as cylinders (magpylib), axes that are converted one after the other, and odometry
 with errors of scale and drift and a random walk of its heading. They are solved as by
 ``locatk solve`` (poses at the tags) and as by ``locatk live`` (poses between the tags: that filter
 knows the tags behind it only, as the forecast does), with the designed positions of the tags.
@@ -20,29 +20,54 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading
-from locatk.core.polaris.design.planning import ReadingConditions
-from locatk.core.polaris.design.routes import SiteForecast, forecast_routes, tag_fix_covariance
+from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading, umeyama
+from locatk.core.polaris.array import Samples
+from locatk.core.polaris.codec import capacity, layout_of
+from locatk.core.polaris.design.accuracy_bound import magnet_covariance
+from locatk.core.polaris.design.planning import ReadingConditions, compact_spacing, sensor_array
+from locatk.core.polaris.design.routes import (
+    SiteForecast,
+    forecast_routes,
+    path_covariance,
+    tag_fix_covariance,
+)
 from locatk.core.polaris.design.site import SitePoint, place_tags
 from locatk.core.polaris.mlx90393 import Settings
 from locatk.core.polaris.simulation.options import SimulationOptions, usual_bar
 from locatk.core.polaris.simulation.session import SimulatedSession, simulate
 from locatk.core.polaris.solver import solve
 from locatk.core.polaris.stream import PolarisStream
-from locatk.core.polaris.tag import Magnet, PlanarPose, Tags
+from locatk.core.polaris.tag import Magnet, PlanarPose, Tags, cell_positions
 from locatk.core.routes import Route
-from locatk.core.simulation import random_stream
 from locatk.core.streaming.events import PoseEstimate
 from locatk.core.streaming.localizer import LiveLocalizer
 from locatk.core.streaming.planar_filter import OdometryNoise
 from locatk.core.streaming.tracker import DEFAULT_SETTINGS
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
+from locatk.formats.benchmarks.polaris.suite import (
+    SAMPLE_RATE_HZ,
+    SET_IDS,
+    SPEED_MPS,
+    read_runs,
+    solve_run,
+    summarize_run,
+)
+from locatk.formats.importers.polaris_csv import PUBLISHED_TAGS
 
 Array = NDArray[np.float64]
 
 SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 """Signs of the errors of scale and drift of the odometry in the drives of a task."""
+
+CAPACITIES = (
+    ("4 magnets of order 3", Tags(magnets=4), math.log2(20_480)),
+    ("5 magnets of order 3", Tags(), math.log2(327_680)),
+    ("8 magnets of order 3", Tags(magnets=8), 24.0),
+    ("8 magnets of order 4, 16 orientations", Tags(order=4, magnets=8, orientations=16), 41.0),
+    ("3 magnets of order 2", Tags(order=2, magnets=3), 9.0),
+)
+"""Designs whose capacity the paper states (sections 5.3 and 8), with the bits."""
 
 TASKS, DRIVES, TAGS = 20, len(SIGNS), 4
 """Tasks, simulated drives of each, and tags along each route."""
@@ -154,6 +179,16 @@ def make_task(number: int) -> PlanningTask:
         noise,
         math.radians(rng.uniform(1, 5)),
     )
+
+
+def figures(data: Path) -> list[Figure]:
+    """Return all figures; ``data`` is the folder of published recordings."""
+    missing = Figure("polaris recordings: predicted and reached errors", None, "", "", TAIL_RATIO)
+    return [
+        *simulated_figures(),
+        *measure_or_explain(lambda: recording_figures(data / "polaris"), missing),
+        *paper_figures(),
+    ]
 
 
 # ---- a simulated drive
@@ -312,6 +347,7 @@ def measure_task(task: PlanningTask, seed: int, drives: int = DRIVES) -> TaskErr
                 tag_id=each.tag_id,
                 heading_rad=each.heading_rad,
                 offset_m=each.offset_m,
+                noise=task.noise,
             )
             for each in route.passes
         ]
@@ -365,8 +401,10 @@ def simulated_figures(tasks: int = TASKS, drives: int = DRIVES) -> list[Figure]:
 
 
 def ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
-    """Return median and tails of ratios as figures; targets are given as the larger of a ratio and
-    its inverse."""
+    """Return the median and the tails of ratios as figures.
+
+    A target for the median is one of the larger of the ratio and its inverse.
+    """
     low, middle, high = np.percentile(ratio, [5, 50, 95])
     return [
         Figure(f"{name}: median", float(middle), "", f"{how}; goal 0.8 to 1.25"),
@@ -380,3 +418,129 @@ def ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
         Figure(f"{name}: 5th percentile", float(low), "", how, 1 / TAIL_RATIO, "higher"),
         Figure(f"{name}: 95th percentile", float(high), "", how, TAIL_RATIO),
     ]
+
+
+# ---- the published recordings
+
+
+@dataclass(frozen=True)
+class RecordingErrors:
+    """Predicted and reached errors of the magnets of one published tag.
+
+    Attributes
+    ----------
+    position_m : (predicted, reached)
+        Mean distance of the magnets from the grid, after rigid alignment.
+    scatter_m : (predicted, reached)
+        Rms by axis of their positions about the mean of each over the runs, after alignment.
+    angle_rad : (predicted, reached)
+        The same of their angles in the frame of the tag.
+    """
+
+    position_m: tuple[float, float]
+    scatter_m: tuple[float, float]
+    angle_rad: tuple[float, float]
+
+
+def measure_recordings(samples: Sequence[Samples], tag_id: int) -> RecordingErrors:
+    """Predict the errors of the recordings of one tag, and solve them.
+
+    The prediction knows the design of the tag and of the bar, the speed of the authors and the
+    noise of the sensors, that magnets were placed by hand and that the robot had no odometry: each
+    step is unknown, the path is assumed to be straight, and the spacing of the tag gives the scale.
+    """
+    tags, layout = PUBLISHED_TAGS, layout_of(PUBLISHED_TAGS, tag_id)
+    cells_m = cell_positions(tags, layout.cells)
+    array, _ = sensor_array(ReadingConditions())
+    measured = magnet_covariance(tags, layout, array, step_m=SPEED_MPS / SAMPLE_RATE_HZ)
+    measured = measured + path_covariance(cells_m[:, 0], OdometryNoise(), has_scale=False)
+    is_position = np.arange(len(measured)) % 3 < 2
+    residual = _without_alignment(cells_m)
+    scatter = residual @ measured[np.ix_(is_position, is_position)] @ residual.T
+    placed = scatter + BUILD_SIGMA_M**2 * residual @ residual.T
+    angle2 = np.diag(measured)[2::3].mean()
+
+    runs = [summarize_run(solve_run(each, "joint"), tag_id) for each in samples]
+    runs = [run for run in runs if np.isfinite(run.position_m).all()]
+    aligned = np.array(
+        [umeyama(run.position_m, cells_m, with_scale=False).apply(run.position_m) for run in runs]
+    )
+    angles = np.array([run.angle_rad - run.heading_rad for run in runs])
+    deviation = np.angle(np.exp(1j * (angles - np.angle(np.exp(1j * angles).mean(axis=0)))))
+    unbiased = len(runs) / (len(runs) - 1)
+    return RecordingErrors(
+        (_mean_length(placed), float(np.linalg.norm(aligned - cells_m, axis=2).mean())),
+        (
+            math.sqrt(np.trace(scatter) / len(scatter)),
+            math.sqrt(unbiased * float(np.mean((aligned - aligned.mean(axis=0)) ** 2))),
+        ),
+        (math.sqrt(angle2), math.sqrt(unbiased * float(np.mean(deviation**2)))),
+    )
+
+
+def _without_alignment(cells_m: Array) -> Array:
+    """Return the projection (2 M, 2 M) that removes translation, rotation and the scale of x."""
+    x, y = (cells_m - cells_m.mean(axis=0)).T
+    design = np.zeros((2 * len(x), 4))
+    design[0::2, 0] = design[1::2, 1] = 1.0
+    design[0::2, 2], design[1::2, 2], design[0::2, 3] = -y, x, x
+    basis = np.linalg.qr(design)[0]
+    return np.asarray(np.eye(len(design)) - basis @ basis.T)
+
+
+def _mean_length(covariance: Array) -> float:
+    """Return the mean length of the errors of points whose covariance is (2 M, 2 M)."""
+    angle = (np.arange(256) + 0.5) * math.pi / 256
+    direction = np.column_stack([np.cos(angle), np.sin(angle)])
+    blocks = [covariance[k : k + 2, k : k + 2] for k in range(0, len(covariance), 2)]
+    # A Gaussian error is r L u: the mean of r is sqrt(pi / 2), u is a unit vector.
+    sigma = np.sqrt([np.einsum("ki,ij,kj->k", direction, block, direction) for block in blocks])
+    return math.sqrt(math.pi / 2) * float(sigma.mean())
+
+
+def recording_figures(folder: Path) -> Iterator[Figure]:
+    """Compare predictions with the published recordings."""
+    recordings = read_runs(folder)
+    for name, samples in recordings.items():
+        errors = measure_recordings(samples, SET_IDS[name])
+        how = f"{len(samples)} published runs, one tag; the prediction knows its design"
+        yield _recording_figure(
+            name, "magnets, rigid-aligned", errors.position_m, f"{how}; 0.4 mm by hand"
+        )
+        yield _recording_figure(name, "scatter of positions", errors.scatter_m, how)
+        yield _recording_figure(name, "scatter of angles", errors.angle_rad, how)
+
+
+def _recording_figure(name: str, kind: str, errors: tuple[float, float], how: str) -> Figure:
+    predicted, reached = errors
+    ratio = predicted / reached
+    return Figure(
+        f"polaris recordings, {name}: predicted and reached {kind}, larger ratio",
+        max(ratio, 1 / ratio), "", f"predicted / reached {ratio:.2f}; {how}", TAIL_RATIO,
+    )  # fmt: skip
+
+
+# ---- calculations of the paper
+
+
+def paper_figures() -> Iterator[Figure]:
+    """Reproduce the calculations of the Polaris paper that belong to the design of tags."""
+    peer = "Polaris paper"
+    for title, tags, bits in CAPACITIES:
+        yield Figure(
+            f"polaris paper, Eq. 1: {title}", math.log2(capacity(tags)), "bit",
+            "capacity of the codec `mosk`", peer=peer, peer_value=bits,
+        )  # fmt: skip
+    tags = Tags()
+    spacing_mm = 1e3 * compact_spacing(tags.magnet, tags.clearance_m)
+    yield Figure(
+        "polaris paper, 5.2.3: spacing by the rule of 0.8", spacing_mm, "mm",
+        "2 x 0.5 mm N52 at 10 mm; distance without overlap: field at 0.1 of its peak, 49.7 mm",
+        peer=peer, peer_value=40.0,
+    )  # fmt: skip
+    conversion = Settings()
+    yield Figure(
+        "polaris paper, 7.1: sampling rate of the published firmware", conversion.max_rate_hz, "Hz",
+        "OSR 3, DIG_FILT 3: 16.05 ms for three axes and the readout; refutes 100 Hz",
+        peer=peer, peer_value=100.0,
+    )  # fmt: skip
