@@ -239,7 +239,9 @@ class CameraSetup:
         _require(self, 0, 1e5, "wanted_rate_hz")
         for name in ("speed_mps", "yaw_rate_rps", "jitter_m", "lens_blur_m", "focus_error_m"):
             if not 0 <= getattr(self, name) < 1e4:
-                raise InputError(f"{name} is {getattr(self, name):g}", hint="Give at least 0")
+                raise InputError(
+                    f"{name.replace('_', ' ')} is {getattr(self, name):g}", hint="Give at least 0"
+                )
         if self.illuminance_lx is not None:
             _require(self, 0, 1e7, "illuminance_lx")
         if self.noise_levels is not None and not 0 <= self.noise_levels <= MAX_LEVEL:
@@ -880,4 +882,7 @@ def _require(
         if not low < value <= high:
             shown = f"{value * scale:g} {unit}".strip()
             limits = f"above {low * scale:g}, at most {high * scale:g} {unit}".strip()
-            raise InputError(f"{name.rpartition('_')[0] or name} is {shown}", hint=f"Give {limits}")
+            quantity = name
+            for ending in ("_m", "_s", "_lx", "_hz"):
+                quantity = quantity.removesuffix(ending)
+            raise InputError(f"{quantity.replace('_', ' ')} is {shown}", hint=f"Give {limits}")

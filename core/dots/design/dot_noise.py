@@ -209,8 +209,8 @@ def _dot_profile(image: DotImage, motion_rad: float) -> Array:
     reach = WINDOW_PX + 2 * image.pitch_px + image.diameter_px + 4 * image.blur_px + image.motion_px
     width = 2 ** math.ceil(math.log2(reach + 2 * SMOOTHING_RADIUS_PX))
     n = width * PHASES_PER_PX
-    frequency = np.fft.fftfreq(n, 1 / PHASES_PER_PX)
-    half = np.fft.rfftfreq(n, 1 / PHASES_PER_PX)
+    frequency: Array = np.fft.fftfreq(n, 1 / PHASES_PER_PX).astype(np.float64)
+    half: Array = np.fft.rfftfreq(n, 1 / PHASES_PER_PX).astype(np.float64)
     fx, fy = half[None, :], frequency[:, None]
     radius = image.diameter_px / 2
     argument = 2 * np.pi * radius * np.hypot(fx, fy)

@@ -3,7 +3,8 @@
 Each of twenty tasks (fixed seeds) has a sensor, a lens, a distance, blur, noise, a speed, a tilt
 and a printer. The prediction is the closed form of :mod:`locatk.core.dots.design.camera`. Frames of
 the same setup are rendered at random poses and decoded by the solver; their errors are those
-against the poses that were rendered. Twenty more tasks are near the limits of the decoder, for read rates.
+against the poses that were rendered. Twenty more tasks are near the limits of the decoder, for read
+rates.
 """
 
 from __future__ import annotations
