@@ -96,24 +96,49 @@ def figures(data: Path) -> list[Figure]:
 # ---- accuracy
 
 
-def _one_station(data: Path) -> list[Figure]:
+def one_station_experiments(
+    data: Path, method: str = "bundle"
+) -> list[tuple[list[Pair], ImportedSession, Solution]]:
+    """Return the pairs of estimate and truth, the session and the solution of each experiment."""
     folder = data / "oneLH-2D_scene" / "dataset"
+    experiments = []
+    for k in PLANAR_EXPERIMENTS:
+        session = read_dotbot(
+            [folder / "lighthouse" / f"{k}_lh2.csv"],
+            [folder / "ground_truth" / f"{k}_blender.csv"],
+        )
+        solution = _solve_session(session, method)
+        experiments.append((list(_with_truth(solution, session.truth)), session, solution))
+    return experiments
 
+
+def _one_station(data: Path) -> list[Figure]:
     def solve_experiments(method: str) -> list[list[Pair]]:
-        experiments = []
-        for k in PLANAR_EXPERIMENTS:
-            session = read_dotbot(
-                [folder / "lighthouse" / f"{k}_lh2.csv"],
-                [folder / "ground_truth" / f"{k}_blender.csv"],
-            )
-            experiments.append(list(_with_truth(_solve_session(session, method), session.truth)))
-        return experiments
+        return [pairs for pairs, _, _ in one_station_experiments(data, method)]
 
     how = (
         "experiments 1-5, frame from the four markers, no alignment; time offset of each "
         "experiment from the other four"
     )
     return _score("one station, planar", solve_experiments, "none", how, (7.01, 7.86, 3.56))
+
+
+def two_stations_pairs(data: Path) -> tuple[list[Pair], ImportedSession, Solution]:
+    """Return the pairs of estimate and truth of all experiments, the session and its solution."""
+    folder = data / "twoLH-2D_scene" / "dataset"
+    session = read_dotbot([folder / "lighthouse" / "data.csv"], [])
+    solution = _solve_session(replace(session, scene=None), "bundle")
+    pairs = [
+        pair
+        for k in PLANAR_EXPERIMENTS
+        for pair in _with_truth(solution, _two_stations_truth(folder, k))
+    ]
+    return pairs, session, solution
+
+
+def _two_stations_truth(folder: Path, number: int) -> Sequence[Trajectory]:
+    recording = folder / "lighthouse" / "data.csv"
+    return read_dotbot([recording], [folder / "ground_truth" / f"{number}_blender.csv"]).truth
 
 
 def _two_stations(data: Path) -> list[Figure]:
@@ -124,13 +149,7 @@ def _two_stations(data: Path) -> list[Figure]:
         # The scene is solved from the robots alone, without markers, as in the paper.
         solution = _solve_session(replace(read_dotbot([recording], []), scene=None), method)
         return [
-            list(
-                _with_truth(
-                    solution,
-                    read_dotbot([recording], [folder / "ground_truth" / f"{k}_blender.csv"]).truth,
-                )
-            )
-            for k in PLANAR_EXPERIMENTS
+            list(_with_truth(solution, _two_stations_truth(folder, k))) for k in PLANAR_EXPERIMENTS
         ]
 
     how = (
@@ -157,8 +176,8 @@ def _score(
     the estimated offset is a row of its own.
     """
     bundle = solve_experiments("bundle")
-    estimated = _leave_one_out(bundle, align)
-    paper = _leave_one_out(solve_experiments("paper"), align)
+    estimated = leave_one_out(bundle, align)
+    paper = leave_one_out(solve_experiments("paper"), align)
     scored, rows = estimated, []
     by_others = "time offset of each experiment from the other four"
     if offset_s is not None:
@@ -178,7 +197,7 @@ def _score(
     ]  # fmt: skip
 
 
-def _leave_one_out(experiments: list[list[Pair]], align: str) -> Evaluation:
+def leave_one_out(experiments: list[list[Pair]], align: str) -> Evaluation:
     """Evaluate all experiments, each with the time offset estimated from the others."""
     shifted: list[Pair] = []
     for k, pairs in enumerate(experiments):
@@ -189,7 +208,7 @@ def _leave_one_out(experiments: list[list[Pair]], align: str) -> Evaluation:
 
 
 def _grid(data: Path) -> list[Figure]:
-    session, truth = _grid_session(data)
+    session, truth = grid_session(data)
     rows = []
     for method in ("bundle", "paper"):
         position = _grid_positions(session, truth, method)
@@ -233,7 +252,7 @@ def _scatter(position: Array, truth: Array) -> list[Figure]:
 
 def _scenes_from_few_positions(data: Path) -> list[Figure]:
     """Solve the scene from n positions and all poses in that scene (Fig. 12 of the paper)."""
-    session, truth = _grid_session(data)
+    session, truth = grid_session(data)
     sites, site = np.unique(truth, axis=0, return_inverse=True)
     rng = np.random.default_rng(2024)
     rows = []
@@ -263,7 +282,7 @@ def _scenes_from_few_positions(data: Path) -> list[Figure]:
     return rows
 
 
-def _grid_session(data: Path) -> tuple[ImportedSession, Array]:
+def grid_session(data: Path) -> tuple[ImportedSession, Array]:
     """Return the recording of the grid, and the true position of each epoch [mm]."""
     path = data / "twoLH-3D_scene" / "dataset" / "data_all.csv"
     session = read_dotbot([path], [])
@@ -326,7 +345,7 @@ def _speed_on_grid(data: Path) -> Figure:
     )  # fmt: skip
 
     def measure() -> list[Figure]:
-        _grid_session(data)  # reports missing data with its path
+        grid_session(data)  # reports missing data with its path
         return [measure_single_threaded(declared, f"lighthouse.suite.time_grid({str(data)!r})")]
 
     return measure_or_explain(measure, declared)[0]
@@ -334,7 +353,7 @@ def _speed_on_grid(data: Path) -> Figure:
 
 def time_grid(data: str) -> Duration:
     """Time the solution of the grid."""
-    session, _ = _grid_session(Path(data))
+    session, _ = grid_session(Path(data))
     return time_call(lambda: solve(session.sweeps, Scene()))
 
 

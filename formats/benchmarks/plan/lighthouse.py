@@ -1,0 +1,431 @@
+"""Figures of the planning of Lighthouse rooms: predicted against reached accuracy.
+
+Predictions are those of ``locatk room check`` (:mod:`locatk.core.lighthouse.design`): standard
+deviations of positions relative to each other, without the frame. They are compared with
+
+- simulated sessions in rooms of random sizes, heights, obstacles and stations on random mounts,
+- simulated sessions in rooms of ``locatk room design``,
+- the published recordings of the grid and the floor.
+
+In each simulated session, the stations are mounted beside their designed poses and have the light
+planes of other real units. The session is solved with the room as a prior, and its positions are
+compared with the truth after a similarity, which the prediction does not contain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from locatk.core.errors import LocatkError
+from locatk.core.evaluation import EvaluationOptions, evaluate
+from locatk.core.geometry import Similarity, umeyama
+from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
+from locatk.core.lighthouse.design import RoomRequest, design_room
+from locatk.core.lighthouse.design.accuracy import PositionAccuracy
+from locatk.core.lighthouse.design.placement import seen_stations
+from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
+from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
+from locatk.core.lighthouse.recording import Sweeps
+from locatk.core.lighthouse.room import (
+    MOUNTING_POSITION_SIGMA_M,
+    MOUNTING_ROTATION_SIGMA_RAD,
+    Obstacle,
+    RobotSize,
+    Room,
+    rectangle,
+)
+from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene.standstills import find_standstills
+from locatk.core.lighthouse.simulation import SimulatedSession, SimulationOptions, simulate
+from locatk.core.lighthouse.solver import SolveOptions, solve
+from locatk.core.solution import Solution
+from locatk.formats.benchmarks.figures import Figure, measure_or_explain
+from locatk.formats.benchmarks.lighthouse import suite
+
+Array = NDArray[np.float64]
+
+TASKS, SESSIONS = 20, 6
+"""Random rooms, and simulated sessions in each: with other units, mounting errors and paths."""
+
+DESIGNED_SESSIONS = 16
+"""Simulated sessions in each designed room."""
+
+FIRST_SEED = 25_100
+
+MIN_REST_POSES = 10
+"""Fewest poses of a robot at rest that give a scatter."""
+
+ROBOTS, DURATION_S, SPEED_MPS = 10, 40.0, 0.3
+"""Robots with one photodiode that report ten times a second, and drive through the whole room."""
+
+MAX_PREDICTED_PLACES = 1000
+"""Largest number of the driven places at which a prediction is computed."""
+
+MEDIAN_GOAL, TAIL_GOAL, DESIGN_GOAL = 1.25, 2.0, 1.2
+"""Goals for the ratio of predicted and reached standard deviation, or its reciprocal: median and
+95 % of the random rooms, and each designed room."""
+
+RECORDING_GOAL = 2.0
+"""The same for published recordings."""
+
+NAME = "Lighthouse: predicted / reached sigma"
+
+REQUEST = RoomRequest(facing="all")
+"""Photodiodes of the simulator receive light from everywhere."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Predicted and reached standard deviations of positions, in m: rms of all sessions of a room.
+
+    Attributes
+    ----------
+    predicted_m, reached_m : float
+    sessions : int
+        Sessions that were solved.
+    refused : tuple of str
+        Reasons of the others.
+    """
+
+    predicted_m: float
+    reached_m: float
+    sessions: int
+    refused: tuple[str, ...] = ()
+
+    @property
+    def ratio(self) -> float:
+        """Predicted over reached."""
+        return self.predicted_m / self.reached_m
+
+
+def figures(data: Path) -> list[Figure]:
+    """Return the figures; ``data`` is the folder of published recordings."""
+    folder = data / "lighthouse"
+    rows: list[Figure] = []
+    for name, measure in (
+        ("20 random rooms", _random_rooms),
+        ("designed rooms", _designed_rooms),
+        ("published grid", partial(_grid, folder)),
+        ("published floor, two stations", partial(_floor_of_two, folder)),
+        ("published floor, one station", partial(_floor_of_one, folder)),
+    ):
+        rows += measure_or_explain(measure, Figure(f"{NAME}, {name}", None, "", ""))
+    return rows
+
+
+# ---- random rooms
+
+
+def _random_rooms() -> list[Figure]:
+    """Compare predictions for random rooms with simulated sessions."""
+    compared = [
+        compare_sessions(draw_room(number), range(SESSIONS), FIRST_SEED + 100 * number)
+        for number in range(TASKS)
+    ]
+    ratio = np.array([each.ratio for each in compared if each.sessions])
+    solved = sum(each.sessions for each in compared)
+    low, median, high = np.percentile(ratio, [5, 50, 95])
+    how = (
+        "rooms of 3 to 8 m, 2 to 6 stations on random places of the walls, on a plane or in space; "
+        f"{solved} of {TASKS * SESSIONS} sessions solved, each with other stations; after a "
+        f"similarity. Median {median:.2f}, 5 % {low:.2f}, 95 % {high:.2f}"
+    )
+    return [
+        Figure(
+            f"{NAME}, 20 random rooms: median",
+            _deviation(median), "", f"or its reciprocal; {how}", MEDIAN_GOAL,
+        ),
+        Figure(
+            f"{NAME}, 20 random rooms: 95 %",
+            float(np.percentile([_deviation(each) for each in ratio], 95)), "",
+            f"or its reciprocal; {how}", TAIL_GOAL,
+        ),
+    ]  # fmt: skip
+
+
+def _deviation(ratio: float) -> float:
+    """Return a ratio or its reciprocal, whichever is above 1."""
+    return float(max(ratio, 1.0 / ratio))
+
+
+def draw_room(number: int) -> Scene:
+    """Draw a room with stations on random places of its walls."""
+    rng = np.random.default_rng(FIRST_SEED + number)
+    length_m, width_m = rng.uniform(3.0, 8.0, 2)
+    height_m = float(rng.uniform(2.4, 3.5))
+    low_m = float(rng.uniform(0.05, 0.3))
+    is_planar = bool(rng.random() < 0.5)
+    high_m = low_m if is_planar else low_m + float(rng.uniform(0.6, 1.2))
+    obstacles = []
+    for _ in range(rng.integers(0, 3)):
+        corner = rng.uniform(0.2, 0.7, 2) * (length_m, width_m)
+        size = rng.uniform(0.2, 0.6, 2)
+        outline = rectangle(*size, (float(corner[0]), float(corner[1])))
+        obstacles.append(Obstacle(outline, 0.0, float(rng.uniform(0.3, 1.0))))
+    robots = RobotSize(ROBOTS, 0.06, min(low_m, 0.12)) if rng.random() < 0.5 else None
+    room = Room(
+        rectangle(length_m, width_m),
+        height_m,
+        (low_m, high_m),
+        obstacles=tuple(obstacles),
+        robots=robots,
+    )
+    stations = _random_stations(rng, room, int(rng.integers(2, 7)))
+    return Scene(
+        stations,
+        planar=is_planar,
+        floor_z=low_m if is_planar else 0.0,
+        scale="design",
+        frame="room",
+        frame_source="design",
+        room=room,
+    )
+
+
+def _random_stations(rng: np.random.Generator, room: Room, count: int) -> tuple[Station, ...]:
+    """Return stations on walls, at least a quarter of the way around from each other for two."""
+    size = room.outline_m.max(axis=0)
+    start = rng.random()
+    covariance = np.diag(
+        np.repeat([MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD], 3) ** 2
+    )
+    stations = []
+    for k in range(count):
+        # Along the walls, a fraction of the circumference from the corner at the origin.
+        along = (start + (k + rng.uniform(-0.25, 0.25)) / max(count, 3)) % 1.0 * 2 * size.sum()
+        x, y = _on_walls(along, *size)
+        position = np.array([x, y, room.height_m - rng.uniform(0.1, 0.6)])
+        target = np.append(size * rng.uniform(0.35, 0.65, 2), room.photodiode_z_m[0])
+        stations.append(
+            Station(
+                k + 1, position, _facing(position, target), GENERIC_CALIBRATION,
+                covariance=covariance,
+            )
+        )  # fmt: skip
+    return tuple(stations)
+
+
+def _on_walls(along_m: float, length_m: float, width_m: float) -> tuple[float, float]:
+    """Return the point at a distance along the walls, 5 cm inside."""
+    inset = 0.05
+    if along_m < length_m:
+        x, y = along_m, inset
+    elif along_m < length_m + width_m:
+        x, y = length_m - inset, along_m - length_m
+    elif along_m < 2 * length_m + width_m:
+        x, y = 2 * length_m + width_m - along_m, width_m - inset
+    else:
+        x, y = inset, 2 * (length_m + width_m) - along_m
+    return (
+        float(np.clip(x, inset, length_m - inset)),
+        float(np.clip(y, inset, width_m - inset)),
+    )
+
+
+def _facing(position: Array, target: Array) -> Array:
+    forward = (target - position) / np.linalg.norm(target - position)
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left)
+    return np.stack([forward, left, np.cross(forward, left)], axis=1)
+
+
+# ---- designed rooms
+
+
+def _designed_rooms() -> list[Figure]:
+    """Compare predictions for rooms of ``locatk room design`` with simulated sessions."""
+    rooms = {
+        "4 x 4 m floor, 2 stations": (Room(rectangle(4, 4), 2.6, (0.1, 0.1)), 2),
+        "8 x 6 m floor, 4 stations": (Room(rectangle(8, 6), 3.0, (0.1, 0.1)), 4),
+        "5 x 4 m to 1.2 m height, 4 stations": (Room(rectangle(5, 4), 2.6, (0.1, 1.2)), 4),
+    }
+    rows = []
+    for number, (name, (room, count)) in enumerate(rooms.items()):
+        scene = design_room(room, RoomRequest(stations=count)).scene
+        seed = FIRST_SEED + 10_000 + 100 * number
+        compared = compare_sessions(scene, range(DESIGNED_SESSIONS), seed)
+        how = (
+            f"or its reciprocal; predicted {1e3 * compared.predicted_m:.2f} mm, reached "
+            f"{1e3 * compared.reached_m:.2f} mm, rms of {compared.sessions} sessions with other "
+            "stations, after a similarity"
+        )
+        rows.append(
+            Figure(
+                f"{NAME}, {name}",
+                _deviation(compared.ratio), "", how, DESIGN_GOAL,
+            )
+        )  # fmt: skip
+    return rows
+
+
+# ---- published recordings
+
+
+def _grid(data: Path) -> list[Figure]:
+    """Compare predictions for the scene of the published grid with its errors and its scatter."""
+    session, truth_mm = suite.grid_session(data)
+    solution = solve(session.sweeps, Scene(), SolveOptions(scene="two-3d"))
+    (track,) = solution.trajectories
+    truth = 1e-3 * truth_mm
+    to = umeyama(track.position, truth)
+    position = to.apply(track.position)
+    error_m = _rms_distance(position - truth)
+    _, site = np.unique(truth, axis=0, return_inverse=True)
+    scatter = [position[site == k] - position[site == k].mean(axis=0) for k in np.unique(site)]
+    accuracy = _predict(solution.artifact.transformed(to), position)
+    return [
+        _recording_figure("published grid: error", accuracy.sigma_m, error_m,
+                          "4,759 positions, after a similarity"),
+        _recording_figure("published grid: repeatability", accuracy.noise_sigma_m,
+                          _rms_distance(np.concatenate(scatter)), "at 140 points at rest"),
+    ]  # fmt: skip
+
+
+def _floor_of_two(data: Path) -> list[Figure]:
+    """Compare predictions for the published floor under two stations."""
+    pairs, session, solution = suite.two_stations_pairs(data)
+    options = EvaluationOptions(align="sim3", offset_s=suite.TWO_STATIONS_OFFSET_S)
+    evaluation = evaluate(pairs, options)
+    to = evaluation.alignment
+    scene: Scene = solution.artifact.transformed(to)
+    return _floor_figures(
+        "published floor, two stations", scene, [(session.sweeps, solution, to)], evaluation.rmse
+    )
+
+
+def _floor_of_one(data: Path) -> list[Figure]:
+    """Compare predictions for the published floor under one station."""
+    experiments = suite.one_station_experiments(data)
+    error_m = suite.leave_one_out([pairs for pairs, _, _ in experiments], "none").rmse
+    runs = [
+        (session.sweeps, solution, Similarity.identity()) for _, session, solution in experiments
+    ]
+    scene: Scene = experiments[0][2].artifact
+    return _floor_figures("published floor, one station", scene, runs, error_m)
+
+
+def _floor_figures(
+    name: str, scene: Scene, runs: Sequence[tuple[Sweeps, Solution, Similarity]], error_m: float
+) -> list[Figure]:
+    """Compare a prediction with the distance from a camera, and with the scatter at rest."""
+    places, scatter = [], []
+    for sweeps, solution, to in runs:
+        rests = find_standstills(sweeps)
+        for track in solution.trajectories:
+            position = to.apply(track.position)
+            places.append(position)
+            for rest in rests:
+                is_inside = (track.time_ns >= rest.start_ns) & (track.time_ns <= rest.end_ns)
+                if rest.device == track.device and np.count_nonzero(is_inside) >= MIN_REST_POSES:
+                    own = position[is_inside, :2]
+                    scatter.append(own - own.mean(axis=0))
+    accuracy = _predict(scene, np.concatenate(places))
+    camera = "against a camera whose video was tracked by hand, whose errors are included"
+    return [
+        _recording_figure(f"{name}: error", accuracy.sigma_m, error_m, camera),
+        _recording_figure(f"{name}: repeatability", accuracy.noise_sigma_m,
+                          _rms_distance(np.concatenate(scatter)),
+                          f"in {len(scatter)} rests of robots"),
+    ]  # fmt: skip
+
+
+def _predict(scene: Scene, points_m: Array) -> PositionAccuracy:
+    """Predict the accuracy at places at which all stations of a solved scene were received."""
+    step = max(1, len(points_m) // MAX_PREDICTED_PLACES)
+    position = np.stack([station.position for station in scene.stations])
+    rotation = np.stack([station.rotation for station in scene.stations])
+    points = points_m[::step]
+    is_seen = np.ones((len(position), len(points)), bool)
+    return predict_solved_positions(
+        position, rotation, points, is_seen, is_planar=bool(scene.planar)
+    )
+
+
+def _rms_distance(offset: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
+
+
+def _recording_figure(name: str, sigma_m: Array, reached_m: float, how: str) -> Figure:
+    predicted_m = float(np.sqrt(np.mean(sigma_m**2)))
+    return Figure(
+        f"{NAME}, {name}",
+        _deviation(predicted_m / reached_m),
+        "",
+        f"or its reciprocal; predicted {1e3 * predicted_m:.2f} mm, reached "
+        f"{1e3 * reached_m:.2f} mm, {how}",
+        RECORDING_GOAL,
+    )
+
+
+# ---- sessions
+
+
+def compare_sessions(scene: Scene, sessions: Sequence[int], first_seed: int) -> Comparison:
+    """Predict the accuracy in a room, and reach it in simulated sessions."""
+    predicted, reached, refused = [], [], []
+    for number in sessions:
+        session = simulate(
+            SimulationOptions(
+                robots=ROBOTS,
+                duration_s=DURATION_S,
+                speed_mps=SPEED_MPS,
+                noise_rad=ANGLE_SIGMA_RAD,
+                room=scene,
+                seed=first_seed + number,
+            )
+        )
+        try:
+            solution = solve(session.sweeps, session.scene)
+        except LocatkError as error:
+            refused.append(error.message)
+            continue
+        if solution.artifact.frame_source == "design":
+            refused.append("the designed poses were used")
+            continue
+        estimate, truth = _positions(solution, session)
+        dims = 2 if scene.planar else 3
+        to = umeyama(estimate[:, :dims], truth[:, :dims])
+        error = to.apply(estimate[:, :dims]) - truth[:, :dims]
+        reached.append(np.mean(np.sum(error**2, axis=1)))
+        predicted.append(_predicted_variance(scene, truth))
+    if not reached:
+        return Comparison(math.nan, math.nan, 0, tuple(refused))
+    return Comparison(
+        float(np.sqrt(np.mean(predicted))),
+        float(np.sqrt(np.mean(reached))),
+        len(reached),
+        tuple(refused),
+    )
+
+
+def _predicted_variance(scene: Scene, points_m: Array) -> float:
+    """Return the mean predicted variance of positions at some of the driven places."""
+    assert scene.room is not None
+    step = max(1, len(points_m) // MAX_PREDICTED_PLACES)
+    points = points_m[::step]
+    position = np.stack([station.position for station in scene.stations])
+    rotation = np.stack([station.rotation for station in scene.stations])
+    is_seen = seen_stations(scene.room, position, rotation, points, REQUEST)
+    sigma = predict_solved_positions(
+        position, rotation, points, is_seen, is_planar=scene.room.is_planar
+    ).sigma_m
+    return float(np.mean(sigma[np.isfinite(sigma)] ** 2))
+
+
+def _positions(solution: Solution, session: SimulatedSession) -> tuple[Array, Array]:
+    """Return the estimated and the true positions (n, 3) at the times of all poses."""
+    truth = {track.device: track for track in session.truth}
+    estimates, trues = [], []
+    for track in solution.trajectories:
+        true = truth[track.device]
+        axes = [np.interp(track.time_ns, true.time_ns, axis) for axis in true.position.T]
+        estimates.append(track.position)
+        trues.append(np.stack(axes, axis=1))
+    return np.concatenate(estimates), np.concatenate(trues)
