@@ -167,7 +167,7 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
             f"locatk map design {rows}x{columns} --window {window} --pitch {1e3 * pitch_m:.0f} "
             "-o map.toml",
             "locatk print landmarks map.toml -o floor.pdf",
-            "locatk simulate landmarks map.toml -o drive.mcap",
+            "locatk simulate landmarks map.toml -o drive.mcap --landmarks 12",
             "locatk solve drive.mcap -o solved.mcap",
             "locatk eval solved.mcap --truth drive.mcap",
         ),

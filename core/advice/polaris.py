@@ -24,7 +24,8 @@ from locatk.core.polaris import codec
 from locatk.core.polaris.design.environment import MOTORS, QUIET, REINFORCED, Environment
 from locatk.core.polaris.design.planning import ReadingConditions, evaluate_design
 from locatk.core.polaris.design.routes import SpacingPlan, plan_route, spacing_for_accuracy
-from locatk.core.polaris.design.site import SitePoint
+from locatk.core.polaris.design.search import SearchSpace, search_designs
+from locatk.core.polaris.design.site import SitePoint, pass_separation
 from locatk.core.polaris.tag import Tags
 from locatk.core.routes import Route
 
@@ -41,14 +42,17 @@ ARRAY_POWER_W, MINIATURE_POWER_W, COMPUTING_POWER_W = 77.22e-3, 25.08e-3, 2.8e-3
 """Power of arrays of nine and three magnetometers, and of template matching on an ESP32 (Polaris
 paper, section 8.5)."""
 
+SEARCHED_IDS = 500
+"""Number of ids of tags that are searched for a larger clearance than that of the paper."""
+
 MAX_MISREAD = 0.01
 """Fraction of passes with a wrong orientation that is accepted."""
 
 
 def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
     """Design tags along the routes of a task, or along lanes if it has no routes."""
-    tags = Tags(clearance_m=task.clearance_m)
     use = ReadingConditions(speed_mps=task.speed_mps, environment=environment_of(task))
+    tags = _choose_tags(task, use)
     routes = task.routes or lanes(task)
     plan, points = _plan(task, tags, use, routes)
     count = len(points)
@@ -183,8 +187,7 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
             "Read under iron filings, dirt and water (section 8.3.6).",
         ),
         commands=(
-            f"locatk tag design --clearance {1e3 * task.clearance_m:g} --count {max(count, 1)} "
-            "-o tag.toml",
+            _tag_command(task, tags, count),
             _site_command(task, routes, plan),
             "locatk print site site.toml -o site.pdf",
             "locatk simulate polaris site.toml -o drive.mcap --odometry",
@@ -197,6 +200,33 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
 
 ROBOT_PARTS = ("magnetometer", "microcontroller")
 POWER_SOURCE = "Polaris paper, section 8.5, array and computing"
+
+
+def _choose_tags(task: Task, use: ReadingConditions) -> Tags:
+    """Return the tags of the paper, or with more clearance the cheapest that are read there."""
+    tags = Tags(clearance_m=task.clearance_m)
+    if task.clearance_m <= Tags.clearance_m:
+        return tags
+    space = SearchSpace(clearance_m=(task.clearance_m, task.clearance_m))
+    found = search_designs(SEARCHED_IDS, use=use, space=space).designs
+    readable = (d.tags for d in found if not math.isnan(pass_separation(d.tags, use)))
+    return next(readable, tags)
+
+
+def _tag_command(task: Task, tags: Tags, count: int) -> str:
+    """Return the command that designs a family of these tags."""
+    words = [
+        f"locatk tag design --clearance {1e3 * tags.clearance_m:g} --count {max(count, 1)}",
+        f"--speed {task.speed_mps:g}",
+    ]
+    if tags != Tags(clearance_m=tags.clearance_m):
+        magnet = tags.magnet
+        words.append(
+            f"--order {tags.order} --magnets {tags.magnets} --orientations {tags.orientations} "
+            f"--spacing {1e3 * tags.spacing_m:g} --diameter {1e3 * magnet.diameter_m:g} "
+            f"--height {1e3 * magnet.height_m:g} --grade {magnet.grade}"
+        )
+    return " ".join([*words, "-o tag.toml"])
 
 
 def _site_command(task: Task, routes: tuple[Route, ...], plan: SpacingPlan) -> str:
