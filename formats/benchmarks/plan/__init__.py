@@ -1,0 +1,1 @@
+"""Benchmarks of planning: predictions against simulations, recordings and published sums."""
