@@ -539,8 +539,8 @@ def _warnings(
         if read:
             count = len({visit.cell for visit in read})
             problem = (
-                f"route {name} is not localisable: {check.ambiguous_places} other places of the map "
-                f"have the {count} landmark{'s' * (count != 1)} that are read on it"
+                f"route {name} is not localisable: {check.ambiguous_places} other places of the "
+                f"map have the {count} landmark{'s' * (count != 1)} that are read on it"
             )
         else:
             problem = f"route {name} is not localisable: no landmark is read on {_length(check)}"
@@ -550,9 +550,10 @@ def _warnings(
         (wanted_heading_rad, check.heading_p95_rad, "heading", "deg", 180 / math.pi),
     ):
         if wanted is not None and reached > wanted:
+            reached_text = f"{scale * reached:.2g} {unit}"
             warnings.append(
-                f"route {name} has a {quantity} error of up to {scale * reached:.2g} {unit} on 95 % "
-                f"of it, not {scale * wanted:.2g} {unit}; {_accuracy_remedy(floor, check)}"
+                f"route {name} has a {quantity} error of up to {reached_text} on 95 % of it, not "
+                f"{scale * wanted:.2g} {unit}; {_accuracy_remedy(floor, check)}"
             )
     return warnings
 
@@ -570,8 +571,8 @@ def _notes(floor: FloorMap, check: RouteCheck) -> list[str]:
         limit = 1e3 * max_pass_offset(floor.geometry)
         notes.append(
             f"route {check.route.name} only grazes {len(doubtful)} of {len(check.visits)} "
-            f"landmarks ({first}{more}), so that they may be misread; pass within {limit:.0f} mm of their "
-            "centres"
+            f"landmarks ({first}{more}), so that they may be misread; pass within {limit:.0f} mm "
+            "of their centres"
         )
     return notes
 
