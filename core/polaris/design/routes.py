@@ -85,8 +85,8 @@ STRAIGHT_ODOMETRY_ERRORS = (
 TOLERANCE_M = 1e-9
 """Tolerance of positions, for rounding [m]."""
 
-PROBABILITY = 0.95
-"""Probability of the errors of a forecast."""
+PROBABILITY, NORMAL_QUANTILE = 0.95, 1.96
+"""Probability of the errors of a forecast, and those of one component in standard deviations."""
 
 
 # ---- one pass
@@ -557,7 +557,7 @@ def lateral_p95_m(accuracy: RouteAccuracy, distance_m: float) -> float:
     covariance = accuracy.covariance[min(row, len(accuracy.covariance) - 1)]
     if not np.isfinite(covariance).all():
         return 0.0
-    return error_quantile(covariance[None, 1:2, 1:2], PROBABILITY)
+    return NORMAL_QUANTILE * math.sqrt(covariance[1, 1])
 
 
 # ---- spacing

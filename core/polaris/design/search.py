@@ -19,7 +19,7 @@ from locatk.core.error_quantiles import error_quantile
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
 from locatk.core.polaris.codec import families
-from locatk.core.polaris.design.accuracy_bound import accuracy_bound
+from locatk.core.polaris.design.accuracy_bound import AccuracyBound, accuracy_bound
 from locatk.core.polaris.design.materials import disc_magnet
 from locatk.core.polaris.design.planning import (
     MAX_EARTH_FIELD_T,
@@ -314,8 +314,12 @@ def _best_of_magnet(
         excess = _excess(design, position_m, heading_rad)
         if excess <= 1 and not codes.has_family(tags):
             continue
-        if excess <= 1 and not evaluate_design(tags, use).warnings:
-            return design, None
+        if excess <= 1:
+            report = evaluate_design(tags, use)
+            design = TagDesign(tags, *_errors_of(report.placed))
+            excess = _excess(design, position_m, heading_rad)
+            if excess <= 1 and not report.warnings:
+                return design, None
         if closest is None or excess < _excess(closest, position_m, heading_rad):
             closest = design
         tried += 1
@@ -377,8 +381,7 @@ def _evaluated(
         )
     except InputError:
         return TagDesign(tags, math.inf, math.inf), math.inf
-    errors = _errors(np.diag([bound.pose_x_m, bound.pose_y_m, bound.pose_heading_rad]) ** 2)
-    return TagDesign(tags, *errors), bound.angle_rad
+    return TagDesign(tags, *_errors_of(bound)), bound.angle_rad
 
 
 def _least_excess(tags: Tags, position_m: float, heading_rad: float) -> float:
@@ -396,6 +399,7 @@ def _least_excess(tags: Tags, position_m: float, heading_rad: float) -> float:
     )
 
 
-def _errors(covariance: Array) -> tuple[float, float]:
-    position_m = error_quantile(covariance[None, :2, :2], PROBABILITY)
-    return position_m, error_quantile(covariance[None, 2:, 2:], PROBABILITY)
+def _errors_of(bound: AccuracyBound) -> tuple[float, float]:
+    """Return the errors of position and heading of the pose that are not exceeded with 95 %."""
+    position = np.diag(np.square([bound.pose_x_m, bound.pose_y_m]))
+    return error_quantile(position[None], PROBABILITY), NORMAL_QUANTILE * bound.pose_heading_rad
