@@ -165,6 +165,13 @@ def predict_with_gradient(points: Array, calibration: Calibration) -> tuple[Arra
     by_tilt : (..., 2) ndarray
         Derivative of each angle by the tilt of its plane. (The derivative by phase is -1.)
     """
+    model, by_point, by_tilt = _model_with_gradient(points, calibration)
+    return model.angles, by_point, by_tilt
+
+
+def _model_with_gradient(
+    points: Array, calibration: Calibration
+) -> tuple[_ForwardModel, Array, Array]:
     x, y, z = (points[..., None, i] for i in range(3))
     r = np.hypot(x, y)
     slope = z / r
@@ -180,7 +187,28 @@ def predict_with_gradient(points: Array, calibration: Calibration) -> tuple[Arra
         ],
         axis=-1,
     )
-    return model.angles, by_point, by_tilt
+    return model, by_point, by_tilt
+
+
+def predict_with_derivatives(points: Array, calibration: Calibration) -> tuple[Array, Array, Array]:
+    """Predict rotor angles, with derivatives by the points and all parameters.
+
+    Parameters
+    ----------
+    points, calibration
+        See :func:`predict_angles`.
+
+    Returns
+    -------
+    angles : (..., 2) ndarray
+        Radians; ``nan`` for points that a plane does not cross.
+    by_point : (..., 2, 3) ndarray
+        Derivative of each angle by the point.
+    by_parameters : (..., 2, 7) ndarray
+        Derivative of each angle by :data:`LINEAR_PARAMETERS` of its plane.
+    """
+    model, by_point, by_tilt = _model_with_gradient(points, calibration)
+    return model.angles, by_point, model.by_linear_parameters(by_tilt)
 
 
 def predict_sweeps(
@@ -205,11 +233,8 @@ def predict_sweeps(
     by_parameters : (n, 7) ndarray
         Derivative by :data:`LINEAR_PARAMETERS` of the plane.
     """
-    angles, by_point, by_tilt = predict_with_gradient(points, calibration)
+    angles, by_point, by_parameters = predict_with_derivatives(points, calibration)
     rows = np.arange(len(points))
-    x, y, z = (points[:, None, i] for i in range(3))
-    model = _ForwardModel(np.arctan2(y, x), z / np.hypot(x, y), calibration)
-    by_parameters = model.by_linear_parameters(by_tilt)
     return angles[rows, plane], by_point[rows, plane], by_parameters[rows, plane]
 
 

@@ -29,7 +29,6 @@ priors and weights those of its bundle adjustment
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +40,7 @@ from locatk.core.lighthouse.calibration import (
     PHASE,
     PHASE_TILT_SIGMA_RAD,
     TILT,
-    predict_sweeps,
+    predict_with_derivatives,
 )
 from locatk.core.lighthouse.design.accuracy import (
     MIN_CONDITION,
@@ -66,22 +65,6 @@ SCENE_POINTS = 300
 MIN_EIGENVALUE_RATIO = 1e-10
 """Smallest eigenvalue of the normal equations of a scene, relative to the largest one, of a
 direction that the recording determines: others are those of the frame."""
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Derivatives of the angles of a station at p points, both planes.
-
-    Attributes
-    ----------
-    by_point : (p, 2, d) ndarray
-    by_station : (p, 2, 9) ndarray
-    by_calibration : (p, 2, 14) ndarray
-    """
-
-    by_point: Array
-    by_station: Array
-    by_calibration: Array
 
 
 def predict_solved_positions(
@@ -125,26 +108,34 @@ def predict_solved_positions(
     )
     is_known = [False] * len(position_m) if has_factory_data is None else list(has_factory_data)
     dims = 2 if is_planar else 3
-    rows = [
-        _station_rows(position_m[i], rotation[i], points_m, is_seen[i], dims, is_known[i])
-        for i in range(len(position_m))
-    ]
-    to_point, is_determined = _position_gain(rows)
+    by_point, by_station, by_calibration = _derivatives(
+        position_m, rotation, points_m, is_seen, dims, is_known
+    )
+    to_point, is_determined = _position_gain(by_point)
     is_determined &= np.isfinite(only_noise.noise_sigma_m)
     if not np.any(is_determined):
         return only_noise
     chosen = np.flatnonzero(is_determined)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), SCENE_POINTS)).astype(int)]
-    gain = _scene_gain(rows, to_point, chosen, is_known)
-    jacobian = _displacement(rows, to_point, gain)
+    projection = np.tile(np.eye(by_point.shape[1]), (len(chosen), 1, 1))
+    if len(position_m) > 1:
+        # Points of a single station are known: they are markers, without which it is not solved.
+        projection -= by_point[chosen] @ to_point[chosen]
+    scene_gain = _scene_gain(projection, by_station[chosen], by_calibration[chosen], is_known)
+    unexplained = by_calibration.reshape(-1, by_calibration.shape[-1])
+    unexplained = unexplained - by_station.reshape(len(unexplained), -1) @ scene_gain
+    jacobian = to_point @ unexplained.reshape(by_calibration.shape)
     motions = _frame_motions(points_m, is_determined, is_planar)
     frame = motions[is_determined].reshape(-1, motions.shape[-1])
     own = jacobian[is_determined].reshape(len(frame), -1)
-    jacobian -= motions @ np.linalg.lstsq(frame, own, rcond=None)[0]
-    covariance = np.zeros((len(points_m), dims, dims))
+    common = np.linalg.solve(frame.T @ frame, frame.T @ own)
+    rows = jacobian.reshape(-1, len(common[0])) - motions.reshape(-1, len(common)) @ common
+    weighted = np.empty_like(rows)
     for i, is_factory in enumerate(is_known):
-        part = jacobian[..., i * CALIBRATION_PARAMETERS : (i + 1) * CALIBRATION_PARAMETERS]
-        covariance += part @ calibration_spread(is_factory) @ part.mT
+        columns = slice(i * CALIBRATION_PARAMETERS, (i + 1) * CALIBRATION_PARAMETERS)
+        weighted[:, columns] = rows[:, columns] @ calibration_spread(is_factory)
+    rows, weighted = rows.reshape(jacobian.shape), weighted.reshape(jacobian.shape)
+    covariance = np.einsum("pik,pjk->pij", rows, weighted)
     infinite = ~is_determined[:, None, None]
     total = np.where(infinite, np.inf, only_noise.noise_covariance + covariance)
     return PositionAccuracy(only_noise.noise_covariance, total, only_noise.dilution)
@@ -164,93 +155,77 @@ def calibration_spread(has_factory_data: bool) -> Array:
     return np.asarray(np.cov(units.T))
 
 
-def _station_rows(
+def _derivatives(
     position: Array,
     rotation: Array,
     points: Array,
     is_seen: BoolArray,
     dims: int,
-    has_factory_data: bool,
-) -> _Rows:
-    """Return the derivatives at the points that a station sees; zero at the others."""
-    p = len(points)
-    offset = points - position
-    rows = _Rows(
-        np.zeros((p, 2, dims)), np.zeros((p, 2, UNKNOWNS)), np.zeros((p, 2, CALIBRATION_PARAMETERS))
-    )
-    for plane in (0, 1):
-        _, by_local, by_parameters = predict_sweeps(
-            offset @ rotation, np.full(p, plane), GENERIC_CALIBRATION
+    is_known: Sequence[bool],
+) -> tuple[Array, Array, Array]:
+    """Return the derivatives of all angles (p, 2 s): both planes of one station after another.
+
+    They are by the point (p, 2 s, d), by the unknowns of stations (p, 2 s, 9 s) and by their
+    calibrations (p, 2 s, 14 s); zero for planes that do not cross the point.
+    """
+    s, p = is_seen.shape
+    by_point = np.zeros((p, s, 2, dims))
+    by_station = np.zeros((p, s, 2, s, UNKNOWNS))
+    by_calibration = np.zeros((p, s, 2, s, CALIBRATION_PARAMETERS))
+    for i in range(s):
+        offset = points - position[i]
+        _, by_local, by_parameters = predict_with_derivatives(
+            offset @ rotation[i], GENERIC_CALIBRATION
         )
-        is_valid = (is_seen & np.isfinite(by_local).all(axis=1))[:, None]
-        gradient = np.where(is_valid, by_local @ rotation.T, 0.0)
-        by_parameters = np.where(is_valid, by_parameters, 0.0)
-        rows.by_point[:, plane] = gradient[:, :dims]
-        rows.by_station[:, plane, :3] = -gradient
-        rows.by_station[:, plane, 3:6] = np.cross(gradient, offset)
-        if not has_factory_data:
-            rows.by_station[:, plane, 6 + plane] = by_parameters[:, TILT]
-            if plane == 1:
-                rows.by_station[:, plane, 8] = by_parameters[:, PHASE]
-        columns = slice(7 * plane, 7 * plane + 7)
-        rows.by_calibration[:, plane, columns] = by_parameters
-    return rows
+        is_valid = is_seen[i] & np.isfinite(by_local).all(axis=(1, 2))
+        gradient = np.where(is_valid[:, None, None], by_local @ rotation[i].T, 0.0)
+        by_parameters = np.where(is_valid[:, None, None], by_parameters, 0.0)
+        by_point[:, i] = gradient[..., :dims]
+        by_station[:, i, :, i, :3] = -gradient
+        by_station[:, i, :, i, 3:6] = np.cross(gradient, offset[:, None])
+        for plane in (0, 1):
+            columns = slice(7 * plane, 7 * plane + 7)
+            by_calibration[:, i, plane, i, columns] = by_parameters[:, plane]
+            if not is_known[i]:
+                by_station[:, i, plane, i, 6 + plane] = by_parameters[:, plane, TILT]
+        if not is_known[i]:
+            by_station[:, i, 1, i, 8] = by_parameters[:, 1, PHASE]
+    return (
+        by_point.reshape(p, 2 * s, dims),
+        by_station.reshape(p, 2 * s, -1),
+        by_calibration.reshape(p, 2 * s, -1),
+    )
 
 
-def _position_gain(rows: Sequence[_Rows]) -> tuple[Array, BoolArray]:
+def _position_gain(by_point: Array) -> tuple[Array, BoolArray]:
     """Return ``(G^T G)^-1 G^T`` (p, d, 2 s), and where it exists."""
-    gradient = np.concatenate([r.by_point for r in rows], axis=1)
-    information = gradient.mT @ gradient
+    information = by_point.mT @ by_point
     values = np.linalg.eigvalsh(information)
     is_determined = values[:, 0] > MIN_CONDITION * values[:, -1]
     safe = np.where(is_determined[:, None, None], information, np.eye(information.shape[-1]))
-    gain = np.linalg.solve(safe, gradient.mT)
+    gain = np.linalg.solve(safe, by_point.mT)
     return np.where(is_determined[:, None, None], gain, 0.0), np.asarray(is_determined)
 
 
 def _scene_gain(
-    rows: Sequence[_Rows], to_point: Array, chosen: NDArray[np.int64], is_known: Sequence[bool]
+    projection: Array, by_station: Array, by_calibration: Array, is_known: Sequence[bool]
 ) -> Array:
     """Return the change L (9 s, 14 s) of the stations' unknowns by deviations of calibrations."""
-    s = len(rows)
-    projection = np.tile(np.eye(2 * s), (len(chosen), 1, 1))
-    if s > 1:
-        # Points of a single station are known: they are markers, without which it is not solved.
-        gradient = np.concatenate([r.by_point[chosen] for r in rows], axis=1)
-        projection -= gradient @ to_point[chosen]
-    weight = MAX_INDEPENDENT_POINTS / (len(chosen) * MODEL_SIGMA_RAD**2)
-    normal = np.zeros((s, UNKNOWNS, s, UNKNOWNS))
-    coupling = np.zeros((s, UNKNOWNS, s, CALIBRATION_PARAMETERS))
-    for i, own in enumerate(rows):
-        for j, other in enumerate(rows):
-            part = projection[:, 2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
-            weighted = weight * own.by_station[chosen].mT @ part
-            normal[i, :, j] = np.sum(weighted @ other.by_station[chosen], axis=0)
-            coupling[i, :, j] = np.sum(weighted @ other.by_calibration[chosen], axis=0)
-        if not is_known[i]:
-            sigma = np.append(PHASE_TILT_SIGMA_RAD[:, 1], PHASE_TILT_SIGMA_RAD[1, 0])
-            normal[i, range(6, 9), i, range(6, 9)] += sigma**-2.0
-    matrix = normal.reshape(s * UNKNOWNS, -1)
-    scale = np.sqrt(np.maximum(np.diagonal(matrix), 1e-12))
+    weight = MAX_INDEPENDENT_POINTS / (len(projection) * MODEL_SIGMA_RAD**2)
+    size = by_station.shape[-1]
+    projected = (weight * projection @ by_station).reshape(-1, size)
+    normal = projected.T @ by_station.reshape(-1, size)
+    coupling = projected.T @ by_calibration.reshape(len(projected), -1)
+    sigma = np.append(PHASE_TILT_SIGMA_RAD[:, 1], PHASE_TILT_SIGMA_RAD[1, 0])
+    for i, is_factory in enumerate(is_known):
+        if not is_factory:
+            rows = UNKNOWNS * i + np.arange(6, UNKNOWNS)
+            normal[rows, rows] += sigma**-2.0
+    scale = np.sqrt(np.maximum(np.diagonal(normal), 1e-12))
     inverse = np.linalg.pinv(
-        matrix / np.outer(scale, scale), rcond=MIN_EIGENVALUE_RATIO, hermitian=True
+        normal / np.outer(scale, scale), rcond=MIN_EIGENVALUE_RATIO, hermitian=True
     )
-    return np.asarray(
-        (inverse @ (coupling.reshape(len(matrix), -1) / scale[:, None])) / scale[:, None]
-    )
-
-
-def _displacement(rows: Sequence[_Rows], to_point: Array, scene_gain: Array) -> Array:
-    """Return the displacements J (p, d, 14 s) of points by deviations of calibrations."""
-    p, dims = to_point.shape[:2]
-    result = np.zeros((p, dims, len(rows) * CALIBRATION_PARAMETERS))
-    for i, own in enumerate(rows):
-        gain = to_point[:, :, 2 * i : 2 * i + 2]
-        result[..., i * CALIBRATION_PARAMETERS : (i + 1) * CALIBRATION_PARAMETERS] += (
-            gain @ own.by_calibration
-        )
-        result -= (gain @ own.by_station) @ scene_gain[i * UNKNOWNS : (i + 1) * UNKNOWNS]
-    return result
+    return np.asarray(inverse @ (coupling / scale[:, None]) / scale[:, None])
 
 
 def _frame_motions(points: Array, is_determined: BoolArray, is_planar: bool) -> Array:
