@@ -25,7 +25,7 @@ RENDERING_S_PER_PX = 0.8e-6
 RENDERING_BUDGET_S = 2.5
 """Time for the frames that are rendered by default."""
 
-FRAME_LIMITS = (4, 40)
+FRAME_LIMITS = (2, 40)
 """Least and largest number of frames that are rendered by default."""
 
 

@@ -50,6 +50,13 @@ dot are larger."""
 EXPOSURE_MOTION_PITCHES = 1 / 11
 """Motion during a chosen exposure: one pixel of the paper's camera, whose pitch is 11 px."""
 
+MAX_PX_PER_PITCH = 40.0
+"""Pixels per pitch of a searched image beyond which it shows too few dots, whatever its size: the
+decoder halves images until their shorter side is about 120 px."""
+
+HOPELESS_MOTION_PITCHES, HOPELESS_BLUR_PITCHES = 2.0, 0.5
+"""Motion and standard deviation of blur beyond which no dot is left in a frame."""
+
 NEGLIGIBLE_FRACTION = 0.01
 """Fraction of frames not decoded at one size from which no other size is considered."""
 
@@ -645,6 +652,12 @@ def _quality_at_level(
     # A rotation blurs the dots of a frame in all directions, in the mean square like this.
     radius_px = math.hypot(*size) / math.sqrt(12)
     turn_px = setup.exposure_s * setup.yaw_rate_rps * radius_px
+    if (
+        pitch_px > MAX_PX_PER_PITCH
+        or motion_px > HOPELESS_MOTION_PITCHES * pitch_px
+        or math.hypot(blur_px / factor, turn_px) > HOPELESS_BLUR_PITCHES * pitch_px
+    ):
+        return _FrameQuality(level, 0.0, math.inf, PoseAccuracy(math.inf, math.inf, 0.0))
     image = DotImage(
         pitch_px=pitch_px,
         diameter_px=setup.dot_pitches * pitch_px,

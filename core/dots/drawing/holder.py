@@ -243,24 +243,18 @@ def _field_view(report: CameraReport, corner: Point, scale: float) -> list[Mark]
         for dx, dy in centres.tolist():
             if abs(dx) + radius < size[0] / 2 and abs(dy) + radius < size[1] / 2:
                 marks.append(_disc((middle[0] + dx, middle[1] + dy), radius))
-    reach = pitch * (MIN_WINDOW_DOTS - 1 + 3 * DOT_OFFSET_PITCHES) / math.sqrt(2)
-    marks.append(
-        Polygon(
-            tuple(
-                (middle[0] + reach * math.cos(angle), middle[1] + reach * math.sin(angle))
-                for angle in np.pi / 2 * np.arange(4)
-            ),
-            width_mm=0.3,
+    label = "smaller than the smallest window"
+    if report.window_dots >= MIN_WINDOW_DOTS:
+        label = "with the smallest window at 45 degrees"
+        reach = pitch * (MIN_WINDOW_DOTS - 1 + 3 * DOT_OFFSET_PITCHES) / math.sqrt(2)
+        corners = tuple(
+            (middle[0] + reach * math.cos(angle), middle[1] + reach * math.sin(angle))
+            for angle in np.pi / 2 * np.arange(4)
         )
-    )
-    marks += [
-        Circle(middle, 0.8, 0.2),
-        Text(
-            f"field from above, {scale:g} : 1, with the smallest window at 45 degrees",
-            (x, y + size[1] + 2.0),
-            TEXT_POINTS,
-        ),
-    ]
+        marks.append(Polygon(corners, width_mm=0.3))
+    marks.append(Circle(middle, 0.8, 0.2))
+    text = f"field from above, {scale:g} : 1, {label}"
+    marks.append(Text(text, (x, y + size[1] + 2.0), TEXT_POINTS))
     return marks
 
 

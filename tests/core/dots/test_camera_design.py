@@ -274,3 +274,24 @@ def test_frames_that_cannot_be_read_are_predicted() -> None:
     measured = measure_camera(blurred, 6)
     assert (measured.read, measured.read_rate) == (0, 0.0)
     assert math.isnan(measured.position_rms_m)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"exposure_s": 1.0, "speed_mps": 3.0},
+        {"exposure_s": 1.0, "yaw_rate_rps": 100.0},
+        {"lens_blur_m": 1.0},
+        {"pitch_m": 0.05},
+        {"pitch_m": 1e-6},
+        {"distance_m": 9.9},
+        {"distance_m": 0.0058},
+        {"jitter_m": 1.0},
+        {"noise_levels": 255.0},
+        {"focus_error_m": 0.1},
+    ],
+)
+def test_hopeless_cameras_are_answered_at_once(change: dict[str, float]) -> None:
+    report = design_camera(replace(PAPER, **change))
+    assert report.read_rate < 0.01
+    assert report.warnings
