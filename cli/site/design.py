@@ -185,8 +185,19 @@ def command(
         noise, laid = odometry_noise(drift, slip), laying_of(laying, tags)
         with console.working("Planning"), error_context(route):
             placed_at, plan = plan_route(tags, waypoints, use, noise, *wanted, laying=laid)
+        impossible = plan_warnings(plan, wanted)
+        if tags.ids is not None and len(placed_at) > len(tags.ids):
+            impossible = [
+                f"{len(placed_at)} tags are needed, but the family has {len(tags.ids)} ids: design "
+                f"more (`locatk tag design --count {len(placed_at)}`), or take a lower accuracy",
+                *impossible,
+            ]
+            placed_at = []
         if not placed_at:
-            failures.finish_with_warnings(plan_warnings(plan, wanted))
+            console.result(plan_text(plan))
+            if as_json:
+                console.emit_json({"version": 1, "output": None, "spacing": plan_entry(plan)})
+            failures.finish_with_warnings(impossible)
         with error_context(route):
             site = place_tags(tags, placed_at, min_distance)
         with console.working("Checking"):
@@ -197,8 +208,7 @@ def command(
         write_tags(output, site, overwrite=overwrite)
         console.result(f"{written_text(output, site)}\n\n{plan_text(plan)}\n")
         more = {"output": output, "site": site_entry(site), "spacing": plan_entry(plan)}
-        warnings = plan_warnings(plan, wanted)
-        report_check(report, more, as_json, forecast=forecast, warnings=warnings)
+        report_check(report, more, as_json, forecast=forecast, warnings=impossible)
         return
     placed_at = _points(tags, grid, points, route, spacing, origin, heading, columns, units)
     with error_context(table or tag):

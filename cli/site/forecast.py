@@ -167,7 +167,9 @@ def plan_text(plan: SpacingPlan) -> str:
     rows = [
         ("spacing", f"{length_text(plan.spacing_m)}; a larger one is limited by the {limit}"),
     ]
-    if not plan.is_feasible:
+    if plan.limited_by == "field":
+        rows = [("spacing", "none: no pass over a tag is detected")]
+    elif not plan.is_feasible:
         rows = [("spacing", f"{length_text(plan.spacing_m)}, the smallest for separate passes")]
     return console.labelled(rows)
 

@@ -89,6 +89,11 @@ def test_points_and_routes_of_tables(locatk, tag: Path, tmp_path: Path) -> None:
         (("--grid", "2x2", "--spacing", 9, "--units", "m"), "--columns and --units are for"),
         (("--grid", "2x2", "--spacing", 9, "--origin", "1"), "is not x,y in mm"),
         (("--points", "none.csv"), "No such file"),
+        (("--grid", "2x2", "--accuracy", 9), "--accuracy is for --route"),
+        (("--grid", "2x2", "--spacing", 9, "--drift", 1), "are for --accuracy"),
+        (("--route", "tag.toml", "--accuracy", "9,x"), "is not MM or MM,DEG"),
+        (("--route", "tag.toml", "--accuracy", "-9"), "in mm and degrees"),
+        (("--grid", "2x2", "--spacing", 900, "--environment", "loud"), "environment 'loud'"),
         (("--grid", "3x3", "--spacing", 500), "9 positions, but only 6 ids"),
     ],
 )
@@ -98,6 +103,66 @@ def test_wrong_use_of_design(locatk, tag: Path, monkeypatch, args: tuple, words:
     assert result.exit_code in (1, 2)
     assert words in " ".join(result.stderr.split())
     assert not Path("site.toml").exists()
+
+
+# ---- routes
+
+AISLE = "x_mm,y_mm\n0,0\n3000,0\n3000,1500\n"
+
+
+@pytest.fixture
+def aisle(tmp_path: Path) -> Path:
+    path = tmp_path / "aisle.csv"
+    path.write_text(AISLE)
+    return path
+
+
+def test_a_route_with_an_accuracy_is_designed_and_checked(
+    locatk, tmp_path: Path, aisle: Path
+) -> None:
+    tag, out = tmp_path / "any.toml", tmp_path / "site.toml"
+    write_tags(tag, Tags())
+    args = ("--route", aisle, "--accuracy", "15,2", "-o", out, "--json")
+    result = locatk("site", "design", tag, *args)
+    assert result.exit_code == 0, result.stderr
+    entry = json.loads(result.stdout)
+    assert entry["spacing"]["is_feasible"]
+    assert entry["forecast"]["position_p95_m"] <= 0.015
+    assert entry["forecast"]["heading_p95_rad"] <= math.radians(2)
+    assert entry["forecast"]["tags"] == len(read_tags(out).site) == entry["tags"]
+    check = locatk("site", "check", out, "--route", aisle)
+    assert check.exit_code == 0, check.stderr
+    assert "error on the route" in check.stdout
+    assert all(len(line) <= 80 for line in check.stdout.splitlines())
+    better = locatk("site", "check", out, "--route", aisle, "--drift", 0.2, "--slip", 0.1, "--json")
+    errors = json.loads(better.stdout)["forecast"]
+    assert errors["position_p95_m"] < entry["forecast"]["position_p95_m"]
+    surveyed = locatk("site", "check", out, "--route", aisle, "--laying", "0.1,0.05", "--json")
+    errors = json.loads(surveyed.stdout)["forecast"]
+    assert errors["fix_position_p95_m"] < 0.2 * entry["forecast"]["fix_position_p95_m"]
+
+
+def test_impossible_accuracies_are_answered_with_status_3(
+    locatk, tmp_path: Path, tag: Path, aisle: Path
+) -> None:
+    free, out = tmp_path / "any.toml", tmp_path / "site.toml"
+    write_tags(free, Tags())
+    result = locatk("site", "design", free, "--route", aisle, "--accuracy", 1, "-o", out)
+    assert result.exit_code == 3
+    assert "1 mm (95 %) is impossible on this route: tags 249 mm apart give" in result.stderr
+    assert "locatk site survey" in result.stderr
+    assert read_tags(out).site
+    few = locatk(
+        "site", "design", tag, "--route", aisle, "--accuracy", 5, "-o", tmp_path / "2.toml"
+    )
+    assert few.exit_code == 3
+    assert "the family has 6 ids: design more" in few.stderr
+    assert not (tmp_path / "2.toml").exists()
+    beside = tmp_path / "beside.csv"
+    beside.write_text("x_mm,y_mm\n0,500\n2900,500\n")
+    missed = locatk("site", "check", out, "--route", beside)
+    assert missed.exit_code == 3
+    assert "beside: no tag passes wholly below the array" in missed.stderr
 
 
 # ---- check
@@ -119,6 +184,7 @@ def test_check_reports_bounds_and_meanings(locatk, tag: Path) -> None:
     assert good.exit_code == 0, good.stderr
     assert "nearest tags     0 and 77354, 1000 mm apart" in good.stdout
     assert locatk("site", "check", tag, "--bounds", "0,0,0,1").exit_code == 2
+    assert "add --route" in locatk("site", "check", tag, "--drift", 1).stderr
     write_tags(tag, Tags(), overwrite=True)
     assert "no tag has a position" in locatk("site", "check", tag).stderr
 

@@ -117,6 +117,51 @@ def test_tags_that_overlap_on_a_site_are_reported(locatk, tag: Path) -> None:
     assert locatk("tag", "check", tag).exit_code == 0
 
 
+def test_search_writes_the_best_design(locatk, tmp_path: Path) -> None:
+    path = tmp_path / "found.toml"
+    options = ("--search", "--count", 20, "--accuracy", "1,1", "--diameter", 2)
+    result = design(locatk, path, *options, "--json")
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)["search"]["designs"]
+    assert [each["magnet"]["diameter_m"] for each in found] == [0.002]
+    tags = read_tags(path)
+    assert len(tags.ids or ()) == 20
+    assert (tags.order, tags.magnets) == (found[0]["order"], found[0]["magnets"])
+    text = design(locatk, path, *options, "--order", 4, "--overwrite").stdout
+    assert "Designs, the first is written" in text
+    assert read_tags(path).order == 4
+    nothing = design(locatk, tmp_path / "no.toml", "--search", "--count", 9, "--accuracy", 0.01)
+    assert nothing.exit_code == 3
+    assert "the nearest reaches" in nothing.stderr
+    assert not (tmp_path / "no.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--search",), "--search needs --count"),
+        (("--accuracy", 1), "are for --search"),
+        (("--search", "--count", 3, "--max-clearance", 5), "Give the smaller one first"),
+    ],
+)
+def test_wrong_use_of_search(locatk, tmp_path: Path, options: tuple, words: str) -> None:
+    result = design(locatk, tmp_path / "tag.toml", *options)
+    assert result.exit_code in (1, 2)
+    assert words in result.stderr
+
+
+def test_environments_are_shown(locatk, tag: Path) -> None:
+    quiet = locatk("tag", "check", tag).stdout
+    iron = locatk("tag", "check", tag, "--environment", "reinforced")
+    assert iron.exit_code == 0
+    assert "environment" not in quiet.split("planned")[1].split("one pass")[0]
+    assert "reinforced" in iron.stdout
+    assert all(len(line) <= 80 for line in iron.stdout.splitlines())
+    strong = locatk("tag", "check", tag, "--environment", "30")
+    assert strong.exit_code == 3
+    assert "the field is too weak" in strong.stderr
+
+
 def test_named_ids(locatk, tmp_path: Path) -> None:
     path = tmp_path / "tag.toml"
     assert design(locatk, path, "--id", 5, "--id", 1234).exit_code == 0

@@ -82,8 +82,8 @@ STRAIGHT_ODOMETRY_ERRORS = (
 )
 """Errors of odometry on a straight route."""
 
-TOLERANCE_M = 1e-9
-"""Tolerance of positions, for rounding [m]."""
+TOLERANCE_M = 1e-8
+"""Tolerance of positions [m]: those of a site are rounded to a nanometre."""
 
 PROBABILITY, NORMAL_QUANTILE = 0.95, 1.96
 """Probability of the errors of a forecast, and those of one component in standard deviations."""
@@ -311,28 +311,32 @@ def find_tag_passes(
     is_sharp = _sharp_turns(route)
     half_m = (tags.order - 1) / 2 * tags.spacing_m
     corners = half_m * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-    last = len(route.segment_m) - 1
-    passes = []
+    passes: list[TagPass] = []
     for k, heading in enumerate(route.heading_rad.tolist()):
         length_m = float(route.segment_m[k])
         for tag_id, pose in tags.site.items():
             offset = np.array([pose.x_m, pose.y_m]) - route.waypoint_m[k]
             along_m, left_m = rotate(offset[None], -heading)[0].tolist()
-            # A tag at a waypoint is passed once.
-            if not (0 <= along_m < length_m or (k == last and along_m == length_m)):
-                continue
             relative = math.remainder(pose.heading_rad - heading, math.tau)
             turned = rotate(corners, relative)
-            reach_m = float(turned[:, 0].max()) - TOLERANCE_M
-            if is_sharp[k] and along_m < reach_m:
-                continue
-            if is_sharp[k + 1] and along_m > length_m - reach_m:
+            reach_m = float(turned[:, 0].max())
+            first_m = reach_m if is_sharp[k] else -reach_m
+            last_m = length_m + (-reach_m if is_sharp[k + 1] else reach_m)
+            if not first_m - TOLERANCE_M <= along_m <= last_m + TOLERANCE_M:
                 continue
             play_m = half_array_m - abs(left_m) - float(turned[:, 1].max())
             if play_m >= -TOLERANCE_M:
-                distance_m = float(start_m[k]) + along_m
+                distance_m = float(start_m[k] + min(max(along_m, 0.0), length_m))
                 passes.append(TagPass(tag_id, distance_m, left_m, relative, max(play_m, 0.0)))
-    return sorted(passes, key=lambda each: each.distance_m)
+    passes.sort(key=lambda each: each.distance_m)
+    # A tag at a waypoint without a sharp turn is on both segments, and passed once.
+    last_at: dict[int, float] = {}
+    result = []
+    for each in passes:
+        if each.distance_m - last_at.get(each.tag_id, -math.inf) > 2 * half_m:
+            result.append(each)
+        last_at[each.tag_id] = each.distance_m
+    return result
 
 
 def _sharp_turns(route: Route) -> NDArray[np.bool_]:

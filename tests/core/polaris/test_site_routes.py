@@ -169,6 +169,9 @@ def test_turns_over_a_tag_and_ways_back() -> None:
     tags = Tags(site={1: PlanarPose(1, 0, 0)})
     straight = Route(np.array([[0.0, 0], [1, 0], [2, 0]]))
     assert [each.distance_m for each in find_tag_passes(tags, straight)] == [1.0]
+    near = Tags(site={1: PlanarPose(1 - 1e-9, 0.01, 0), 2: PlanarPose(1 + 1e-9, -0.01, 0)})
+    bend = Route(np.array([[0.0, 0], [1, 0], [2, 0.1]]))
+    assert sorted(each.tag_id for each in find_tag_passes(near, bend)) == [1, 2]
     corner = Route(np.array([[0.0, 0], [1, 0], [1, 1]]))
     assert find_tag_passes(tags, corner) == []
     back = Route(np.array([[0.0, 0], [2, 0], [0, 0]]))
