@@ -114,12 +114,16 @@ class DesignedFrame:
     is_plausible: bool
     scale_sigma_of_design: float
 
+    def pose_covariance(self, position: Array) -> Array:
+        """Return the covariances (n, 6, 6) of poses at positions (n, 3) by the frame."""
+        motions = np.zeros((len(position), 6, 7))
+        motions[:, :3] = common_motions(position - self.centre)
+        motions[:, range(3, 6), range(3, 6)] = 1.0
+        return np.asarray(motions @ self.covariance @ motions.mT)
+
     def add_uncertainty(self, trajectory: Trajectory) -> Trajectory:
         """Add the uncertainty of the frame to the covariance of poses in it."""
-        motions = np.zeros((len(trajectory), 6, 7))
-        motions[:, :3] = common_motions(trajectory.position - self.centre)
-        motions[:, range(3, 6), range(3, 6)] = 1.0
-        added = motions @ self.covariance @ motions.mT
+        added = self.pose_covariance(trajectory.position)
         return replace(trajectory, covariance=trajectory.covariance + added)
 
     @property

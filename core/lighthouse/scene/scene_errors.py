@@ -20,6 +20,7 @@ from locatk.core.lighthouse.motion.parameters import (
     GIVEN_ROTATION_SIGMA_RAD,
 )
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene.designed_frame import DesignedFrame
 from locatk.core.lighthouse.scene.model import JOINT_PARAMETERS
 
 Array = NDArray[np.float64]
@@ -44,6 +45,8 @@ class SceneErrors:
         Those of the scene, in the order of their indices here.
     floor_z : float, optional
         Height of all photodiodes, if they move on a plane.
+    frame : DesignedFrame, optional
+        Frame of a designed room, whose uncertainty is added.
 
     Attributes
     ----------
@@ -57,7 +60,14 @@ class SceneErrors:
     errors here.
     """
 
-    def __init__(self, scene: Scene, stations: Sequence[Station], floor_z: float | None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        stations: Sequence[Station],
+        floor_z: float | None,
+        frame: DesignedFrame | None = None,
+    ) -> None:
+        self._frame = frame
         self._stations = tuple(stations)
         self._dims = 3 if floor_z is None else 2
         self._floor_z = floor_z
@@ -92,6 +102,8 @@ class SceneErrors:
             if self._floor_z is not None:
                 centre[2] = self._floor_z
             self._cells[key] = self._propagate(centre, members)
+            if self._frame is not None:
+                self._cells[key] += self._frame.pose_covariance(centre[None])[0, :3, :3]
         return self._cells[key]
 
     def _propagate(self, position: Array, members: Sequence[int]) -> Array:
@@ -142,6 +154,11 @@ class SceneErrors:
             if len(members) > 1:
                 covariance[:3, 3:] = covariance[3:, :3] = 0.0
                 covariance[:3, :3] = self.position_covariance(position.tolist(), members)
+            if self._frame is not None:
+                of_frame = self._frame.pose_covariance(np.array(cell)[None] * CELL_M)[0]
+                if len(members) > 1:
+                    of_frame[:3, :3] = 0.0  # It is in that of the position.
+                covariance += of_frame
             if len(self._cells) >= MAX_CELLS:
                 self._cells.clear()
             self._cells[key] = covariance

@@ -13,7 +13,7 @@ from locatk.core.lighthouse.epochs import MAX_PLANE_DELAY_TURNS, MIN_PLANE_DELAY
 from locatk.core.lighthouse.localization.photodiodes import MAX_MOUNTING_SIGMAS, mounting_sigma
 from locatk.core.lighthouse.noise import CALIBRATION_SIGMA_RAD, INLIER_GATE_RAD
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.scene.designed_frame import is_design
+from locatk.core.lighthouse.scene.designed_frame import DesignedFrame, is_design
 from locatk.core.lighthouse.scene.model import StationArrays, stack_stations
 from locatk.core.lighthouse.scene.scene_errors import SceneErrors
 
@@ -114,12 +114,12 @@ class KnownScene:
     excluded: set[int] = field(default_factory=set)
 
     @classmethod
-    def of(cls, scene: Scene) -> KnownScene:
-        """Prepare a scene with one station or more."""
+    def of(cls, scene: Scene, frame: DesignedFrame | None = None) -> KnownScene:
+        """Prepare a scene with one station or more; ``frame`` is that of a designed room."""
         stations = tuple(sorted(scene.stations, key=lambda s: s.channel))
         floor_map = stations[0].floor_map if len(stations) == 1 else None
         floor_z = scene.floor_z if scene.planar else None
-        errors = SceneErrors(scene, stations, floor_z)
+        errors = SceneErrors(scene, stations, floor_z, frame)
         is_generic = any(s.calibration.is_generic for s in stations)
         has_generic_error = is_generic and floor_map is None and not errors.has_calibration
         max_gate_rad = INLIER_GATE_RAD

@@ -19,7 +19,11 @@ from locatk.core.geometry import Similarity, umeyama
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.scene.designed_frame import is_design
+from locatk.core.lighthouse.scene.designed_frame import (
+    DesignedFrame,
+    fit_designed_frame,
+    is_design,
+)
 from locatk.core.lighthouse.solver import SolveOptions, solve
 from locatk.core.solution import SolverWarning
 from locatk.core.trajectory import Trajectory
@@ -71,10 +75,13 @@ class SceneResult:
     ----------
     scene : Scene
     warnings : tuple of SolverWarning
+    frame : DesignedFrame or None
+        Uncertainty of the frame, if it is that of a designed room.
     """
 
     scene: Scene
     warnings: tuple[SolverWarning, ...]
+    frame: DesignedFrame | None = None
 
 
 def estimate_live_scene(
@@ -95,7 +102,10 @@ def estimate_live_scene(
     if is_design(solution.artifact):
         (reason,) = [w for w in solution.warnings if w.code == "designed_poses_used"]
         raise DegenerateError(reason.message)
-    return SceneResult(solution.artifact, solution.warnings)
+    frame = None
+    if is_design(prior) and solution.artifact.frame_source != "markers":
+        frame = fit_designed_frame(solution.artifact, prior)
+    return SceneResult(solution.artifact, solution.warnings, frame)
 
 
 class SweepStore:

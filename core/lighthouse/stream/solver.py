@@ -14,7 +14,11 @@ from locatk.core.lighthouse.devices.device_sweeps import MIN_SENSORS
 from locatk.core.lighthouse.receiver import Receiver
 from locatk.core.lighthouse.recording import UNKNOWN, Sweeps
 from locatk.core.lighthouse.scene import Scene
-from locatk.core.lighthouse.scene.designed_frame import is_design, with_mounting_tolerance
+from locatk.core.lighthouse.scene.designed_frame import (
+    DesignedFrame,
+    is_design,
+    with_mounting_tolerance,
+)
 from locatk.core.lighthouse.scene.estimation import direction_only_warning
 from locatk.core.lighthouse.solver import SolveOptions
 from locatk.core.lighthouse.stream.known_scene import KnownScene
@@ -337,10 +341,10 @@ class LighthouseStream(Stream):
 
     # ---- scene
 
-    def _use_scene(self, scene: Scene) -> None:
+    def _use_scene(self, scene: Scene, frame: DesignedFrame | None = None) -> None:
         """Locate devices in another scene from now on."""
         old = self._known
-        known = self._known = KnownScene.of(scene)
+        known = self._known = KnownScene.of(scene, frame)
         self._supervision = StationSupervision(known)
         if old is None:
             self._photodiodes = PhotodiodeFixes(known, self._reject, self._observe)
@@ -415,7 +419,7 @@ class LighthouseStream(Stream):
             scene = align_scene(scene, old)
         self._flush()
         self.version += 1
-        self._use_scene(scene)
+        self._use_scene(scene, result.frame)
         is_first = old is None or is_design(old)
         reason = "estimated from the first sweeps" if is_first else "refined with later sweeps"
         self._events.append(ArtifactUpdate(now_ns, self.version, scene, reason))
