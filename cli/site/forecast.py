@@ -10,7 +10,7 @@ import click
 
 from locatk.cli import console
 from locatk.cli.command import section
-from locatk.cli.tag.options import LengthAndAngle
+from locatk.cli.tag.options import LengthAndAngle as LengthAndAngle
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:

@@ -263,10 +263,12 @@ def _search(
         clearance_m=(metres(clearance), metres(max_clearance or clearance)),
         codec=context.params["codec"],
     )
-    fixed = {"order": "orders", "magnets": "counts", "orientations": "orientations"}
-    for option, name in fixed.items():
-        if option in given:
-            space = replace(space, **{name: (given[option],)})
+    if "order" in given:
+        space = replace(space, orders=(given["order"],))
+    if "magnets" in given:
+        space = replace(space, counts=(given["magnets"],))
+    if "orientations" in given:
+        space = replace(space, orientations=(given["orientations"],))
     if given.get("spacing") is not None:
         space = replace(space, spacing_m=metres(given["spacing"]))
     if given.keys() & {"diameter", "height", "grade", "remanence"}:

@@ -640,11 +640,12 @@ def spacing_for_accuracy(
         smallest_m = math.nan
     if math.isnan(smallest_m):
         remedy = "take larger magnets, less clearance or a lower speed (`locatk tag design`)"
-        return SpacingPlan(False, math.nan, *[math.inf] * 4, "field", (remedy,))
+        unknown = math.inf, math.inf
+        return SpacingPlan(False, math.nan, *unknown, *unknown, "field", (remedy,))
     single = _quantiles(fix[None], np.ones(1))
     play_m = ((use.sensors - 1) * use.sensor_spacing_m - (tags.order - 1) * tags.spacing_m) / 2
 
-    def limits(spacing_m: float) -> tuple[float, float, tuple[str, ...]]:
+    def limits(spacing_m: float) -> tuple[tuple[float, float], tuple[str, ...]]:
         """Return the errors at a spacing, and the names of the limits that they exceed."""
         route = Route(np.array([[0.0, 0.0], [PLANNED_GAPS * spacing_m, 0.0]]))
         places_m = spacing_m * np.arange(PLANNED_GAPS + 1)
@@ -662,19 +663,19 @@ def spacing_for_accuracy(
             "heading": errors[1] > heading_rad,
             "play": lateral_m > play_m,
         }
-        return (*errors, tuple(name for name, is_exceeded in exceeded.items() if is_exceeded))
+        return errors, tuple(name for name, is_exceeded in exceeded.items() if is_exceeded)
 
-    *errors, exceeded = limits(smallest_m)
+    errors, exceeded = limits(smallest_m)
     if exceeded:
         remedies = _remedies(tags, use, noise, (position_m, heading_rad), single, exceeded, laying)
         return SpacingPlan(False, smallest_m, *errors, *single, exceeded[0], remedies)
     low_m, high_m = smallest_m, MAX_SPACING_M
-    *largest_errors, exceeded = limits(high_m)
+    largest_errors, exceeded = limits(high_m)
     if not exceeded:
         return SpacingPlan(True, high_m, *largest_errors, *single, "maximum")
     while high_m > SPACING_RATIO * low_m:
         middle_m = math.sqrt(low_m * high_m)
-        *middle_errors, middle_exceeded = limits(middle_m)
+        middle_errors, middle_exceeded = limits(middle_m)
         if middle_exceeded:
             high_m, exceeded = middle_m, middle_exceeded
         else:
