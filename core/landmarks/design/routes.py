@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ from locatk.core.landmarks.design.visit_accuracy import (
 from locatk.core.landmarks.design.visit_accuracy import visit_covariance as visit_covariance
 from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.halls import circle
-from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, signs
+from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, Geometry, code_of, signs
 from locatk.core.landmarks.map.floor import (
     HOLE_CODE,
     Cell,
@@ -67,6 +68,9 @@ MAX_VISIT_POINTS = 400
 
 MAX_ROUTE_M = 10_000.0
 """Longest route; 10 km have 2.5 million points."""
+
+PASS_STEP_M = 5e-3
+"""Distances of passes that are tried [m]."""
 
 SHIFT_STEPS = 8
 """Shifts of a route that are tried along each axis, over one pitch."""
@@ -240,8 +244,9 @@ def check_routes(
         check = _check_route(
             floor, route, visits, noise, evidence, speed_mps=speed_mps, is_smoothed=is_smoothed
         )
-        warnings = _warnings(floor, check, wanted_position_m, wanted_heading_rad)
-        checks.append(replace(check, warnings=tuple(warnings), notes=tuple(_notes(floor, check))))
+        advisor = _Advisor(floor, check, noise, errors)
+        warnings = tuple(advisor.warnings(wanted_position_m, wanted_heading_rad))
+        checks.append(replace(check, warnings=warnings, notes=tuple(advisor.notes())))
     return tuple(checks)
 
 
@@ -526,104 +531,125 @@ def _check_route(
 # ---- warnings
 
 
-def _warnings(
-    floor: FloorMap,
-    check: RouteCheck,
-    wanted_position_m: float | None,
-    wanted_heading_rad: float | None,
-) -> list[str]:
-    """Return the problems of a route, with figures and remedies."""
-    warnings = []
-    name, read = check.route.name, [visit for visit in check.visits if visit.is_read]
-    if not check.is_localizable:
-        if read:
-            count = len({visit.cell for visit in read})
-            problem = (
-                f"route {name} is not localisable: {check.ambiguous_places} other places of the "
-                f"map have the {count} landmark{'s' * (count != 1)} that are read on it"
-            )
-        else:
-            problem = f"route {name} is not localisable: no landmark is read on {_length(check)}"
-        warnings.append(f"{problem}; {_remedy(floor, check, LONGER_ROUTE)}")
-    for wanted, reached, quantity, unit, scale in (
-        (wanted_position_m, check.position_p95_m, "position", "mm", 1e3),
-        (wanted_heading_rad, check.heading_p95_rad, "heading", "deg", 180 / math.pi),
-    ):
-        if wanted is not None and reached > wanted:
-            reached_text = f"{scale * reached:.2g} {unit}"
-            warnings.append(
-                f"route {name} has a {quantity} error of up to {reached_text} on 95 % of it, not "
-                f"{scale * wanted:.2g} {unit}; {_accuracy_remedy(floor, check)}"
-            )
-    return warnings
+@dataclass(frozen=True)
+class _Advisor:
+    """Problems of a route in words, with figures and remedies.
 
+    Attributes
+    ----------
+    floor : FloorMap
+    check : RouteCheck
+    noise : OdometryNoise
+    errors : VisitErrors
+    """
 
-def _notes(floor: FloorMap, check: RouteCheck) -> list[str]:
-    """Return the landmarks of a route that may be misread."""
-    notes = []
-    doubtful = [visit for visit in check.visits if not visit.is_read]
-    if doubtful:
+    floor: FloorMap
+    check: RouteCheck
+    noise: OdometryNoise
+    errors: VisitErrors
+
+    @cached_property
+    def pass_m(self) -> float:
+        """Result of :func:`max_pass_offset`, which takes a tenth of a second."""
+        return max_pass_offset(self.floor.geometry, self.noise, self.errors)
+
+    def warnings(
+        self, wanted_position_m: float | None, wanted_heading_rad: float | None
+    ) -> Iterator[str]:
+        """Yield what is missing, and a remedy."""
+        check, name = self.check, self.check.route.name
+        if not check.is_localizable:
+            count = len({visit.cell for visit in check.visits if visit.is_read})
+            problem = f"no landmark is read on {check.route.length_m:.3g} m"
+            if count:
+                problem = (
+                    f"{check.ambiguous_places} other places of the map have the {count} "
+                    f"landmark{'s' * (count != 1)} that are read on it"
+                )
+            remedy = self.shorten_gap(LONGER_ROUTE)
+            yield f"route {name} is not localisable: {problem}; {remedy}"
+        for wanted, reached, quantity, unit, scale in (
+            (wanted_position_m, check.position_p95_m, "position", "mm", 1e3),
+            (wanted_heading_rad, check.heading_p95_rad, "heading", "deg", 180 / math.pi),
+        ):
+            if wanted is not None and reached > wanted:
+                yield (
+                    f"route {name} has a {quantity} error of up to {scale * reached:.2g} {unit} on "
+                    f"95 % of it, not {scale * wanted:.2g} {unit}; {self.improve_accuracy()}"
+                )
+
+    def notes(self) -> Iterator[str]:
+        """Yield the landmarks that may be misread."""
+        check = self.check
+        doubtful = [visit for visit in check.visits if not visit.is_read]
+        if not doubtful:
+            return
         first = ", ".join(
             f"{visit.cell[0]},{visit.cell[1]} at {1e3 * visit.offset_m:.0f} mm"
             for visit in doubtful[:MAX_NAMED_LANDMARKS]
         )
         more = " ..." if len(doubtful) > MAX_NAMED_LANDMARKS else ""
-        limit = 1e3 * max_pass_offset(floor.geometry)
-        notes.append(
+        yield (
             f"route {check.route.name} only grazes {len(doubtful)} of {len(check.visits)} "
-            f"landmarks ({first}{more}), so that they may be misread; pass within {limit:.0f} mm "
-            "of their centres"
+            f"landmarks ({first}{more}), so that they may be misread; pass within "
+            f"{1e3 * self.pass_m:.0f} mm of their centres"
         )
-    return notes
+
+    def improve_accuracy(self) -> str:
+        """Return what makes the position or the heading more accurate."""
+        sigma_m = self.check.accuracy.position_sigma_m
+        is_flat = float(np.nanmin(sigma_m)) > MIN_FLATNESS * self.check.position_sigma_m
+        if is_flat and not self.floor.built:
+            return (
+                "the installation of the landmarks is the largest error: measure them "
+                "(locatk calibrate map)"
+            )
+        return self.shorten_gap("calibrate the odometry, or make the pitch smaller")
+
+    def shorten_gap(self, otherwise: str) -> str:
+        """Return what makes the longest stretch without a fix shorter, if anything does."""
+        floor, route = self.floor, self.check.route
+        start_m, end_m = self.check.longest_m
+        length_m = end_m - start_m
+        shift = best_shift(floor, route, self.pass_m)
+        if shift is not None:
+            return (
+                f"shift the route by {1e3 * shift.x_m:.0f} mm in x and {1e3 * shift.y_m:.0f} mm in "
+                f"y: it is then {shift.longest_m:.2g} m instead of {shift.unshifted_m:.2g} m "
+                "without a landmark"
+            )
+        middle = route.at(np.array([(start_m + end_m) / 2]))[0][0]
+        column, row = np.rint((middle - floor.origin_m) / floor.pitch_m).astype(int).tolist()
+        rows, columns = floor.shape
+        if not (-1 <= row <= rows and -1 <= column <= columns):
+            x, y = floor.position((rows - 1, columns - 1))
+            return (
+                f"the route leaves the map (x {floor.origin_m[0]:.2g} to {x:.2g} m, "
+                f"y {floor.origin_m[1]:.2g} to {y:.2g} m) from {start_m:.2g} m on; extend the map"
+            )
+        is_on_map = 0 <= row < rows and 0 <= column < columns
+        if not is_on_map or floor.codes[row, column] == HOLE_CODE:
+            return (
+                f"add a landmark at {row},{column}: the route is {length_m:.2g} m without one there"
+            )
+        return otherwise
 
 
-def _length(check: RouteCheck) -> str:
-    return f"{check.route.length_m:.3g} m"
+def max_pass_offset(
+    geometry: Geometry, noise: OdometryNoise | None = None, errors: VisitErrors | None = None
+) -> float:
+    """Return the largest distance from its centre at which any landmark is read by a pass [m].
 
-
-def _remedy(floor: FloorMap, check: RouteCheck, otherwise: str) -> str:
-    """Return what makes the longest stretch without a fix shorter."""
-    start_m, end_m = check.longest_m
-    length_m = end_m - start_m
-    shift = best_shift(floor, check.route)
-    if shift is not None:
-        return (
-            f"shift the route by {1e3 * shift.x_m:.0f} mm in x and {1e3 * shift.y_m:.0f} mm in y: "
-            f"it is then {shift.longest_m:.2g} m instead of {shift.unshifted_m:.2g} m without a "
-            "landmark"
+    It is a multiple of 5 mm; 0 if no pass reads all landmarks.
+    """
+    offsets = PASS_STEP_M * np.arange(math.ceil(territory_reach(geometry) / PASS_STEP_M))
+    for offset in offsets[::-1].tolist():
+        path = straight_path(geometry, offset, 0.0)
+        visits = (
+            predict_visit(geometry, path, signs(code_of(letters)), noise=noise, errors=errors)
+            for letters in PATTERNS
         )
-    middle = check.route.at(np.array([(start_m + end_m) / 2]))[0][0]
-    column, row = np.rint((middle - floor.origin_m) / floor.pitch_m).astype(int).tolist()
-    rows, columns = floor.shape
-    if not (-1 <= row <= rows and -1 <= column <= columns):
-        x, y = floor.position((rows - 1, columns - 1))
-        return (
-            f"the route leaves the map (x {floor.origin_m[0]:.2g} to {x:.2g} m, "
-            f"y {floor.origin_m[1]:.2g} to {y:.2g} m) from {start_m:.2g} m on; extend the map"
-        )
-    if not (0 <= row < rows and 0 <= column < columns) or floor.codes[row, column] == HOLE_CODE:
-        return f"add a landmark at {row},{column}: the route is {length_m:.2g} m without one there"
-    return otherwise
-
-
-def _accuracy_remedy(floor: FloorMap, check: RouteCheck) -> str:
-    """Return what makes the position or the heading more accurate."""
-    sigma_m = check.accuracy.position_sigma_m
-    is_flat = float(np.nanmin(sigma_m)) > MIN_FLATNESS * check.position_sigma_m
-    if is_flat and not floor.built:
-        return (
-            "the installation of the landmarks is the largest error: measure them "
-            "(locatk calibrate map)"
-        )
-    return _remedy(floor, check, "calibrate the odometry, or make the pitch smaller")
-
-
-def max_pass_offset(geometry: Geometry) -> float:
-    """Return the largest distance from its centre at which any landmark is read by a pass [m]."""
-    offsets = np.arange(0.0, territory_reach(geometry), 0.005)
-    for offset in offsets[::-1]:
-        path = straight_path(geometry, float(offset), 0.0)
-        if all(_is_read(predict_visit(geometry, path, signs(code))) for code in (7, 5, 3, 15)):
+        if all(map(_is_read, visits)):
             return float(offset)
     return 0.0
 
@@ -641,7 +667,7 @@ class RouteShift:
     x_m, y_m : float
     longest_m, unshifted_m : float
         Longest stretch without a landmark, shifted and as it is. A landmark counts if the route is
-        within :func:`max_pass_offset` of its centre.
+        within the given distance of its centre.
     """
 
     x_m: float
@@ -650,11 +676,12 @@ class RouteShift:
     unshifted_m: float
 
 
-def best_shift(floor: FloorMap, route: Route) -> RouteShift | None:
+def best_shift(floor: FloorMap, route: Route, pass_m: float) -> RouteShift | None:
     """Return the shift of a route with the shortest stretch between landmarks.
 
-    Shifts are multiples of an eighth of the pitch, up to half a pitch. Of those with the same
-    stretch (to 10 mm), it is the one that passes landmarks more closely, then the smallest.
+    A landmark counts if the route is within ``pass_m`` of its centre. Shifts are multiples of an
+    eighth of the pitch, up to half a pitch. Of those with the same stretch (to 10 mm), it is the
+    one that passes landmarks more closely, then the smallest.
 
     Returns
     -------
@@ -664,7 +691,6 @@ def best_shift(floor: FloorMap, route: Route) -> RouteShift | None:
     cells = floor.cells()
     if not cells:
         return None
-    limit = max_pass_offset(floor.geometry)
     tree = cKDTree([as_built_landmark(floor, cell)[0][:2] for cell in cells])
     along = np.linspace(0.0, route.length_m, max(math.ceil(route.length_m / 0.01), 1) + 1)
     position = route.at(along)[0]
@@ -673,7 +699,7 @@ def best_shift(floor: FloorMap, route: Route) -> RouteShift | None:
     for x in grid.tolist():
         for y in grid.tolist():
             gap_m = tree.query(position + (x, y))[0]
-            stops = np.concatenate([[0.0], along[gap_m <= limit], [route.length_m]])
+            stops = np.concatenate([[0.0], along[gap_m <= pass_m], [route.length_m]])
             longest_m = float(np.diff(stops).max())
             ranked.append((round(longest_m, 2), round(gap_m.mean(), 3), math.hypot(x, y), x, y))
     unshifted_m = next(item[0] for item in ranked if item[2] == 0)

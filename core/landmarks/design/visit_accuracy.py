@@ -10,13 +10,14 @@ is its part of the inverse of
 
 with the derivatives J of the closed-form field (:mod:`locatk.core.landmarks.field`) and the
 weights W of the readings (the bound of Cramer and Rao with nuisance parameters; S. M. Kay,
-Fundamentals of Statistical Signal Processing, vol. 1, 1993, chapters 3 and 12). If iron distorts
-the field, W is the inverse of noise plus a Gaussian process along the floor.
+Fundamentals of Statistical Signal Processing, vol. 1, 1993, chapters 3 and 12). Iron distorts the
+field by a Gaussian process along the floor with the covariance K. The solver does not know it, so
+that its error is added: A K A' for the estimate A = (J' W J + ...)^-1 J' W.
 
-Another code c' is read instead of the true one with the probability Q(d / 2) of a test between two
-Gaussian hypotheses (H. L. Van Trees, Detection, Estimation, and Modulation Theory, part I, 1968,
-section 2.6), where d is the distance of its field from that of all poses and errors near the true
-ones. Poses far from the true one are not compared.
+Another code c' is read instead of the true one if it is the more probable of two Gaussian
+hypotheses (H. L. Van Trees, Detection, Estimation, and Modulation Theory, part I, 1968, section
+2.6): with the probability Q(d / 2), where d is the distance of its field from that of all poses and
+errors near the true ones. Poses far from the true one are not compared.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from locatk.core.errors import InputError
 from locatk.core.landmarks.field import basis_gradient
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, code_of, signs
+from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
 from locatk.core.streaming.planar_filter import OdometryNoise
 
 Array = NDArray[np.float64]
@@ -256,26 +258,36 @@ def predict_visit(
         *_sensor_columns(total, gradient, errors),
         *_bar_columns(field, by_position, strength, errors),
     ]
-    jacobian = np.stack([column.reshape(-1) for column in columns], -1)
-    root = _Whitener.of(position, _readings(path, speed_mps, turn_rps, errors), errors)
-    jacobian = root(jacobian)
+    readings = np.repeat(_readings(path, speed_mps, turn_rps, errors), len(sensors))
+    root = np.sqrt(readings) / errors.noise_t
+    jacobian = np.stack([column.reshape(-1) for column in columns], -1) * root[:, None]
     information = jacobian.T @ jacobian + np.eye(jacobian.shape[1])
     information[range(3), range(3)] += DIFFUSE_SIGMA**-2 - 1.0
     covariance = np.linalg.inv(information)
 
-    others = np.array([each for each in signs(np.arange(CODE_COUNT)) if _differs(each, strength)])
-    difference = root(field.reshape(-1, 4) @ (others - strength).T)
-    projected = jacobian.T @ difference
-    square = np.einsum("rk,rk->k", difference, difference)
-    square -= np.einsum("ik,ij,jk->k", projected, covariance, projected)
-    distance = np.sqrt(np.maximum(square, 0.0))
-    misread = min(1.0, float(ndtr(-distance / 2).sum()))
-    return VisitAccuracy(covariance[:3, :3], misread, float(np.abs(total).max()))
+    others = _other_strengths(strength)
+    difference = root[:, None] * (field.reshape(-1, 4) @ (others - strength).T)
+    test = difference - jacobian @ (covariance @ (jacobian.T @ difference))
+    square = np.maximum(np.einsum("rk,rk->k", difference, test), 0.0)
+    variance = square
+    pose_covariance = covariance[:3, :3]
+    if errors.disturbance_t:
+        iron = root[:, None] * _iron_covariance(position.reshape(-1, 2), errors) * root
+        estimate = covariance[:3] @ jacobian.T
+        pose_covariance = pose_covariance + estimate @ iron @ estimate.T
+        variance = square + np.einsum("rk,rk->k", test, iron @ test)
+    margin = square / 2 / np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+    misread = min(1.0, float(ndtr(-margin).sum()))
+    return VisitAccuracy(pose_covariance, misread, float(np.abs(total).max()))
 
 
-def _differs(code_strength: Array, strength: Array) -> bool:
-    """Return whether a code differs in a bar that is there (a missing one has no direction)."""
-    return bool(np.any(code_strength * np.sign(strength) < 0))
+def _other_strengths(strength: Array) -> Array:
+    """Return the strengths (k, 4) of all other codes; a missing bar has no direction."""
+    is_present = np.abs(strength) >= MISSING_BAR_STRENGTH
+    codes = signs(np.arange(CODE_COUNT))
+    is_other = ((codes == np.where(strength < 0, -1.0, 1.0)) | is_present).all(axis=1)
+    others = np.where(is_present, codes * np.abs(strength), strength)[is_other]
+    return np.asarray(others[(others != strength).any(axis=1)])
 
 
 def _pose_columns(gradient: Array, lever: Array) -> list[Array]:
@@ -360,35 +372,9 @@ def _readings(path: Array, speed_mps: float, turn_rps: float, errors: VisitError
     return np.asarray(errors.rate_hz * near)
 
 
-@dataclass(frozen=True)
-class _Whitener:
-    """Multiplication by the root of the weights of the readings.
-
-    Attributes
-    ----------
-    sigma : (r,) ndarray
-        Of each reading, if they are independent.
-    lower : (r, r) ndarray or None
-        Cholesky factor of their covariance, otherwise.
-    """
-
-    sigma: Array
-    lower: Array | None
-
-    @classmethod
-    def of(cls, position: Array, readings: Array, errors: VisitErrors) -> _Whitener:
-        """Return the whitener of readings at positions (n, N, 2)."""
-        sigma = np.repeat(errors.noise_t / np.sqrt(np.maximum(readings, 1e-9)), position.shape[1])
-        if not errors.disturbance_t:
-            return cls(sigma, None)
-        flat = position.reshape(-1, 2)
-        square = np.sum((flat[:, None] - flat) ** 2, axis=-1)
-        covariance = errors.disturbance_t**2 * np.exp(
-            -square / (2 * errors.disturbance_length_m**2)
-        )
-        return cls(sigma, np.linalg.cholesky(covariance + np.diag(sigma**2)))
-
-    def __call__(self, rows: Array) -> Array:
-        if self.lower is None:
-            return rows / self.sigma[:, None]
-        return np.linalg.solve(self.lower, rows)
+def _iron_covariance(position: Array, errors: VisitErrors) -> Array:
+    """Return the covariance (r, r) of the field of iron at positions (r, 2) in the plane."""
+    square = np.sum((position[:, None] - position) ** 2, axis=-1)
+    return np.asarray(
+        errors.disturbance_t**2 * np.exp(-square / (2 * errors.disturbance_length_m**2))
+    )
