@@ -49,10 +49,7 @@ def text(
         console.table(
             ("sensor", "fits", "lens mm", "distance", "sigma um", "why not"), list(_sensors(fits))
         ),
-        console.table(
-            ("material", "count", "detail"),
-            [(item.part, item.count, item.detail) for item in report.materials],
-        ),
+        _materials_text(report),
     ]
     return "\n\n".join(parts)
 
@@ -139,9 +136,9 @@ def _head(report: CameraReport) -> Iterator[tuple[str, str]]:
     )
     yield (
         "Exposure",
-        f"{setup.exposure_s * 1e6:.0f} us, light {illuminance_text(report.needed_illuminance_lx)} "
+        f"{setup.exposure_s * 1e6:.0f} us, needs {illuminance_text(report.needed_illuminance_lx)} "
         f"(without gain {illuminance_text(report.full_illuminance_lx)}), "
-        f"noise {report.noise_levels:.2g} grey values",
+        f"noise {report.noise_levels:.3g} grey values",
     )
     yield (
         "Task",
@@ -242,6 +239,26 @@ def _sensors(fits: Sequence[CameraFit]) -> Iterator[tuple[str, ...]]:
             f"{fit.report.position_sigma_m * 1e6:.2g}",
             fit.reasons[0].partition(":")[0] if fit.reasons else "",
         )
+
+
+def _materials_text(report: CameraReport) -> str:
+    """Format the bill of materials and its total."""
+    from locatk.core.materials import total_of
+
+    total = total_of(report.materials)
+    rows = [
+        (
+            item.part,
+            item.count,
+            "" if item.amount is None else f"{item.amount:.2f}",
+            item.detail,
+        )
+        for item in report.materials
+    ]
+    table = console.table(("material", "count", total.currency, "detail"), rows)
+    sources = sorted({f"{i.price.source}, {i.price.date}" for i in report.materials if i.price})
+    lines = [f"{total.text[0].upper()}{total.text[1:]}.", *sources]
+    return "\n".join([table, "", *(console.wrapped(line) for line in lines)])
 
 
 def _mm(value_m: float) -> str:

@@ -43,12 +43,16 @@ GOOD_WINDOW_DOTS = 12
 MAX_LEVEL = 255.0
 
 GOOD_NOISE_LEVELS = 4.0
-"""Noise of a pixel of paper, in grey values, from which more light hardly helps: other errors of a
-dot are larger."""
+"""Noise of a pixel of a searched image of paper, in grey values, from which more light hardly
+helps: other errors of a dot are larger."""
 
 
 EXPOSURE_MOTION_PITCHES = 1 / 11
 """Motion during a chosen exposure: one pixel of the paper's camera, whose pitch is 11 px."""
+
+DIM_EXPOSURE_MOTION_PITCHES = 0.4
+"""Motion during a chosen exposure, at most, if the light is too little for a shorter one: half of
+what is decoded."""
 
 MAX_PX_PER_PITCH = 40.0
 """Pixels per pitch of a searched image beyond which it shows too few dots, whatever its size: the
@@ -350,8 +354,7 @@ class CameraReport:
     max_speed_mps, max_yaw_rate_rps : float
         Largest speeds at which frames with this exposure are decoded, each without the other.
     needed_illuminance_lx, full_illuminance_lx : float
-        On the paper: for a noise of :data:`GOOD_NOISE_LEVELS` with gain, and for a well exposed
-        frame without gain.
+        On the paper: from which more light hardly helps, and for a well exposed frame without gain.
     noise_levels : float
         Standard deviation of a pixel of paper in grey values.
     dot_sigma_m : float
@@ -475,7 +478,12 @@ def design_camera(setup: CameraSetup) -> CameraReport:
         pose_rate_hz=quality.read_rate * min(fps, 1 / decoding_s),
         pose_spacing_m=setup.speed_mps / (fps * max(quality.read_rate, 1e-3)),
         latency_s=setup.exposure_s / 2 + 1 / setup.sensor.max_fps + decoding_s,
-        materials=camera_materials(setup.sensor.name, setup.lens.focal_m, setup.wavelength_m),
+        materials=camera_materials(
+            setup.sensor.name,
+            setup.lens.focal_m,
+            setup.wavelength_m,
+            is_colour=setup.sensor.is_colour,
+        ),
     )
     return replace(report, warnings=tuple(_warnings(report)))
 
@@ -568,8 +576,13 @@ def full_well_e(setup: CameraSetup) -> float:
 
 
 def needed_illuminance_lx(setup: CameraSetup) -> float:
-    """Return the illuminance of the paper with which its noise is :data:`GOOD_NOISE_LEVELS`."""
-    relative = (GOOD_NOISE_LEVELS / PAPER_LEVEL) ** 2
+    """Return the illuminance of the paper from which more light hardly helps.
+
+    The noise of a pixel of the image that is searched is then :data:`GOOD_NOISE_LEVELS`; halving a
+    large frame averages its pixels.
+    """
+    averaged = 4 ** searched_levels(setup.size_px)[0]
+    relative = averaged * (GOOD_NOISE_LEVELS / PAPER_LEVEL) ** 2
     read_variance = (setup.sensor.read_noise_e * setup.binning) ** 2
     electrons = (1 + math.sqrt(1 + 4 * relative * read_variance)) / (2 * relative)
     return electrons / electrons_of_paper(setup, 1.0)
@@ -755,8 +768,8 @@ def _light_warnings(report: CameraReport) -> Iterator[str]:
             )
         elif setup.illuminance_lx < report.needed_illuminance_lx / MAX_LIGHT_DEFICIT:
             yield (
-                f"{illuminance_text(setup.illuminance_lx)} on the paper give a noise of "
-                f"{report.noise_levels:.0f} grey values: light it with "
+                f"the light, {illuminance_text(setup.illuminance_lx)}, gives a noise of "
+                f"{report.noise_levels:.0f} grey values: light the paper with "
                 f"{illuminance_text(report.needed_illuminance_lx)}, as by pulsed LEDs"
             )
 
@@ -786,7 +799,7 @@ def suggest_camera(
     The shorter side of the field shows ``window_dots`` columns and rows in any direction. The focal
     length is one in which M12 lenses are sold. The exposure is the longest with which a dot moves
     by less than :data:`EXPOSURE_MOTION_PITCHES` at the wanted speeds, and which the frame rate
-    leaves time for.
+    leaves time for; longer if a given light needs it.
 
     Parameters
     ----------
@@ -821,7 +834,7 @@ def suggest_camera(
     assert distance_m is not None
     setup = setup_of(focal_m, distance_m)
     if exposure_s is None:
-        exposure_s = _longest_exposure(setup)
+        exposure_s = _chosen_exposure(setup)
     return replace(setup, exposure_s=exposure_s)
 
 
@@ -846,13 +859,18 @@ def _standard_lens(
     return focal_m, distances[focal_m]
 
 
-def _longest_exposure(setup: CameraSetup) -> float:
+def _chosen_exposure(setup: CameraSetup) -> float:
+    """Return the exposure for the speeds, the frame rate and the light of a setup."""
     corner_mps = setup.speed_mps + setup.yaw_rate_rps * setup.corner_m
     by_rate = 0.5 / max(setup.wanted_rate_hz, setup.sensor.max_fps)
     if corner_mps == 0:
         return by_rate
-    by_motion = EXPOSURE_MOTION_PITCHES * setup.pitch_m / corner_mps
-    return max(min(by_motion, by_rate), setup.sensor.min_exposure_s)
+    exposure_s = EXPOSURE_MOTION_PITCHES * setup.pitch_m / corner_mps
+    if setup.illuminance_lx is not None:
+        by_light = setup.exposure_s * needed_illuminance_lx(setup) / setup.illuminance_lx
+        longest = DIM_EXPOSURE_MOTION_PITCHES * setup.pitch_m / corner_mps
+        exposure_s = min(max(exposure_s, by_light), longest)
+    return max(min(exposure_s, by_rate), setup.sensor.min_exposure_s)
 
 
 @dataclass(frozen=True)

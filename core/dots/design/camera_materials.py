@@ -25,13 +25,18 @@ LEDS = 3
 """Number of LEDs about the lens (paper, III-A)."""
 
 
-def camera_materials(sensor: str, focal_m: float, wavelength_m: float) -> tuple[BillItem, ...]:
+def camera_materials(
+    sensor: str, focal_m: float, wavelength_m: float, *, is_colour: bool = False
+) -> tuple[BillItem, ...]:
     """List the parts of one camera, as in Table II of the paper, without the computer."""
     is_paper_sensor = sensor.lower().startswith(PAPER_SENSOR.lower())
     is_paper_lens = abs(focal_m - PAPER_FOCAL_M) < 1e-6
     return (
         BillItem(
-            "image sensor", 1, sensor, PAPER_PRICES["image sensor"] if is_paper_sensor else None
+            "image sensor",
+            1,
+            f"{sensor}, without infrared filter" if is_colour else sensor,
+            PAPER_PRICES["image sensor"] if is_paper_sensor else None,
         ),
         BillItem(
             "lens",

@@ -96,7 +96,7 @@ def test_less_light_gives_noise_and_lower_accuracy() -> None:
     dim = design_camera(replace(PAPER, illuminance_lx=0.02 * bright.needed_illuminance_lx))
     assert dim.noise_levels > 5 * bright.noise_levels
     assert dim.position_sigma_m > bright.position_sigma_m
-    assert "light it with" in only_warning(dim)
+    assert "light the paper with" in only_warning(dim)
 
 
 @given(st.floats(1e-3, 0.1), st.floats(0.2e-3, 2e-3))
@@ -132,6 +132,15 @@ def test_given_values_are_kept() -> None:
     assert (setup.lens.focal_m, setup.distance_m, setup.exposure_s) == (3.6e-3, 0.02, 1e-4)
     assert suggest_camera(MT9V034, distance_m=0.05).distance_m == 0.05
     assert design_camera(suggest_camera(MT9V034, focal_m=8e-3)).window_dots == 12
+
+
+def test_dim_light_gets_a_longer_exposure() -> None:
+    bright = suggest_camera(MT9V034, speed_mps=0.3)
+    lux = design_camera(bright).needed_illuminance_lx
+    dim = suggest_camera(MT9V034, speed_mps=0.3, illuminance_lx=lux / 2)
+    assert dim.exposure_s == pytest.approx(2 * bright.exposure_s)
+    darker = suggest_camera(MT9V034, speed_mps=0.3, illuminance_lx=lux / 100)
+    assert darker.motion_m == pytest.approx(0.4 * darker.pitch_m)
 
 
 def test_sensors_are_compared_and_reasons_are_given() -> None:
