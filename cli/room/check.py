@@ -92,9 +92,7 @@ def command(
         if device == "deck":
             heading = deck_heading_sigma(scene, report, used, request)
         with console.working("Searching the best additional station"):
-            addition = best_addition(
-                scene, used, request, given_errors=scene.frame_source != "design"
-            )
+            addition = best_addition(scene, used, request)
     notes = report.notes
     if room is None and scene.room is None:
         notes = (ASSUMED_ROOM, *notes)
@@ -115,7 +113,7 @@ def command(
     lines.append(
         (
             "best addition",
-            "none: all channels are used"
+            "none: no additional station improves the room"
             if addition is None
             else room_text.addition_text(addition),
         )

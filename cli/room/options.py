@@ -232,12 +232,8 @@ def request_of(
     """Return the request of options in mm and degrees."""
     import math
 
-    from locatk.core.lighthouse.design.accuracy import FACTORY_SIGMA_RAD, AngleErrors
     from locatk.core.lighthouse.design.placement import RoomRequest
 
-    errors = AngleErrors()
-    if calibration == "factory":
-        errors = replace(errors, calibration_rad=FACTORY_SIGMA_RAD)
     return RoomRequest(
         stations=stations,
         accuracy_m=None if accuracy is None else metres(accuracy),
@@ -246,7 +242,7 @@ def request_of(
         facing="all" if facing == "all" else "up",
         max_range_m=metres(range_mm),
         field_of_view_rad=(math.radians(field_of_view[0]), math.radians(field_of_view[1])),
-        errors=errors,
+        calibration="factory" if calibration == "factory" else "generic",
     )
 
 

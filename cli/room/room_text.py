@@ -9,9 +9,6 @@ from typing import TYPE_CHECKING, Any
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from locatk.core.lighthouse.design import Addition, RoomDesign, RoomReport
     from locatk.core.lighthouse.room import Room
     from locatk.core.lighthouse.scene import Station
@@ -210,13 +207,6 @@ def addition_entry(addition: Addition | None) -> dict[str, Any] | None:
         "covered_fraction": addition.report.covered_fraction,
         "p95_sigma_m": finite(addition.report.p95_sigma_m),
     }
-
-
-def percentile_of(values: NDArray[np.float64]) -> float:
-    """Return the 95th percentile of values of which some may be infinite."""
-    from locatk.core.lighthouse.design.report import percentile
-
-    return percentile(values)
 
 
 def finite(value: float) -> float | None:

@@ -46,11 +46,6 @@ PLANE_SLOPES = (float(np.tan(np.pi / 6)), -float(np.tan(np.pi / 6)))
 """Tangents of the tilts of both planes: +30 and -30 degrees
 (crazyflie-firmware, kalman_measurement_model.md)."""
 
-FACTORY_SIGMA_RAD = 2e-4
-"""Standard deviation of the angle error that the factory calibration of a station leaves [rad]: the
-median difference from motion capture on public flights of a Crazyflie was 0.136 mrad
-(bitcraze/positioning_dataset), which is 0.67 standard deviations."""
-
 MIN_CONDITION = 1e-9
 """Smallest ratio of the eigenvalues of an information matrix that determines a position."""
 
@@ -127,12 +122,16 @@ def angle_gradients(position_m: Array, rotation: Array, points_m: Array) -> Arra
     return np.einsum("spkj,sij->spki", gradient, rotation)
 
 
-def information(gradient: Array, is_seen: BoolArray, dims: int = 3) -> Array:
-    """Return the information matrices (s, p, d, d) of stations at unit noise; 0 if unseen.
+def information(
+    gradient: Array, is_seen: BoolArray, dims: int = 3, sigma_rad: Array | float = 1.0
+) -> Array:
+    """Return the information matrices (s, p, d, d) of stations; 0 if unseen.
 
-    They are additive over stations.
+    They are additive over stations. ``sigma_rad`` (s, p, 2) are the standard deviations of the
+    angles of both planes.
     """
     g = np.where(is_seen[..., None, None], gradient[..., :dims], 0.0)
+    g = g / np.broadcast_to(np.asarray(sigma_rad, float), g.shape[:-1])[..., None]
     return np.einsum("spki,spkj->spij", g, g)
 
 

@@ -9,7 +9,7 @@ are computed once; those of several stations are their sums.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.design.accuracy import (
-    AngleErrors,
     angle_gradients,
     information,
     variance_of,
 )
+from locatk.core.lighthouse.design.calibration_errors import calibration_sigma
+from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
 from locatk.core.lighthouse.design.visibility import (
     FIELD_OF_VIEW_RAD,
     MAX_RANGE_M,
@@ -32,6 +33,7 @@ from locatk.core.lighthouse.design.visibility import (
     in_obstacle,
     is_inside,
 )
+from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.room import Room, signed_area
 
 Array = NDArray[np.float64]
@@ -49,8 +51,19 @@ SEARCH_POINTS = 400
 REFINEMENT_POINTS = 1200
 """Number of points at which the result of the search is refined."""
 
+COVERAGE_TOLERANCE = 0.005
+"""Fraction of the working volume that may stay without coverage in favour of accuracy elsewhere: the
+last corners cost a third of the accuracy of a 10 x 10 m room."""
+
 POSITION_DECIMALS = 2
 """Decimals to which positions are rounded, in metres; angles are rounded to degrees."""
+
+SOLVED_POINTS = 200
+"""Number of points at which accuracy in a solved scene is compared."""
+
+SOLVED_EVALUATIONS = 6_000
+"""Number of comparisons in solved scenes, times the square of the number of stations: about three
+seconds."""
 
 WALL_POSITIONS = 44
 """Number of positions along the walls that are tried, at each height."""
@@ -74,7 +87,7 @@ MAX_TILT_RAD = float(np.radians(90.0))
 REFINEMENT_STEPS = ((0.5, 0.2), (0.25, 0.1), (0.1, 0.05), (0.05, 0.02))
 """Steps of positions [m] and of angles [rad] of the refinement, one after the other."""
 
-UNDETERMINED_SIGMA_M = 0.2
+UNDETERMINED_SIGMA_M = 0.25
 """Standard deviation from which on a place counts as not covered, however many stations it sees:
 they are at almost the same position or in line with it."""
 
@@ -100,7 +113,7 @@ MIN_SEPARATION_M = 0.3
 MAX_STARTS = 32
 """Largest number of searches, of which the best is kept."""
 
-SEARCH_BUDGET = 40_000_000
+SEARCH_BUDGET = 30_000_000
 """Number of evaluations of one candidate at one point after which no search is started: about three
 seconds."""
 
@@ -123,7 +136,9 @@ class RoomRequest:
         ``"up"`` for photodiodes that receive light from above only, ``"all"`` from everywhere.
     max_range_m : float
     field_of_view_rad : (horizontal, vertical)
-    errors : AngleErrors
+    calibration : str
+        ``"factory"`` if the solver will have the factory calibrations of the stations (OOTX),
+        otherwise ``"generic"``.
     """
 
     stations: int | None = 4
@@ -133,7 +148,7 @@ class RoomRequest:
     facing: Literal["up", "all"] = "up"
     max_range_m: float = MAX_RANGE_M
     field_of_view_rad: tuple[float, float] = FIELD_OF_VIEW_RAD
-    errors: AngleErrors = field(default_factory=AngleErrors)
+    calibration: Literal["generic", "factory"] = "generic"
 
     def __post_init__(self) -> None:
         """Check the numbers; raise InputError if they are out of range."""
@@ -361,6 +376,11 @@ def _concatenate(first: StationPoses, second: StationPoses) -> StationPoses:
     )
 
 
+def percentile(sigma: Array) -> float:
+    """Return the 95th percentile of values of which some may be infinite."""
+    return float(np.sort(sigma)[int(np.ceil(PERCENTILE / 100 * len(sigma))) - 1])
+
+
 # ---- the cost of a placement
 
 
@@ -398,7 +418,7 @@ class Views:
     Attributes
     ----------
     info : (c, p, d, d) ndarray
-        Information at unit noise, 0 if unseen.
+        Information, with the noise and the calibration errors of the angles; 0 if unseen.
     is_seen : (c, p) bool ndarray
     free : (c, p) ndarray
         Fraction of time in which the point receives the station: 0 if unseen, otherwise reduced by
@@ -457,9 +477,7 @@ class PlacementProblem:
         self.min_seen = request.seen_by(room)
         self._dims = 2 if room.is_planar else 3
         self._area_m2 = abs(signed_area(room.working_outline_m))
-        errors = request.errors
-        self._angle_sigma_rad = float(np.hypot(errors.noise_rad, errors.calibration_rad))
-        self._prior = np.eye(self._dims) * (self._angle_sigma_rad / PRIOR_SIGMA_M) ** 2
+        self._prior = np.eye(self._dims) / PRIOR_SIGMA_M**2
 
     def views(self, poses: StationPoses) -> Views:
         """Return the views of stations."""
@@ -475,21 +493,16 @@ class PlacementProblem:
             self.room, position_m, rotation, points, self.request, gradient=gradient
         )
         blocked = blocked_fraction(self.room.robots, self._area_m2, position, points)[which]
-        info = information(gradient, is_seen, self._dims)
+        local = np.einsum("spi,sij->spj", points[None] - position_m[:, None], rotation)
+        systematic = calibration_sigma(local, self.request.calibration == "factory")
+        sigma_rad = np.hypot(ANGLE_SIGMA_RAD, systematic)
+        info = information(gradient, is_seen, self._dims, sigma_rad)
         return Views(info, is_seen, np.where(is_seen, 1.0 - blocked, 0.0), position_m)
 
     def cost(self, views: Views) -> float:
         """Return the cost of all stations of ``views`` together."""
         state = self._state(views)
         return float(self._costs(state.info[None], state.seen[None])[0])
-
-    def percentile_m(self, views: Views) -> float:
-        """Return the 95th percentile of the standard deviations; infinite without coverage."""
-        info = views.info.sum(axis=0)
-        sigma = self._angle_sigma_rad * np.sqrt(variance_of(info))
-        is_covered = views.is_seen.sum(axis=0) >= self.min_seen
-        ordered_m = np.sort(np.where(is_covered, sigma, np.inf))
-        return float(ordered_m[int(np.ceil(PERCENTILE / 100 * len(ordered_m))) - 1])
 
     def costs_with(self, stations: Views, views: Views) -> Array:
         """Return the costs (c,) of ``stations`` with each one of ``views`` added.
@@ -521,7 +534,7 @@ class PlacementProblem:
         """Return the costs (c,) by information (c, p, d, d) and probabilities (c, p, k)."""
         # Expected number of stations that are missing: column j is the probability of j < k.
         missing = seen @ np.arange(self.min_seen, 0, -1.0) / self.min_seen
-        sigma = self._angle_sigma_rad * np.sqrt(variance_of(info + self._prior))
+        sigma = np.sqrt(variance_of(info + self._prior))
         mean = sigma.mean(axis=1)
         is_undetermined = sigma > UNDETERMINED_SIGMA_M
         missing = np.where(is_undetermined, np.maximum(missing, 1.0 / self.min_seen), missing)
@@ -713,6 +726,99 @@ def place_stations(problem: PlacementProblem, count: int) -> StationPoses:
     # The grid of the search has gaps at the edges of beams.
     fine = working_points(problem.room, REFINEMENT_POINTS)
     poses = refine(PlacementProblem(problem.room, problem.request, fine), poses)
+    return rounded(refine_solved(problem, poses))
+
+
+def refine_solved(problem: PlacementProblem, poses: StationPoses) -> StationPoses:
+    """Move and turn stations so that positions in the solved scene become more accurate.
+
+    The search treats the calibration errors of planes as independent. In a solved scene they are
+    not, which takes more time to compute (:class:`SolvedCost`). The number of computations is
+    limited by :data:`SOLVED_EVALUATIONS`.
+    """
+    function = SolvedCost(problem.room, problem.request)
+    remaining = SOLVED_EVALUATIONS // len(poses) ** 2
+    cost = function(poses)
+    for length_m, angle_rad in REFINEMENT_STEPS:
+        improves = True
+        while improves:
+            improves = False
+            for k in range(len(poses)):
+                if remaining <= 0:
+                    return poses
+                moves = _moves(problem.room, poses.take([k]), length_m, angle_rad)
+                options = [_replaced(poses, k, moves.take([i])) for i in range(len(moves))]
+                options = [each for each in options if is_separated(each.position_m)]
+                remaining -= len(options)
+                costs = [function(each) for each in options]
+                if costs and min(costs) < cost * (1 - 1e-3):
+                    cost = min(costs)
+                    poses = options[costs.index(cost)]
+                    improves = True
+    return poses
+
+
+class SolvedCost:
+    """Cost of stations in a solved scene: uncovered places first, then standard deviations.
+
+    Parameters
+    ----------
+    room : Room
+    request : RoomRequest
+    """
+
+    def __init__(self, room: Room, request: RoomRequest) -> None:
+        self.room, self.request = room, request
+        self.points_m = working_points(room, SOLVED_POINTS)
+        self._coverage_points_m = working_points(room, REFINEMENT_POINTS)
+        self.min_seen = request.seen_by(room)
+
+    def __call__(self, poses: StationPoses) -> float:
+        """Return the cost in metres."""
+        return self.cost(poses.position_m, poses.rotation)
+
+    def cost(self, position_m: Array, rotation: Array) -> float:
+        """Return the cost of stations at positions (s, 3) with rotations (s, 3, 3)."""
+        sigma = self.sigmas(position_m, rotation)
+        is_covered = np.isfinite(sigma)
+        if not np.any(is_covered):
+            return SHORTFALL_WEIGHT_M
+        # Places without coverage count by the finer grid.
+        sigma = np.minimum(sigma[is_covered], PRIOR_SIGMA_M)
+        mean = float(sigma.mean())
+        spread = mean
+        if self.request.criterion == "worst":
+            spread = float(np.percentile(sigma, PERCENTILE)) + MEAN_WEIGHT * mean
+        uncovered = self.uncovered_fraction(position_m, rotation)
+        uncovered = max(0.0, uncovered - COVERAGE_TOLERANCE)
+        uncovered += float(np.mean(sigma > UNDETERMINED_SIGMA_M))
+        return SHORTFALL_WEIGHT_M * uncovered + spread
+
+    def uncovered_fraction(self, position_m: Array, rotation: Array) -> float:
+        """Return the fraction of the working volume that sees too few stations."""
+        is_seen = seen_stations(
+            self.room, position_m, rotation, self._coverage_points_m, self.request
+        )
+        return float(np.mean(is_seen.sum(axis=0) < self.min_seen))
+
+    def sigmas(self, position: Array, rotation: Array) -> Array:
+        """Return the standard deviations (p,) of positions; infinite for places not covered."""
+        points = self.points_m
+        is_seen = seen_stations(self.room, position, rotation, points, self.request)
+        accuracy = predict_solved_positions(
+            position,
+            rotation,
+            points,
+            is_seen,
+            is_planar=self.room.is_planar,
+            has_factory_data=[self.request.calibration == "factory"] * len(position),
+        )
+        is_covered = is_seen.sum(axis=0) >= self.min_seen
+        return np.where(is_covered, accuracy.sigma_m, np.inf)
+
+
+def rounded(poses: StationPoses) -> StationPoses:
+    """Return poses in centimetres and degrees, which can be measured by hand."""
     return replace(
         poses,
         position_m=np.round(poses.position_m, POSITION_DECIMALS),
@@ -721,12 +827,18 @@ def place_stations(problem: PlacementProblem, count: int) -> StationPoses:
     )
 
 
-def grow_placements(problem: PlacementProblem) -> Iterator[tuple[int, float]]:
-    """Yield numbers of stations 1, 2, ... and the 95th percentiles of their standard deviations.
+def is_separated(position_m: Array) -> bool:
+    """Return True if no two positions (s, 3) are closer than :data:`MIN_SEPARATION_M`."""
+    offset = position_m[:, None] - position_m[None]
+    distance = np.linalg.norm(offset, axis=-1) + np.eye(len(position_m)) * MIN_SEPARATION_M
+    return bool(np.all(distance >= MIN_SEPARATION_M))
 
-    Each placement is grown from the one before by an exchange of each station, so that the
-    percentiles are a little larger than those of :func:`place_stations`; they are infinite without
-    coverage.
+
+def grow_placements(problem: PlacementProblem) -> Iterator[StationPoses]:
+    """Yield placements of 1, 2, ... stations, each grown from the one before.
+
+    A station is added, and each one is exchanged once, so that they are not quite as good as those
+    of :func:`place_stations`.
     """
     poses = candidates(problem.room, problem.points_m)
     views = problem.views(poses)
@@ -736,7 +848,7 @@ def grow_placements(problem: PlacementProblem) -> Iterator[tuple[int, float]]:
         if len(extended) == len(chosen):
             return
         chosen, _ = exchange(problem, views, extended, max_rounds=1)
-        yield len(chosen), problem.percentile_m(views.take(chosen))
+        yield poses.take(chosen)
 
 
 def ordered(room: Room, poses: StationPoses) -> StationPoses:

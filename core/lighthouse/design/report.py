@@ -9,24 +9,32 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
-from locatk.core.lighthouse.design.accuracy import predict_poses, predict_positions
+from locatk.core.lighthouse.design.accuracy import (
+    AngleErrors,
+    PositionAccuracy,
+    predict_poses,
+    predict_positions,
+)
 from locatk.core.lighthouse.design.placement import (
     MAX_STATIONS,
     MOUNT_DEPTH_M,
-    PERCENTILE,
-    UNDETERMINED_SIGMA_M,
+    SEARCH_POINTS,
     PlacementProblem,
     RoomRequest,
+    SolvedCost,
     candidates,
-    refine,
+    percentile,
+    rounded,
     seen_stations,
     working_points,
 )
+from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
 from locatk.core.lighthouse.design.visibility import (
     MAX_RANGE_M,
     MEASURED_RANGE_M,
     blocked_fraction,
 )
+from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.room import (
     MOUNTING_POSITION_SIGMA_M,
@@ -36,12 +44,20 @@ from locatk.core.lighthouse.room import (
     signed_area,
 )
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene.scene_errors import SceneErrors
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 REPORT_POINTS = 2000
 """Number of points of the working volume of which a report consists."""
+
+MAX_GAIN_M = 100.0
+"""Position error per angle error [m/rad] from which on a place counts as not covered, however many
+stations it sees: they are at almost the same position or in line with it."""
+
+COMPARED_ADDITIONS = 40
+"""Number of candidates for an additional station whose accuracy in a solved scene is compared."""
 
 WORST_PLACES = 3
 """Number of places that a report names."""
@@ -149,11 +165,6 @@ class Addition:
     report: RoomReport
 
 
-def percentile(sigma: Array) -> float:
-    """Return the 95th percentile of values of which some may be infinite."""
-    return float(np.sort(sigma)[int(np.ceil(PERCENTILE / 100 * len(sigma))) - 1])
-
-
 def mounting_covariance() -> Array:
     """Return the covariance (6, 6) of a station that was mounted by hand at its designed pose."""
     sigma = np.repeat([MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD], 3)
@@ -185,8 +196,9 @@ def report_room(
     request : RoomRequest, optional
         Its photodiodes, range and number of stations in view.
     given_errors : bool
-        Include the covariances of the stations. Otherwise, the stations are taken as solved from a
-        recording, whose errors are part of that of the calibration.
+        Include the covariances of the stations of the scene. Otherwise, or if it has none, the
+        stations are taken as solved from a recording in the whole working volume, with the errors
+        of :mod:`~locatk.core.lighthouse.design.solved_accuracy`.
     points_m : (p, 3) ndarray, optional
         Places; the default is a grid in the working volume.
     """
@@ -200,15 +212,7 @@ def report_room(
     min_seen = request.seen_by(room)
     position, rotation = _stacked(scene)
     is_seen = seen_stations(room, position, rotation, points, request)
-    accuracy = predict_positions(
-        position,
-        rotation,
-        points,
-        is_seen,
-        is_planar=room.is_planar,
-        errors=request.errors,
-        station_covariances=[s.covariance for s in scene.stations] if given_errors else None,
-    )
+    accuracy = _accuracy(scene, room, request, points, is_seen, given_errors)
     blocked = blocked_fraction(
         room.robots, abs(signed_area(room.working_outline_m)), position, points
     )
@@ -220,7 +224,7 @@ def report_room(
         sigma_m=accuracy.sigma_m,
         noise_sigma_m=accuracy.noise_sigma_m,
         dilution=accuracy.dilution,
-        is_covered=(count >= min_seen) & _is_determined(accuracy.noise_sigma_m, request),
+        is_covered=(count >= min_seen) & (accuracy.noise_sigma_m < MAX_GAIN_M * ANGLE_SIGMA_RAD),
         min_seen=min_seen,
         is_planar=room.is_planar,
         channels=tuple(s.channel for s in scene.stations),
@@ -241,18 +245,15 @@ def deck_heading_sigma(scene: Scene, report: RoomReport, room: Room, request: Ro
     """
     position, rotation = _stacked(scene)
     is_seen = seen_stations(room, position, rotation, report.points_m, request)
-    poses = predict_poses(
-        position, rotation, report.points_m, is_seen, DECK.position_m, errors=request.errors
-    )
+    poses = predict_poses(position, rotation, report.points_m, is_seen, DECK.position_m)
     return percentile(poses.heading_sigma_rad)
 
 
-def best_addition(
-    scene: Scene, room: Room, request: RoomRequest, *, given_errors: bool = False
-) -> Addition | None:
-    """Find the station that improves a scene most; None if all channels are used.
+def best_addition(scene: Scene, room: Room, request: RoomRequest) -> Addition | None:
+    """Find the station that improves a scene most, if it is solved again.
 
-    Its channel is the lowest free one.
+    Its channel is the lowest free one. Returns None if all channels are used, or if no candidate
+    improves the scene.
     """
     used = {station.channel for station in scene.stations}
     free = [c for c in range(1, MAX_STATIONS + 1) if c not in used]
@@ -260,15 +261,30 @@ def best_addition(
         return None
     problem = PlacementProblem(room, request)
     position, rotation = _stacked(scene)
-    existing = problem.views_of(position, rotation)
     poses = candidates(room, problem.points_m)
-    costs = problem.costs_with(existing, problem.views(poses))
-    if not np.any(np.isfinite(costs)):
+    costs = problem.costs_with(problem.views_of(position, rotation), problem.views(poses))
+    order = np.argsort(costs, kind="stable")[:COMPARED_ADDITIONS]
+    function = SolvedCost(room, request)
+
+    def rank(positions: Array, rotations: Array) -> tuple[float, float]:
+        uncovered = function.uncovered_fraction(positions, rotations)
+        sigma_m = percentile(function.sigmas(positions, rotations))
+        return max(uncovered, NEGLIGIBLE_FRACTION), sigma_m
+
+    ranks = [
+        rank(
+            np.concatenate([position, poses.position_m[[k]]]),
+            np.concatenate([rotation, poses.rotation[[k]]]),
+        )
+        for k in order.tolist()
+        if np.isfinite(costs[k])
+    ]
+    if not ranks or not min(ranks) < rank(position, rotation):
         return None
-    pose = refine(problem, poses.take([int(np.argmin(costs))]), existing)
-    station = station_of(free[0], pose.position_m[0], pose.rotation[0])
+    best = rounded(poses.take([int(order[ranks.index(min(ranks))])]))
+    station = station_of(free[0], best.position_m[0], best.rotation[0])
     more = replace(scene, stations=(*scene.stations, station), covariance=None)
-    return Addition(station, report_room(more, room, request, given_errors=given_errors))
+    return Addition(station, report_room(more, room, request))
 
 
 def assumed_room(scene: Scene) -> Room:
@@ -304,11 +320,64 @@ def _stacked(scene: Scene) -> tuple[Array, Array]:
     return position, rotation
 
 
-def _is_determined(noise_sigma_m: Array, request: RoomRequest) -> BoolArray:
-    """Return True for the places that the search counts as determined."""
-    errors = request.errors
-    factor = np.hypot(1.0, errors.calibration_rad / errors.noise_rad)
-    return np.asarray(factor * noise_sigma_m < UNDETERMINED_SIGMA_M)
+def _accuracy(
+    scene: Scene,
+    room: Room,
+    request: RoomRequest,
+    points: Array,
+    is_seen: BoolArray,
+    given_errors: bool,
+) -> PositionAccuracy:
+    """Predict the accuracy with the errors of solved stations, or with those of the scene."""
+    position, rotation = _stacked(scene)
+    # Devices move through the whole working volume when the scene is recorded.
+    grid = working_points(room, SEARCH_POINTS)
+    everywhere = np.concatenate([points, grid])
+    on_grid = seen_stations(room, position, rotation, grid, request)
+    is_factory = request.calibration == "factory"
+    solved = predict_solved_positions(
+        position,
+        rotation,
+        everywhere,
+        np.concatenate([is_seen, on_grid], axis=1),
+        is_planar=room.is_planar,
+        has_factory_data=[is_factory or s.calibration.source == "factory" for s in scene.stations],
+    )
+    n = len(points)
+    accuracy = PositionAccuracy(
+        solved.noise_covariance[:n], solved.covariance[:n], solved.dilution[:n]
+    )
+    if not given_errors:
+        return accuracy
+    if scene.covariance is not None:
+        added = _joint_errors(scene, room, points, is_seen)
+        return replace(accuracy, covariance=accuracy.noise_covariance + added)
+    given = predict_positions(
+        position,
+        rotation,
+        points,
+        is_seen,
+        is_planar=room.is_planar,
+        errors=AngleErrors(calibration_rad=0.0),
+        station_covariances=[s.covariance for s in scene.stations],
+    )
+    with np.errstate(invalid="ignore"):  # Places without a position are infinite in both.
+        added = given.covariance - given.noise_covariance
+    added = np.nan_to_num(added, nan=0.0, posinf=0.0)
+    return replace(accuracy, covariance=accuracy.covariance + added)
+
+
+def _joint_errors(scene: Scene, room: Room, points: Array, is_seen: BoolArray) -> Array:
+    """Return the covariances (p, d, d) by the joint covariance of stations and calibrations."""
+    dims = 2 if room.is_planar else 3
+    height_m = room.photodiode_z_m[0] if room.is_planar else None
+    errors = SceneErrors(scene, scene.stations, height_m)
+    added = np.zeros((len(points), dims, dims))
+    for k, point in enumerate(points.tolist()):
+        members = np.flatnonzero(is_seen[:, k]).tolist()
+        if members:
+            added[k] = errors.position_covariance(point, members)[:dims, :dims]
+    return added
 
 
 def _availability(free: Array, min_seen: int) -> Array:

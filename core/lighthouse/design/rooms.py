@@ -11,9 +11,11 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse.design.placement import (
     PlacementProblem,
     RoomRequest,
+    SolvedCost,
     StationPoses,
     grow_placements,
     ordered,
+    percentile,
     place_stations,
 )
 from locatk.core.lighthouse.design.report import (
@@ -25,7 +27,7 @@ from locatk.core.lighthouse.design.report import (
 from locatk.core.lighthouse.room import Room
 from locatk.core.lighthouse.scene import Scene
 
-SEARCH_GAIN = 1.3
+SEARCH_GAIN = 1.5
 """Ratio by which the whole search improves a grown placement at most, from experience."""
 
 FRAME = "room"
@@ -173,21 +175,25 @@ def _design(room: Room, request: RoomRequest, poses: StationPoses) -> RoomDesign
 
 def _smallest_design(problem: PlacementProblem) -> RoomDesign:
     """Return the design with the smallest number of stations that reaches the accuracy."""
-    accuracy_m = problem.request.accuracy_m
+    room, request = problem.room, problem.request
+    accuracy_m = request.accuracy_m
     assert accuracy_m is not None  # checked by the request
+    function = SolvedCost(room, request)
     best: RoomDesign | None = None
-    quick_m = np.inf
-    count = 0
-    for count, quick_m in grow_placements(problem):
-        if count < problem.min_seen or quick_m > SEARCH_GAIN * accuracy_m:
+    best_count, best_sigma_m = 0, np.inf
+    for poses in grow_placements(problem):
+        sigma_m = percentile(function.sigmas(poses.position_m, poses.rotation))
+        if not sigma_m >= best_sigma_m or np.isinf(best_sigma_m):
+            best_count, best_sigma_m = len(poses), sigma_m
+        if len(poses) < problem.min_seen or sigma_m > SEARCH_GAIN * accuracy_m:
             continue
-        design = _design(problem.room, problem.request, place_stations(problem, count))
+        design = _design(room, request, place_stations(problem, len(poses)))
         if best is None or _rank(design) < _rank(best):
             best = design
         if design.is_reached:
             return design
     if best is None:
-        best = _design(problem.room, problem.request, place_stations(problem, count))
+        best = _design(room, request, place_stations(problem, best_count))
     return best
 
 
