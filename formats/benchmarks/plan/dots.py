@@ -68,6 +68,9 @@ PUBLISHED_PITCH_PX = 20.2
 SPLITS = 200
 """Number of random divisions of the dots of the published frame into halves."""
 
+OUTLIER_SIGMAS, REJECTION_ROUNDS = 3.5, 4
+"""Distance of a dot of this frame from the fit that rejects it, and number of fits."""
+
 PUBLISHED_JITTER_M = 10e-6
 """Assumed jitter of its printer, the default of a design: nothing is known about it."""
 
@@ -330,16 +333,25 @@ def measure_scatter(pixels: Array, grid: Array) -> FrameScatter:
     difference of the poses of two halves has four times the variance of the pose of all dots.
     """
     points = pixels / float(np.linalg.norm(pixels, axis=1).max())
-    best, straight, squared = math.inf, points, np.zeros(len(points))
+    sigma, straight = math.inf, points
     for radial in np.linspace(-0.1, 0.1, 81):
         candidate = points / (1 + radial * (points**2).sum(axis=1, keepdims=True))
         homography, _ = cv2.findHomography(candidate, grid, cv2.LMEDS)
-        residual = cv2.perspectiveTransform(candidate[None], homography)[0] - grid
         # The median of a sum of two squares is 2 ln 2 variances.
-        sigma = math.sqrt(np.median((residual**2).sum(axis=1)) / (2 * math.log(2)))
-        if sigma < best:
-            best, straight, squared = sigma, candidate, (residual**2).sum(axis=1)
-    is_inlier = squared < 9 * best**2
+        squared = (_residual(homography, candidate, grid) ** 2).sum(axis=1)
+        smallest = math.sqrt(np.median(squared) / (2 * math.log(2)))
+        if smallest < sigma:
+            sigma, straight = smallest, candidate
+    # The smallest median is too small; it only begins the rejection of outliers.
+    homography, _ = cv2.findHomography(straight, grid, cv2.LMEDS)
+    is_inlier = np.ones(len(grid), bool)
+    for _ in range(REJECTION_ROUNDS):
+        squared = (_residual(homography, straight, grid) ** 2).sum(axis=1)
+        is_inlier = squared < (OUTLIER_SIGMAS * sigma) ** 2
+        homography, _ = cv2.findHomography(straight[is_inlier], grid[is_inlier], 0)
+        squares = (_residual(homography, straight, grid)[is_inlier] ** 2).sum()
+        # Eight parameters of the homography, and one of the lens.
+        sigma = math.sqrt(squares / (2 * is_inlier.sum() - 9))
     straight, grid = straight[is_inlier], grid[is_inlier]
     rng = np.random.default_rng(FIRST_SEED)
     differences = []
@@ -349,7 +361,12 @@ def measure_scatter(pixels: Array, grid: Array) -> FrameScatter:
         poses = [_pose_of(straight[half], grid[half]) for half in halves]
         differences.append(poses[0] - poses[1])
     x, y, heading = np.sqrt(np.mean(np.square(differences), axis=0)) / 2
-    return FrameScatter(best, math.sqrt((x * x + y * y) / 2), float(heading))
+    return FrameScatter(sigma, math.sqrt((x * x + y * y) / 2), float(heading))
+
+
+def _residual(homography: Array, points: Array, grid: Array) -> Array:
+    projected: Array = cv2.perspectiveTransform(points[None], homography)[0]
+    return projected - grid
 
 
 def _pose_of(points: Array, grid: Array) -> Array:
