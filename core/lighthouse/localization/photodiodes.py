@@ -182,7 +182,7 @@ def track_photodiodes(epochs: Epochs, scene: Scene) -> PhotodiodeTracks:
     )
     if is_design:
         errors = SceneErrors(scene, selected, floor_z)
-        is_seen = np.isfinite(estimates.residual).all(axis=2)
+        is_seen = np.asarray(np.isfinite(estimates.residual).all(axis=2))
         for row in np.flatnonzero(is_accepted).tolist():
             covariance[row] += errors.position_covariance(
                 estimates.position[row].tolist(), np.flatnonzero(is_seen[row]).tolist()

@@ -423,7 +423,8 @@ class _Matching:
         turn = to.rotation @ self.rotation[rows] @ self.designed_rotation[rows].mT
         angle = rotation_vector_from_quaternion(quaternion_from_matrix(turn))
         own = transform_covariance(self.covariance[rows], to.scale, to.rotation)
-        return np.concatenate([offset, angle], axis=1), np.linalg.inv(self.tolerance[rows] + own)
+        weight = np.asarray(np.linalg.inv(self.tolerance[rows] + own), np.float64)
+        return np.concatenate([offset, angle], axis=1), weight
 
     def jacobian(self, to: Similarity, rows: Sequence[int], centre: Array) -> Array:
         """Return the change of the residuals by a motion about a centre (n, 6, 7)."""
