@@ -311,12 +311,18 @@ def find_tag_passes(
     is_sharp = _sharp_turns(route)
     half_m = (tags.order - 1) / 2 * tags.spacing_m
     corners = half_m * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    ids = list(tags.site)
+    middle_m = np.array([[pose.x_m, pose.y_m] for pose in tags.site.values()]).reshape(-1, 2)
     passes: list[TagPass] = []
     for k, heading in enumerate(route.heading_rad.tolist()):
         length_m = float(route.segment_m[k])
-        for tag_id, pose in tags.site.items():
-            offset = np.array([pose.x_m, pose.y_m]) - route.waypoint_m[k]
-            along_m, left_m = rotate(offset[None], -heading)[0].tolist()
+        local_m = rotate(middle_m - route.waypoint_m[k], -heading)
+        is_near = np.abs(local_m[:, 1]) <= half_array_m
+        is_near &= np.abs(local_m[:, 0] - length_m / 2) <= length_m / 2 + 2 * half_m
+        for number in np.flatnonzero(is_near).tolist():
+            tag_id = ids[number]
+            pose = tags.site[tag_id]
+            along_m, left_m = local_m[number].tolist()
             relative = math.remainder(pose.heading_rad - heading, math.tau)
             turned = rotate(corners, relative)
             reach_m = float(turned[:, 0].max())
@@ -794,9 +800,13 @@ def route_points(
         if point.tag_id is not None or point.meaning
     ]
     size_m = tags.order * tags.spacing_m
+    taken = [complex(point.x_m, point.y_m) for point in points]
     for place, (x_m, y_m), angle in zip(places, position_m.tolist(), heading.tolist(), strict=True):
-        if all(math.hypot(x_m - p.x_m, y_m - p.y_m) >= size_m - TOLERANCE_M for p in points):
-            points.append(SitePoint(x_m, y_m, angle, name=f"{place:.3g} m along the route"))
+        position = complex(x_m, y_m)
+        if taken and np.abs(np.array(taken) - position).min() < size_m - TOLERANCE_M:
+            continue
+        taken.append(position)
+        points.append(SitePoint(x_m, y_m, angle, name=f"{place:.3g} m along the route"))
     return route, points
 
 
