@@ -173,17 +173,12 @@ def _draw_visits(axes: Axes, floor: FloorMap, checks: Sequence[RouteCheck]) -> N
 def _label_cells(axes: Axes, floor: FloorMap) -> None:
     """Number columns at the top and rows at the right, if there are not too many."""
     rows, columns = floor.shape
-    for count, origin, make, title in (
-        (columns, floor.origin_m[0], axes.secondary_xaxis, "column"),
-        (rows, floor.origin_m[1], axes.secondary_yaxis, "row"),
+    top, right = axes.secondary_xaxis("top"), axes.secondary_yaxis("right")
+    for count, origin, set_ticks in (
+        (columns, floor.origin_m[0], top.set_xticks),
+        (rows, floor.origin_m[1], right.set_yticks),
     ):
-        axis = make("top" if title == "column" else "right")
-        step = math.ceil(count / MAX_LABELLED_CELLS)
-        ticks = np.arange(0, count, step)
-        positions = (origin + floor.pitch_m * ticks).tolist()
-        if title == "column":
-            axis.set_xticks(positions, ticks.tolist())
-            axis.set_xlabel(title)
-        else:
-            axis.set_yticks(positions, ticks.tolist())
-            axis.set_ylabel(title)
+        ticks = range(0, count, math.ceil(count / MAX_LABELLED_CELLS))
+        set_ticks([origin + floor.pitch_m * tick for tick in ticks], list(map(str, ticks)))
+    top.set_xlabel("column")
+    right.set_ylabel("row")

@@ -419,7 +419,7 @@ def count_places(floor: FloorMap, cells: Sequence[Cell]) -> NDArray[np.int64]:
     codes = np.where(floor.codes == HOLE_CODE, 0, floor.codes)
     exists = floor.codes != HOLE_CODE
     # Letters that are read at each of the four headings, relative to that of the route.
-    letters = [letters_as_read(codes, np.int64(quarters), floor.alphabet) for quarters in range(4)]
+    letters = [letters_as_read(codes, np.array(quarters), floor.alphabet) for quarters in range(4)]
     is_possible = np.broadcast_to(exists, (4, rows, columns)).copy()
     first, counts = cells[0] if cells else (0, 0), []
     row, column = np.indices((rows, columns))
@@ -698,7 +698,7 @@ def best_shift(floor: FloorMap, route: Route, pass_m: float) -> RouteShift | Non
     ranked = []
     for x in grid.tolist():
         for y in grid.tolist():
-            gap_m = tree.query(position + (x, y))[0]
+            gap_m = np.asarray(tree.query(position + (x, y))[0])
             stops = np.concatenate([[0.0], along[gap_m <= pass_m], [route.length_m]])
             longest_m = float(np.diff(stops).max())
             ranked.append((round(longest_m, 2), round(gap_m.mean(), 3), math.hypot(x, y), x, y))

@@ -32,8 +32,8 @@ from locatk.core.landmarks.simulation.session import SimulatedSession, simulate
 from locatk.core.landmarks.solver import solve
 from locatk.core.landmarks.stream import LandmarksStream
 from locatk.core.routes import Route
-from locatk.core.streaming.events import PoseEstimate
-from locatk.core.streaming.localizer import LiveEvent, LiveLocalizer
+from locatk.core.streaming.events import LiveEvent, PoseEstimate
+from locatk.core.streaming.localizer import LiveLocalizer
 from locatk.core.streaming.planar_filter import OdometryNoise
 from locatk.core.streaming.tracker import DEFAULT_SETTINGS
 from locatk.core.trajectory import Trajectory
@@ -172,12 +172,13 @@ def _route(rng: np.random.Generator, floor: FloorMap) -> Route:
             corners.append(corner)
         points = floor.pitch_m * np.array(corners) + rng.normal(0, 0.015, 2)
     else:
-        points = [rng.uniform(0, last, 2)]
-        while len(points) < 4:
-            point = rng.uniform(0, last, 2)
-            if np.hypot(*(point - points[-1])) > 0.4 * last:
-                points.append(point)
-    return Route(np.array(points))
+        places = [rng.uniform(0, last, 2)]
+        while len(places) < 4:
+            place = rng.uniform(0, last, 2)
+            if np.hypot(*(place - places[-1])) > 0.4 * last:
+                places.append(place)
+        points = np.array(places)
+    return Route(points)
 
 
 def figures(data: Path) -> list[Figure]:

@@ -203,9 +203,9 @@ def _add_polaris(to: _Calculations) -> None:
     ids = dispatch.capacity(tags)
     to.add("polaris, K = 3, M = 4, P = 8", ids, 20_480, "ids", "Eq. 1", POLARIS)
     largest = Tags(order=3, magnets=8, orientations=16)
-    bits = math.log2(dispatch.capacity(largest))
+    largest_bits = math.log2(dispatch.capacity(largest))
     how = "section 1: nine magnets on 3 x 3 cells, of which Eq. 1 allows eight"
-    to.add("polaris, tag of 3 x 3 cm", bits, 36, "bits", how, POLARIS, digits=None)
+    to.add("polaris, tag of 3 x 3 cm", largest_bits, 36, "bits", how, POLARIS, digits=None)
     for degrees, count in ((20, 90), (10, 180), (1, 1800)):
         grid = TemplateGrid(orientations=360 // degrees)
         templates = len(template_set(Tags(), 0.01, grid).angle_rad)
