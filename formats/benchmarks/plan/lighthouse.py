@@ -25,12 +25,14 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import LocatkError
 from locatk.core.evaluation import EvaluationOptions, evaluate
-from locatk.core.geometry import Similarity, umeyama
+from locatk.core.geometry import Similarity, apply_homography, fit_homography, umeyama
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
 from locatk.core.lighthouse.design import RoomRequest, design_room
 from locatk.core.lighthouse.design.accuracy import PositionAccuracy
 from locatk.core.lighthouse.design.placement import seen_stations
 from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
+from locatk.core.lighthouse.devices.alignment import MARKER_SIGMA_M
+from locatk.core.lighthouse.motion.frames import common_motions
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.lighthouse.room import (
@@ -41,7 +43,7 @@ from locatk.core.lighthouse.room import (
     Room,
     rectangle,
 )
-from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.lighthouse.scene.standstills import find_standstills
 from locatk.core.lighthouse.simulation import SimulatedSession, SimulationOptions, simulate
 from locatk.core.lighthouse.solver import SolveOptions, solve
@@ -59,8 +61,9 @@ DESIGNED_SESSIONS = 16
 
 FIRST_SEED = 25_100
 
-MIN_REST_POSES = 10
-"""Fewest poses of a robot at rest that give a scatter."""
+MIN_REST_POSES, MIN_REST_NS, MIN_RESTS = 10, 2_000_000_000, 3
+"""Fewest poses and shortest time of a rest that gives a scatter, and fewest rests: in shorter ones,
+robots still creep."""
 
 ROBOTS, DURATION_S, SPEED_MPS = 10, 40.0, 0.3
 """Robots with one photodiode that report ten times a second, and drive through the whole room."""
@@ -293,9 +296,14 @@ def _floor_of_two(data: Path) -> list[Figure]:
     options = EvaluationOptions(align="sim3", offset_s=suite.TWO_STATIONS_OFFSET_S)
     evaluation = evaluate(pairs, options)
     to = evaluation.alignment
-    scene: Scene = solution.artifact.transformed(to)
+    assert session.scene is not None
     return _floor_figures(
-        "published floor, two stations", scene, [(session.sweeps, solution, to)], evaluation.rmse
+        "published floor, two stations",
+        solution.artifact.transformed(to),
+        [(session.sweeps, solution, to)],
+        evaluation.rmse,
+        session.scene.markers,
+        are_marks_of_scene=False,
     )
 
 
@@ -307,13 +315,30 @@ def _floor_of_one(data: Path) -> list[Figure]:
         (session.sweeps, solution, Similarity.identity()) for _, session, solution in experiments
     ]
     scene: Scene = experiments[0][2].artifact
-    return _floor_figures("published floor, one station", scene, runs, error_m)
+    return _floor_figures(
+        "published floor, one station",
+        scene,
+        runs,
+        error_m,
+        scene.markers,
+        are_marks_of_scene=True,
+    )
 
 
 def _floor_figures(
-    name: str, scene: Scene, runs: Sequence[tuple[Sweeps, Solution, Similarity]], error_m: float
+    name: str,
+    scene: Scene,
+    runs: Sequence[tuple[Sweeps, Solution, Similarity]],
+    error_m: float,
+    marks: Sequence[Marker],
+    *,
+    are_marks_of_scene: bool,
 ) -> list[Figure]:
-    """Compare a prediction with the distance from a camera, and with the scatter at rest."""
+    """Compare a prediction with the distance from a camera, and with the scatter at rest.
+
+    Four marks on the floor fix the positions of the camera, and those of a single station, by one
+    homography each. They have the errors of marks that are measured and visited by hand.
+    """
     places, scatter = [], []
     for sweeps, solution, to in runs:
         rests = find_standstills(sweeps)
@@ -322,17 +347,50 @@ def _floor_figures(
             places.append(position)
             for rest in rests:
                 is_inside = (track.time_ns >= rest.start_ns) & (track.time_ns <= rest.end_ns)
-                if rest.device == track.device and np.count_nonzero(is_inside) >= MIN_REST_POSES:
+                is_long = rest.end_ns - rest.start_ns >= MIN_REST_NS
+                is_own = rest.device == track.device and is_long
+                if is_own and np.count_nonzero(is_inside) >= MIN_REST_POSES:
                     own = position[is_inside, :2]
                     scatter.append(own - own.mean(axis=0))
-    accuracy = _predict(scene, np.concatenate(places))
-    camera = "against a camera whose video was tracked by hand, whose errors are included"
-    return [
-        _recording_figure(f"{name}: error", accuracy.sigma_m, error_m, camera),
-        _recording_figure(f"{name}: repeatability", accuracy.noise_sigma_m,
-                          _rms_distance(np.concatenate(scatter)),
-                          f"in {len(scatter)} rests of robots"),
-    ]  # fmt: skip
+    points = np.concatenate(places)
+    accuracy = _predict(scene, points)
+    corners = np.stack([mark.position[:2] for mark in marks])
+    of_marks = _homography_variance(corners, points[:, :2], is_aligned=not are_marks_of_scene)
+    variance = np.mean(accuracy.sigma_m**2) + (2 if are_marks_of_scene else 1) * of_marks
+    own_mm = 1e3 * float(np.sqrt(np.mean(accuracy.sigma_m**2)))
+    how = (
+        f"against a camera; {own_mm:.2f} mm of the prediction are Lighthouse, the rest are the "
+        f"marks of the camera{' and of the station' if are_marks_of_scene else ''}, "
+        f"{1e3 * MARKER_SIGMA_M:.0f} mm each"
+    )
+    rows = [_recording_figure(f"{name}: error", np.sqrt(variance), error_m, how)]
+    repeatability = f"{name}: repeatability"
+    if len(scatter) < MIN_RESTS:
+        missing = Figure(f"{NAME}, {repeatability}", None, "", "")
+        return [*rows, missing.missing(f"robots rest {len(scatter)} times")]
+    how = f"in {len(scatter)} rests of robots"
+    scatter_m = _rms_distance(np.concatenate(scatter))
+    return [*rows, _recording_figure(repeatability, accuracy.noise_sigma_m, scatter_m, how)]
+
+
+def _homography_variance(corners: Array, points: Array, *, is_aligned: bool) -> float:
+    """Return the mean variance of points (n, 2) by a homography of four uncertain corners (4, 2).
+
+    If the points are aligned with others, a similarity has no errors.
+    """
+    step_m = 1e-4
+    jacobian = np.empty((*points.shape, 8))
+    for k in range(8):
+        moved = corners.copy()
+        moved.flat[k] += step_m
+        homography = fit_homography(corners, moved)
+        jacobian[..., k] = (apply_homography(homography, points) - points) / step_m
+    rows = jacobian.reshape(-1, 8)
+    if is_aligned:
+        centred = np.pad(points - points.mean(axis=0), ((0, 0), (0, 1)))
+        frame = common_motions(centred)[:, :2][:, :, [0, 1, 5, 6]].reshape(len(rows), 4)
+        rows = rows - frame @ np.linalg.lstsq(frame, rows, rcond=None)[0]
+    return MARKER_SIGMA_M**2 * float(np.sum(rows**2) / len(points))
 
 
 def _predict(scene: Scene, points_m: Array) -> PositionAccuracy:
@@ -351,8 +409,8 @@ def _rms_distance(offset: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(offset**2, axis=1))))
 
 
-def _recording_figure(name: str, sigma_m: Array, reached_m: float, how: str) -> Figure:
-    predicted_m = float(np.sqrt(np.mean(sigma_m**2)))
+def _recording_figure(name: str, sigma_m: Array | float, reached_m: float, how: str) -> Figure:
+    predicted_m = float(np.sqrt(np.mean(np.square(sigma_m))))
     return Figure(
         f"{NAME}, {name}",
         _deviation(predicted_m / reached_m),
