@@ -52,8 +52,8 @@ REFINEMENT_POINTS = 1200
 """Number of points at which the result of the search is refined."""
 
 COVERAGE_TOLERANCE = 0.005
-"""Fraction of the working volume that may stay without coverage in favour of accuracy elsewhere: the
-last corners cost a third of the accuracy of a 10 x 10 m room."""
+"""Fraction of the working volume that may stay without coverage in favour of accuracy elsewhere:
+the last corners would cost a third of the accuracy of a 10 x 10 m room."""
 
 POSITION_DECIMALS = 2
 """Decimals to which positions are rounded, in metres; angles are rounded to degrees."""
@@ -110,7 +110,7 @@ of a symmetric placement can be moved to advantage."""
 MIN_SEPARATION_M = 0.3
 """Smallest distance of two stations [m]: nearer ones hide each other."""
 
-MAX_STARTS = 32
+MAX_STARTS = 100
 """Largest number of searches, of which the best is kept."""
 
 SEARCH_BUDGET = 30_000_000
