@@ -12,7 +12,7 @@ import click
 from locatk.cli import console, options
 from locatk.cli.command import section
 from locatk.cli.options import number
-from locatk.cli.site.forecast import LengthAndAngle, odometry_noise, read_routes
+from locatk.cli.route_options import LengthAndAngle, odometry_noise, read_routes
 from locatk.core.units import metres
 
 if TYPE_CHECKING:

@@ -9,11 +9,10 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
+from locatk.cli.route_options import odometry_noise, read_routes
 from locatk.cli.site.forecast import (
     laying_of,
-    odometry_noise,
     odometry_options,
-    read_routes,
 )
 from locatk.cli.site.site_text import report_check
 from locatk.cli.table_options import site_table_options

@@ -12,18 +12,17 @@ from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
 from locatk.cli.map.options import Size
 from locatk.cli.options import number
+from locatk.cli.route_options import LengthAndAngle, odometry_noise, read_routes
 from locatk.cli.site.forecast import (
     laying_of,
-    odometry_noise,
     odometry_options,
     plan_entry,
     plan_text,
     plan_warnings,
-    read_routes,
 )
 from locatk.cli.site.site_text import report_check, site_entry, written_text
 from locatk.cli.table_options import site_table_options
-from locatk.cli.tag.options import LengthAndAngle, reading_conditions, reading_options
+from locatk.cli.tag.options import reading_conditions, reading_options
 from locatk.core.units import metres
 
 if TYPE_CHECKING:

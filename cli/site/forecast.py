@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from locatk.cli import console
 from locatk.cli.command import section
-from locatk.cli.tag.options import LengthAndAngle as LengthAndAngle
+from locatk.cli.route_options import LengthAndAngle, drift_option, slip_option
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from locatk.core.polaris.design.routes import SiteForecast, SpacingPlan
-    from locatk.core.routes import Route
-    from locatk.core.streaming.planar_filter import OdometryNoise
 
 LIMITS = {
     "position": "error of the position",
@@ -30,42 +25,17 @@ LIMITS = {
 """Descriptions of the limits of a spacing."""
 
 
-odometry_options = section(
-    "Odometry and tags on the floor",
-    click.option(
-        "--drift",
-        type=click.FloatRange(0, 90),
-        metavar="DEG/M",
-        help="Drift of the heading of the odometry (standard deviation).  [default: 2.9]",
-    ),
-    click.option(
-        "--slip",
-        type=click.FloatRange(0, 50),
-        metavar="PERCENT",
-        help="Error of distances by odometry (standard deviation).  [default: 1.5]",
-    ),
-    click.option(
-        "--laying",
-        type=LengthAndAngle(),
-        metavar="MM[,DEG]",
-        help="Error of tags on the floor along x and y, and of their headings (standard "
-        "deviation).  [default: as surveyed, otherwise 1.5 mm, and 1 mm at each end of an edge]",
-    ),
+laying_option = click.option(
+    "--laying",
+    type=LengthAndAngle(),
+    metavar="MM[,DEG]",
+    help="Error of tags on the floor along x and y, and of their headings (standard "
+    "deviation).  [default: as surveyed, otherwise 1.5 mm, and 1 mm at each end of an edge]",
 )
 
-
-def odometry_noise(drift: float | None, slip: float | None) -> OdometryNoise:
-    """Return the errors of odometry of the options."""
-    from dataclasses import replace
-
-    from locatk.core.streaming.planar_filter import OdometryNoise
-
-    noise = OdometryNoise()
-    if drift is not None:
-        noise = replace(noise, drift_rad_per_m=math.radians(drift))
-    if slip is not None:
-        noise = replace(noise, scale=slip / 100)
-    return noise
+odometry_options = section(
+    "Odometry and tags on the floor", drift_option, slip_option, laying_option
+)
 
 
 def laying_of(laying: tuple[float, float | None] | None, tags: Any) -> tuple[float, float] | None:
@@ -76,24 +46,6 @@ def laying_of(laying: tuple[float, float | None] | None, tags: Any) -> tuple[flo
         return None
     position_m, heading_rad = laying
     return position_m, laying_sigma(tags)[1] if heading_rad is None else heading_rad
-
-
-def read_routes(
-    paths: Sequence[Path], columns: dict[str, str] | None, units: tuple[str, ...] | None
-) -> list[Route]:
-    """Read the waypoints of routes."""
-    import numpy as np
-
-    from locatk.core.errors import error_context
-    from locatk.core.routes import Route
-    from locatk.formats.importers.floors.site_csv import read_site_points
-
-    routes = []
-    for path in paths:
-        points, _ = read_site_points(path, columns, units or ())
-        with error_context(path):
-            routes.append(Route(np.array([[p.x_m, p.y_m] for p in points]), path.stem))
-    return routes
 
 
 def forecast_text(forecast: SiteForecast) -> str:

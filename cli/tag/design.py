@@ -14,10 +14,10 @@ from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
 from locatk.cli.options import number
 from locatk.cli.price_options import price_options
+from locatk.cli.route_options import LengthAndAngle
 from locatk.cli.tag.design_text import report_evaluation, search_entry, search_text
 from locatk.cli.tag.options import (
     LENGTH_MM,
-    LengthAndAngle,
     code_options,
     reading_conditions,
     reading_options,

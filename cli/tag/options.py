@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from click.core import ParameterSource
@@ -21,35 +21,7 @@ if TYPE_CHECKING:
 LENGTH_MM = options.PositiveNumber(1e-3, 1e5)
 """Lengths of tags and arrays: from a micrometre to a hundred metres."""
 
-MAX_ACCURACY_MM = 1e5
-"""Largest length of an accuracy; a larger one is in another unit."""
-
 CODECS = ("mosk", "redundant", "polaris-released")
-
-
-class LengthAndAngle(click.ParamType):
-    """Length in mm and, optionally, angle in degrees, as in ``20`` or ``20,1.5``."""
-
-    name = "MM[,DEG]"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, float | None]:
-        """Parse the text to m and rad; fail with the expected form."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            length, *angle = (float(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not MM or MM,DEG as in 20,1.5.", param, ctx)
-        numbers = [length, *angle]
-        if len(angle) > 1 or not all(number > 0 and math.isfinite(number) for number in numbers):
-            self.fail(
-                f"{value!r} is not one or two numbers above 0, in mm and degrees.", param, ctx
-            )
-        if length > MAX_ACCURACY_MM or any(number > 180 for number in angle):
-            self.fail(f"{value!r} is not within 100000 mm and 180 degrees.", param, ctx)
-        return metres(length), math.radians(angle[0]) if angle else None
 
 
 code_options = section(
