@@ -27,6 +27,7 @@ from locatk.core.dots.design.read_rate import (
     MAX_SHEAR,
     MIN_PX_PER_PITCH,
     read_rate,
+    reading_limit,
     searched_levels,
 )
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
@@ -60,6 +61,15 @@ decoder halves images until their shorter side is about 120 px."""
 
 HOPELESS_MOTION_PITCHES, HOPELESS_BLUR_PITCHES = 2.0, 0.5
 """Motion and standard deviation of blur beyond which no dot is left in a frame."""
+
+HOPELESS_LIMIT = (
+    "no dot is left by blur, motion or the size of its image: blur less, by the f-number, focus "
+    "and exposure, or change the distance"
+)
+"""Reason and remedy of these."""
+
+GOOD_READ_RATE = 0.95
+"""Fraction of decoded frames below which there is a warning."""
 
 NEGLIGIBLE_FRACTION = 0.01
 """Fraction of frames not decoded at one size from which no other size is considered."""
@@ -485,7 +495,7 @@ def design_camera(setup: CameraSetup) -> CameraReport:
             is_colour=setup.sensor.is_colour,
         ),
     )
-    return replace(report, warnings=tuple(_warnings(report)))
+    return replace(report, warnings=tuple(_warnings(report, quality.limit)))
 
 
 # ---- optics
@@ -629,6 +639,7 @@ class _FrameQuality:
     read_rate: float
     dot_sigma_m: float
     accuracy: PoseAccuracy
+    limit: str
 
 
 def _frame_quality(setup: CameraSetup, blur_px: float, noise: float) -> _FrameQuality:
@@ -670,7 +681,8 @@ def _quality_at_level(
         or motion_px > HOPELESS_MOTION_PITCHES * pitch_px
         or math.hypot(blur_px / factor, turn_px) > HOPELESS_BLUR_PITCHES * pitch_px
     ):
-        return _FrameQuality(level, 0.0, math.inf, PoseAccuracy(math.inf, math.inf, 0.0))
+        nothing = PoseAccuracy(math.inf, math.inf, 0.0)
+        return _FrameQuality(level, 0.0, math.inf, nothing, HOPELESS_LIMIT)
     image = DotImage(
         pitch_px=pitch_px,
         diameter_px=setup.dot_pitches * pitch_px,
@@ -685,14 +697,18 @@ def _quality_at_level(
         size, pitch_px, error.total_px, is_lens_known=setup.is_calibrated
     ).with_fraction(error.used_fraction)
     rate = read_rate(error, accuracy.dots, pitch_px)
-    return _FrameQuality(level, rate, error.total_px * mpp, accuracy)
+    limit = reading_limit(error, accuracy.dots, pitch_px)
+    return _FrameQuality(level, rate, error.total_px * mpp, accuracy, limit)
 
 
 # ---- warnings
 
 
-def _warnings(report: CameraReport) -> Iterator[str]:
-    """Yield the requirements that are not met, most important first."""
+def _warnings(report: CameraReport, limit: str) -> Iterator[str]:
+    """Yield the requirements that are not met, most important first.
+
+    ``limit`` is what limits the read rate.
+    """
     setup = report.setup
     yield from _field_warnings(report)
     yield from _light_warnings(report)
@@ -718,8 +734,11 @@ def _warnings(report: CameraReport) -> Iterator[str]:
             f"second, and the camera takes {fps:.3g}: choose a faster sensor, or accept "
             f"{report.pose_rate_hz:.3g} poses per second"
         )
-    if report.read_rate < 0.95:
-        yield (f"only {100 * report.read_rate:.0f} % of the frames are expected to be decoded")
+    if report.read_rate < GOOD_READ_RATE:
+        yield (
+            f"only {100 * report.read_rate:.0f} % of the frames are expected to be decoded, "
+            f"because {limit}"
+        )
 
 
 def _field_warnings(report: CameraReport) -> Iterator[str]:

@@ -206,8 +206,9 @@ def _dot_profile(image: DotImage, motion_rad: float) -> Array:
     The dot is at sample (0, 0) of a periodic image, so wide that the farthest neighbour does not
     reach the window from the other side.
     """
-    reach = WINDOW_PX + 2 * image.pitch_px + image.diameter_px + 4 * image.blur_px + image.motion_px
-    width = 2 ** math.ceil(math.log2(reach + 2 * SMOOTHING_RADIUS_PX))
+    tail = image.diameter_px + 4 * image.blur_px + image.motion_px + 2 * SMOOTHING_RADIUS_PX
+    farthest = 2 * image.pitch_px if _has_neighbours_in_window(image) else 0.0
+    width = 2 ** math.ceil(math.log2(WINDOW_PX + farthest + tail))
     n = width * PHASES_PER_PX
     frequency: Array = np.fft.fftfreq(n, 1 / PHASES_PER_PX).astype(np.float64)
     half: Array = np.fft.rfftfreq(n, 1 / PHASES_PER_PX).astype(np.float64)
@@ -229,6 +230,13 @@ def _dot_profile(image: DotImage, motion_rad: float) -> Array:
     return result
 
 
+def _has_neighbours_in_window(image: DotImage) -> bool:
+    """Return whether neighbours, as near as their symbols allow, reach the pixels about a dot."""
+    nearest = (1 - 2 * DOT_OFFSET_PITCHES) * image.pitch_px
+    reach = image.diameter_px / 2 + 4 * image.blur_px + image.motion_px / 2 + SMOOTHING_RADIUS_PX
+    return nearest < math.sqrt(2) * WINDOW_PX + reach
+
+
 def _sampled_ink(image: DotImage, profile: Array) -> tuple[Array, Array]:
     """Return phases (k, 2) of dots, x and y, and the ink (k, w, w) of the pixels about them.
 
@@ -239,9 +247,10 @@ def _sampled_ink(image: DotImage, profile: Array) -> tuple[Array, Array]:
     phase = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     count = len(phase)
     direction = np.pi / 2 * (((np.arange(count) + 0.5) * 0.6180339887) % 1)
-    nodes = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    around = (-1, 0, 1) if _has_neighbours_in_window(image) else (0,)
+    nodes = np.array([(x, y) for x in around for y in around])
     steps_of_symbols = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23])
-    symbol = np.floor(4 * np.arange(count)[:, None] * steps_of_symbols)
+    symbol = np.floor(4 * np.arange(count)[:, None] * steps_of_symbols[: len(nodes)])
     offset = DOT_DIRECTIONS[symbol.astype(np.int64) % 4] * DOT_OFFSET_PITCHES
     is_self = (nodes == 0).all(axis=1)
     relative = nodes + offset - offset[:, is_self]

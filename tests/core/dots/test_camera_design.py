@@ -7,11 +7,13 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from locatk.core.dots.codec import codec
 from locatk.core.dots.design.camera import (
     PAPER_REFLECTANCE,
     CameraSetup,
@@ -28,8 +30,14 @@ from locatk.core.dots.design.camera import (
 )
 from locatk.core.dots.design.camera_measurement import camera_model, measure_camera
 from locatk.core.dots.design.camera_sensors import SENSORS, sensor_named
-from locatk.core.dots.design.read_rate import searched_levels
+from locatk.core.dots.design.read_rate import (
+    MAX_BLUR_PITCHES,
+    MAX_MOTION_PITCHES,
+    MAX_SHEAR,
+    searched_levels,
+)
 from locatk.core.dots.localization import frames
+from locatk.core.dots.simulation.session import SimulationOptions, camera, simulate
 from locatk.core.errors import InputError
 
 MT9V034 = Sensor("MT9V034", (752, 480), 6e-6, 60.0)
@@ -275,6 +283,75 @@ def test_prediction_agrees_with_rendered_frames(setup: CameraSetup) -> None:
     assert measured.read_rate == 1.0
     assert report.position_sigma_m == pytest.approx(measured.position_rms_m, rel=0.25)
     assert report.heading_sigma_rad == pytest.approx(measured.heading_rms_rad, rel=0.35)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"lens_blur_m": MAX_BLUR_PITCHES * 0.508e-3 * PAPER.magnification},
+        {"speed_mps": MAX_MOTION_PITCHES * 0.508e-3 * 7684},
+    ],
+    ids=["blur", "motion"],
+)
+def test_frames_at_the_limits_are_read(change: dict[str, float]) -> None:
+    setup = replace(PAPER, focus_error_m=0.0, **change)
+    assert design_camera(setup).read_rate > 0.95
+    assert measure_camera(setup, 12, seed=5).read_rate == 1.0
+
+
+@pytest.mark.parametrize("down", [False, True])
+def test_frames_that_a_rolling_shutter_shears_are_read(down: bool) -> None:
+    options = SimulationOptions(frames=12, path="random", camera=camera(0.0), seed=3)
+    session = simulate(None, options)
+    (width, height), matrix = options.camera.size, np.eye(2, 3)
+    # Rows are displaced along x, or along y, in proportion to their time.
+    matrix[int(down), 1] += MAX_SHEAR
+    matrix[:, 2] = (np.eye(2) - matrix[:, :2]) @ [(width - 1) / 2, (height - 1) / 2]
+    images = [
+        cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_CONSTANT)
+        for image in session.frames.images
+    ]
+    read = frames.localize_frames(np.stack(images), codec("anoto"), other_codec_odds=0)
+    assert read.accepted.mean() > 0.9
+
+
+SENSOR_SIZES = st.tuples(st.integers(40, 3000), st.integers(40, 3000))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    SENSOR_SIZES,
+    st.floats(1e-6, 30e-6),
+    st.floats(1e-3, 50e-3),
+    st.floats(1.1, 50.0),
+    st.floats(1e-6, 0.1),
+    st.floats(0.1e-3, 3e-3),
+    st.floats(0.0, 10.0),
+)
+def test_every_camera_has_a_report(
+    size: tuple[int, int],
+    pixel_m: float,
+    focal_m: float,
+    distance: float,
+    exposure_s: float,
+    pitch_m: float,
+    speed_mps: float,
+) -> None:
+    setup = CameraSetup(
+        Sensor("any", size, pixel_m, 60.0),
+        Lens(focal_m),
+        distance * focal_m,
+        exposure_s,
+        pitch_m=pitch_m,
+        speed_mps=speed_mps,
+    )
+    report = design_camera(setup)
+    assert 0 <= report.read_rate <= 1
+    assert report.position_sigma_m > 0
+    assert report.heading_sigma_rad > 0
+    assert report.near_m <= setup.distance_m * (1 + 1e-9) <= report.far_m * (1 + 2e-9)
+    # A camera of which no frame is read is never returned without a remedy.
+    assert report.read_rate > 0.9 or any(": " in text for text in report.warnings)
 
 
 def test_frames_that_cannot_be_read_are_predicted() -> None:
