@@ -6,6 +6,7 @@ import itertools
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from locatk.core.errors import InputError
@@ -18,6 +19,9 @@ from locatk.core.polaris.design.search import (
     search_designs,
     stocked_magnets,
 )
+from locatk.core.polaris.simulation.options import SimulationOptions, usual_bar
+from locatk.core.polaris.simulation.session import simulate
+from locatk.core.polaris.solver import solve
 from locatk.core.polaris.tag import Magnet, Tags
 
 SMALL = SearchSpace(
@@ -63,6 +67,32 @@ def test_all_designs_of_a_search_can_be_made() -> None:
         assert 0.008 <= tags.clearance_m <= 0.012
         assert len(families.generate_family(tags, 50, 3)) == 50
         assert not evaluate_design(tags).warnings
+
+
+@pytest.mark.slow
+def test_a_design_that_was_found_is_read_as_accurately_as_forecast() -> None:
+    """Passes over cylinders that were set by hand, at twice the clearance of the paper."""
+    space = SearchSpace(magnets=stocked_magnets()[3:4], clearance_m=(0.02, 0.02))
+    (best,) = search_designs(200, 1e-3, space=space, min_distance=2).designs
+    tags = replace(best.tags, ids=families.generate_family(best.tags, 200, 2), min_distance=2)
+    errors = []
+    for seed in range(6):
+        assert tags.ids is not None
+        tag_id = tags.ids[31 * seed]
+        options = SimulationOptions(
+            array=usual_bar(rate_hz=60.0, noise_t=None), rate_hz=60.0, route=(tag_id,), seed=seed,
+            build_place_m=4e-4, build_angle_rad=math.radians(6), build_seed=seed,
+        )  # fmt: skip
+        session = simulate(tags, options)
+        (tag,) = solve([session.samples], tags).detections
+        assert tag.tag_id == tag_id
+        truth = session.truth
+        row = int(np.abs(truth.time_ns * 1e-9 - tag.time_s).argmin())
+        errors.append([tag.y_m, tag.heading_rad])
+        assert abs(float(truth.position[row, 1])) < 1e-9
+    lateral_m, heading_rad = np.sqrt(np.mean(np.square(np.array(errors, float)), axis=0))
+    assert 0.3 * best.position_p95_m < 2.448 * lateral_m < 1.5 * best.position_p95_m
+    assert 0.3 * best.heading_p95_rad < 1.96 * heading_rad < 1.7 * best.heading_p95_rad
 
 
 def test_impossible_wishes_are_answered() -> None:
