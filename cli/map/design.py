@@ -15,6 +15,7 @@ from locatk.cli.command import Command, section
 from locatk.cli.map import landmark_text, proof_text
 from locatk.cli.map.options import Cells, Size, Walls, check_cells, geometry_of, geometry_options
 from locatk.cli.options import number
+from locatk.cli.site.forecast import LengthAndAngle
 from locatk.core.errors import InputError
 from locatk.core.units import metres
 
@@ -36,6 +37,13 @@ OVERLAP_TOLERANCE_M = 1e-9
     "--landmark",
     is_flag=True,
     help="Print the analysis of one landmark instead of designing a map.",
+)
+@click.option(
+    "--search",
+    type=LengthAndAngle(),
+    metavar="MM[,DEG]",
+    help="With --landmark: list the common bars, and heights of the sensors, with which errors of "
+    "position (and heading) do not exceed this with 95 % at the --pitch.",
 )
 @section(
     "Map",
@@ -105,6 +113,7 @@ def command(
     wall: tuple[tuple[Wall, ...], ...],
     name: str,
     landmark: bool,
+    search: tuple[float, float | None] | None,
     overwrite: bool,
     as_json: bool,
     **bars: Any,
@@ -129,13 +138,19 @@ def command(
       locatk map design 7x7 --detect 1 --wall '0-5,3:0-5,4' -o rooms.toml
       locatk map design --landmark
       locatk map design --landmark --bar 40x10x5 --sensor-height 5 --json
+      locatk map design --landmark --search 8,2 --pitch 250
     """
     geometry, pitch_m = geometry_of(**bars), metres(pitch)
     if landmark:
         if size is not None or output is not None:
             raise click.UsageError("--landmark makes no map: omit ROWSxCOLS and -o.")
+        if search is not None:
+            _print_search(geometry, pitch_m, search, as_json)
+            return
         _print_landmark(geometry, pitch_m, as_json)
         return
+    if search is not None:
+        raise click.UsageError("--search is of landmarks: give --landmark as well.")
     if size is None or output is None:
         raise click.UsageError("A map needs ROWSxCOLS and -o, as in 24x24 -o map.toml.")
     forbidden = [cell for cells in forbid for cell in cells]
@@ -236,6 +251,30 @@ def _print_landmark(geometry: Geometry, pitch_m: float, as_json: bool) -> None:
         console.emit_json(
             {"version": 1, **landmark_text.entry(analysis, pitch_m), "warnings": warnings}
         )
+    failures.finish_with_warnings(warnings)
+
+
+def _print_search(
+    geometry: Geometry, pitch_m: float, wanted: tuple[float, float | None], as_json: bool
+) -> None:
+    """Print the bars and heights that suffice; the exit status is 3 if none do."""
+    from locatk.core.landmarks.design.bar_search import BARS_M, HEIGHTS_M, search_bars
+
+    with console.steps(len(BARS_M), "Searching") as step:
+        options = search_bars(
+            pitch_m,
+            *wanted,
+            remanence_t=geometry.remanence_t,
+            circle_m=geometry.circle_m,
+            bars_m=BARS_M,
+            heights_m=HEIGHTS_M,
+            progress=step,
+        )
+    warnings = landmark_text.search_warnings(options, pitch_m, wanted)
+    console.result(landmark_text.search_table(options))
+    if as_json:
+        entries = [landmark_text.search_entry(option) for option in options]
+        console.emit_json({"version": 1, "pitch_m": pitch_m, "bars": entries, "warnings": warnings})
     failures.finish_with_warnings(warnings)
 
 

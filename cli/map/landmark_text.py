@@ -10,11 +10,14 @@ from locatk.cli import console
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from locatk.core.landmarks.design.analysis import (
         LandmarkAnalysis,
         PatternAnalysis,
         ToleranceEffect,
     )
+    from locatk.core.landmarks.design.bar_search import BarOption
     from locatk.core.landmarks.landmark import Geometry
 
 
@@ -232,3 +235,73 @@ def _clean(value: float, digits: int) -> str:
 
 def _mm(metres: float) -> str:
     return length_text(metres, 4)
+
+
+def search_table(options: Sequence[BarOption]) -> str:
+    """Return the bars that were tried, and the heights that suffice, in 80 columns."""
+    table = console.table(
+        ("bar mm", "heights mm", "error mm", "deg", "at mm", "pitch from mm", "hall range mT", ""),
+        (
+            (
+                _size(option.analysis.geometry),
+                ", ".join(f"{1e3 * height_m:g}" for height_m in option.heights_m) or "-",
+                _number(1e3 * option.forecast.position_p95_m, 1),
+                _number(math.degrees(option.forecast.heading_p95_rad), 2),
+                f"{1e3 * option.analysis.geometry.sensor_height_m:g}",
+                _number(1e3 * option.analysis.min_pitch_m, 0),
+                _number(1e3 * option.analysis.range_t, 0),
+                option.reason,
+            )
+            for option in options
+        ),
+    )
+    return (
+        f"{table}\n\nErrors: not exceeded with 95 %, by locatk live on straight drives anywhere, "
+        "at\nthe best height. Buy bars that are magnetised along their length."
+    )
+
+
+def search_warnings(
+    options: Sequence[BarOption], pitch_m: float, wanted: tuple[float, float | None]
+) -> list[str]:
+    """Return what is possible, and what would have to change, if no bars suffice."""
+    if any(option.is_feasible for option in options):
+        return []
+    wish = length_text(wanted[0])
+    if wanted[1] is not None:
+        wish += f" and {math.degrees(wanted[1]):.2g} deg"
+    separate = [option for option in options if option.analysis.min_pitch_m <= pitch_m]
+    if not separate:
+        smallest_m = min(option.analysis.min_pitch_m for option in options)
+        return [
+            f"no bars have separate territories at a pitch of {length_text(pitch_m)}; the smallest "
+            f"pitch is {length_text(smallest_m)}"
+        ]
+    best = min(separate, key=lambda option: option.forecast.position_p95_m)
+    return [
+        f"{wish} (95 %) is impossible at a pitch of {length_text(pitch_m)}: the best bars, "
+        f"{_size(best.analysis.geometry)}, give {length_text(best.forecast.position_p95_m)} and "
+        f"{math.degrees(best.forecast.heading_p95_rad):.2g} deg; make the pitch smaller, calibrate "
+        "the odometry, or measure the landmarks (locatk calibrate map)"
+    ]
+
+
+def search_entry(option: BarOption) -> dict[str, Any]:
+    """Return bars that were tried for ``--json``; unknown errors are null."""
+    forecast = {
+        key: value if math.isfinite(value) else None
+        for key, value in asdict(option.forecast).items()
+    }
+    return {
+        "geometry": asdict(option.analysis.geometry),
+        "heights_m": list(option.heights_m),
+        "min_pitch_m": option.analysis.min_pitch_m,
+        "range_t": option.analysis.range_t,
+        "forecast": forecast,
+        "reason": option.reason,
+    }
+
+
+def _size(geometry: Geometry) -> str:
+    sides = (geometry.bar_length_m, geometry.bar_width_m, geometry.bar_height_m)
+    return "x".join(f"{1e3 * side:g}" for side in sides)

@@ -178,3 +178,43 @@ def test_two_maps_with_a_route_are_refused(locatk, made: Path, drive: Path) -> N
     result = locatk("map", "check", made, made, "--route", drive)
     assert result.exit_code == 2
     assert "one map" in result.stderr
+
+
+# ---- map design --landmark --search
+
+
+@pytest.fixture
+def few_bars(monkeypatch: pytest.MonkeyPatch) -> None:
+    bar_search = "locatk.core.landmarks.design.bar_search"
+    monkeypatch.setattr(f"{bar_search}.BARS_M", ((30e-3, 10e-3, 5e-3), (50e-3, 12e-3, 12e-3)))
+    monkeypatch.setattr(f"{bar_search}.HEIGHTS_M", (12e-3,))
+
+
+@pytest.mark.usefixtures("few_bars")
+def test_search_lists_bars_and_heights(locatk) -> None:
+    result = locatk("map", "design", "--landmark", "--search", "20,5")
+    assert result.exit_code == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    (line,) = (each for each in lines if "30x10x5" in each)
+    assert line.split()[1] == "12"
+    assert "needs a" in result.stdout
+    told = json.loads(locatk("map", "design", "--landmark", "--search", "20,5", "--json").stdout)
+    assert [bool(each["heights_m"]) for each in told["bars"]] == [True, False]
+
+
+@pytest.mark.usefixtures("few_bars")
+def test_search_without_result_says_what_is_possible(locatk) -> None:
+    result = locatk("map", "design", "--landmark", "--search", "1")
+    assert result.exit_code == 3
+    assert "1 mm (95 %) is impossible at a pitch of 200 mm" in result.stderr
+    assert "30x10x5" in result.stderr
+    result = locatk("map", "design", "--landmark", "--search", "1", "--pitch", "120")
+    assert result.exit_code == 3
+    assert "the smallest pitch is" in result.stderr.replace("\n", " ")
+
+
+def test_search_needs_landmark(locatk) -> None:
+    result = locatk("map", "design", "--search", "5")
+    assert result.exit_code == 2
+    assert "give --landmark" in result.stderr
