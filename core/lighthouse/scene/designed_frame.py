@@ -55,10 +55,6 @@ IMPLAUSIBLE_PROBABILITY = 1e-4
 """Probability of a larger sum of weighted squares, below which the stations do not fit the
 design."""
 
-PROBABILITY_OF_INFLATION = 0.01
-"""Probability of a larger sum of weighted squares, below which the covariance of the frame grows
-with the misfit: the mounting was less careful than its tolerance says."""
-
 NO_PRIOR = np.inf
 
 
@@ -96,10 +92,12 @@ class DesignedFrame:
         Of all stations of both scenes.
     used : tuple of int
         Channels of the stations that determined the frame.
-    swapped : (int, int) or None
-        Channels that were exchanged, if the stations fit the design only then.
-    is_plausible : bool
-        False if the stations used do not fit the design.
+    swaps : tuple of (int, int)
+        Pairs of channels, if the stations fit the design only after the exchange of one of these.
+        The frame is that of the first. There are several in symmetric rooms.
+    misfit_ratio : float
+        Distance of the stations used from their designed poses, relative to the mounting tolerance;
+        1 if it is plausible.
     scale_sigma_of_design : float
         Relative standard deviation of the scale by the designed poses alone; infinite if these do
         not determine it.
@@ -110,8 +108,8 @@ class DesignedFrame:
     covariance: Array
     deviations: tuple[StationDeviation, ...]
     used: tuple[int, ...]
-    swapped: tuple[int, int] | None
-    is_plausible: bool
+    swaps: tuple[tuple[int, int], ...]
+    misfit_ratio: float
     scale_sigma_of_design: float
 
     def pose_covariance(self, position: Array) -> Array:
@@ -290,30 +288,30 @@ def fit_designed_frame(scene: Scene, design: Scene) -> DesignedFrame:
         )
     to_channel = {c: c for c in channels}
     matching = _Matching.of(scene, design, to_channel, sigma)
-    fit, used, swapped = matching.fit(channels), list(channels), None
+    fit, used = matching.fit(channels), list(channels)
+    swaps: tuple[tuple[int, int], ...] = ()
     if not fit.is_plausible:
-        swap = _best_swap(scene, design, channels, sigma)
-        if swap is not None:
-            swapped, matching, fit = swap
+        fits_of_swaps = _plausible_swaps(scene, design, channels, sigma)
+        swaps = tuple(sorted(fits_of_swaps, key=lambda pair: fits_of_swaps[pair].cost))
+        if swaps:
+            fit = fits_of_swaps[swaps[0]]
     while not fit.is_plausible and len(used) > 2:
         # Of the stations, the one without which the others fit best is where it should not be.
         fits = {c: matching.fit([other for other in used if other != c]) for c in used}
         worst = min(fits, key=lambda c: fits[c].cost)
+        (deviation,) = (d for d in matching.deviations(fits[worst]) if d.channel == worst)
+        if deviation.sigmas <= MAX_STATION_SIGMAS:
+            break  # All were mounted less carefully than the tolerance says.
         used.remove(worst)
         fit = fits[worst]
-    if swapped is not None:
-        unswapped = _Matching.of(scene, design, to_channel, sigma)
-        deviations = unswapped.deviations(fit)
-    else:
-        deviations = matching.deviations(fit)
     return DesignedFrame(
         fit.to_design,
         fit.centre,
         fit.covariance,
-        deviations,
+        matching.deviations(fit),
         tuple(used),
-        swapped,
-        fit.is_plausible,
+        swaps,
+        fit.misfit_ratio,
         fit.scale_sigma_of_design,
     )
 
@@ -321,13 +319,13 @@ def fit_designed_frame(scene: Scene, design: Scene) -> DesignedFrame:
 def compare_with_design(scene: Scene, design: Scene) -> DesignedFrame:
     """Return the deviations of stations in a frame that is not that of the design but should be."""
     channels = [s.channel for s in scene.stations if design.station(s.channel) is not None]
-    identity = _Fit(Similarity.identity(), np.zeros(3), np.zeros((7, 7)), 0.0, True, NO_PRIOR)
+    identity = _Fit(Similarity.identity(), np.zeros(3), np.zeros((7, 7)), 0.0, 1.0, NO_PRIOR)
     deviations: tuple[StationDeviation, ...] = ()
     if channels:
         matching = _Matching.of(scene, design, {c: c for c in channels}, NO_PRIOR)
         deviations = matching.deviations(identity)
     return DesignedFrame(
-        identity.to_design, np.zeros(3), identity.covariance, deviations, (), None, True, NO_PRIOR
+        identity.to_design, np.zeros(3), identity.covariance, deviations, (), (), 1.0, NO_PRIOR
     )
 
 
@@ -337,8 +335,12 @@ class _Fit:
     centre: Array
     covariance: Array
     cost: float
-    is_plausible: bool
+    misfit_ratio: float
     scale_sigma_of_design: float
+
+    @property
+    def is_plausible(self) -> bool:
+        return self.misfit_ratio == 1.0
 
 
 @dataclass(frozen=True)
@@ -407,7 +409,8 @@ class _Matching:
         own = np.asarray(minimum.equations.hessian[0])
         cost = 2.0 * float(minimum.equations.cost[0])
         freedom = 6 * len(rows) - len(free) + bool(np.isfinite(self.scale_sigma))
-        inflation = max(1.0, cost / float(chdtri(freedom, PROBABILITY_OF_INFLATION)))
+        # With a misfit beyond the tolerance, the mounting was less careful than it says.
+        inflation = max(1.0, cost / freedom)
         covariance = np.zeros((7, 7))
         covariance[np.ix_(free, free)] = inflation * np.linalg.inv(own)
         scale_sigma_of_design = NO_PRIOR
@@ -415,7 +418,8 @@ class _Matching:
             own[-1, -1] -= self.scale_sigma**-2.0
             scale_sigma_of_design = float(np.sqrt(np.linalg.inv(own)[-1, -1]))
         is_plausible = cost < float(chdtri(freedom, IMPLAUSIBLE_PROBABILITY))
-        return _Fit(minimum.state, centre, covariance, cost, is_plausible, scale_sigma_of_design)
+        misfit_ratio = 1.0 if is_plausible else float(np.sqrt(cost / freedom))
+        return _Fit(minimum.state, centre, covariance, cost, misfit_ratio, scale_sigma_of_design)
 
     def residuals(self, to: Similarity, rows: Sequence[int]) -> tuple[Array, Array]:
         """Return position and rotation beside the designed ones (n, 6), and weights (n, 6, 6)."""
@@ -507,18 +511,17 @@ def mounting_covariance(station: Station) -> Array:
     return np.diag(sigma**2)
 
 
-def _best_swap(
+def _plausible_swaps(
     scene: Scene, design: Scene, channels: Sequence[int], sigma: float
-) -> tuple[tuple[int, int], _Matching, _Fit] | None:
-    """Return the two channels whose exchange makes all stations fit, or None."""
-    best = None
+) -> dict[tuple[int, int], _Fit]:
+    """Return the pairs of channels after whose exchange all stations fit, with the fits."""
+    result = {}
     for first, second in combinations(channels, 2):
         to_channel = {c: c for c in channels} | {first: second, second: first}
-        matching = _Matching.of(scene, design, to_channel, sigma)
-        fit = matching.fit(channels)
-        if fit.is_plausible and (best is None or fit.cost < best[2].cost):
-            best = ((first, second), matching, fit)
-    return best
+        fit = _Matching.of(scene, design, to_channel, sigma).fit(channels)
+        if fit.is_plausible:
+            result[first, second] = fit
+    return result
 
 
 # ---- messages
@@ -550,29 +553,42 @@ def _frame_warning(frame: DesignedFrame, scale: str) -> SolverWarning:
 
 def _deviation_warnings(frame: DesignedFrame) -> list[SolverWarning]:
     """Return the stations that are not where the design has them."""
-    if frame.swapped is not None:
-        first, second = frame.swapped
+    if frame.swaps:
+        used, *others = (f"{first} and {second}" for first, second in frame.swaps)
+        alternatives = ""
+        if others:
+            alternatives = (
+                f" (or {', or '.join(others)}, which fits as well and gives another frame: visit "
+                "markers to decide)"
+            )
         return [
             SolverWarning(
                 "designed_channels_swapped",
-                f"the stations fit the design only if those on channels {first} and {second} are "
-                "exchanged: the frame is that of this arrangement. Set the channels as designed, "
-                "or exchange them in the design",
+                f"the stations fit the design only if those on channels {used} are exchanged"
+                f"{alternatives}: the frame is that of this arrangement. Set the channels as "
+                "designed, or exchange them in the design",
             )
         ]
-    far = [
-        d
+    is_misplaced = [
+        d.sigmas > MAX_STATION_SIGMAS or (bool(frame.used) and d.channel not in frame.used)
         for d in frame.deviations
-        if d.sigmas > MAX_STATION_SIGMAS
-        or not frame.is_plausible
-        or (frame.used and d.channel not in frame.used)
     ]
-    return [
+    warnings = [
         SolverWarning(
             "station_not_as_designed",
             f"the station on channel {d.channel} is {1e3 * d.offset_m:.0f} mm and "
             f"{np.degrees(d.rotation_rad):.1f} deg from its designed pose ({d.sigmas:.0f} sigma of "
             "the mounting): it was mounted elsewhere, or the scene is wrong",
         )
-        for d in far
+        for d, is_far in zip(frame.deviations, is_misplaced, strict=True)
+        if is_far
     ]
+    if frame.misfit_ratio > 1.0 and not warnings:
+        warnings.append(
+            SolverWarning(
+                "station_not_as_designed",
+                f"the stations are {frame.misfit_ratio:.1f} times as far from their designed poses "
+                "as the mounting tolerance: one was mounted elsewhere, or the tolerance is larger",
+            )
+        )
+    return warnings

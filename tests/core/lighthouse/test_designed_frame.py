@@ -118,7 +118,7 @@ def test_a_known_scale_counts_with_that_of_the_design() -> None:
     own = fit_designed_frame(scene, design).scale_sigma
     # A distance of 2 m between two points, each known to 3 mm.
     combined = (own**-2 + (np.sqrt(2) * 3e-3 / 2.0) ** -2) ** -0.5
-    assert fit_designed_frame(by_tape, design).scale_sigma == pytest.approx(combined, rel=0.02)
+    assert fit_designed_frame(by_tape, design).scale_sigma == pytest.approx(combined, rel=0.1)
 
 
 def test_a_station_that_was_mounted_elsewhere_does_not_move_the_frame() -> None:
@@ -137,6 +137,22 @@ def test_a_station_that_was_mounted_elsewhere_does_not_move_the_frame() -> None:
         assert np.linalg.norm(frame_error(frame, back)[:3]) < 0.08
 
 
+def test_careless_mounting_widens_the_frame_and_leaves_few_stations_out() -> None:
+    rng = np.random.default_rng(9)
+    nees, used = [], []
+    for _ in range(15):
+        truth = rooms.room(rng, 4)
+        scene, back = estimated(truth, rng)
+        design = design_of(truth, rng, 2 * TOLERANCE)
+        stated = tuple(replace(s, covariance=np.diag(TOLERANCE**2)) for s in design.stations)
+        frame = fit_designed_frame(scene, replace(design, stations=stated))
+        used.append(len(frame.used))
+        error = frame_error(frame, back)
+        nees.append(error @ np.linalg.solve(frame.covariance, error) / 7)
+    assert np.mean(used) > 3.3
+    assert np.mean(nees) < 2.5  # It would be 4 without.
+
+
 def test_swapped_channels_are_named() -> None:
     rng = np.random.default_rng(4)
     truth = rooms.room(rng, 4)
@@ -145,8 +161,24 @@ def test_swapped_channels_are_named() -> None:
     channels = {1: 3, 3: 1, 2: 2, 4: 4}
     stations = tuple(replace(s, channel=channels[s.channel]) for s in design.stations)
     frame = fit_designed_frame(scene, replace(design, stations=stations))
-    assert frame.swapped == (1, 3)
+    assert frame.swaps[0] == (1, 3)
     assert np.linalg.norm(frame_error(frame, back)[:3]) < 0.06
+
+
+def test_an_exchange_in_a_symmetric_room_names_all_arrangements_that_fit() -> None:
+    rng = np.random.default_rng(7)
+    corners = np.array([[-2, -1.5, 2.2], [2, 1.5, 2.2], [-2, 1.5, 2.2], [2, -1.5, 2.2]])
+    stations = tuple(
+        Station(k + 1, corner, rooms.looking_at(corner, np.zeros(3)), rooms.IDEAL)
+        for k, corner in enumerate(corners)
+    )
+    truth = Scene(stations, planar=True)
+    scene, _ = estimated(truth, rng)
+    design = design_of(truth, rng)
+    channels = {1: 2, 2: 1, 3: 3, 4: 4}
+    swapped = tuple(replace(s, channel=channels[s.channel]) for s in design.stations)
+    frame = fit_designed_frame(scene, replace(design, stations=swapped))
+    assert set(frame.swaps) == {(1, 2), (3, 4)}  # The second is the first, turned by 180 degrees.
 
 
 def test_scenes_without_stations_of_the_design_are_refused() -> None:
