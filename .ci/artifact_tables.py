@@ -18,13 +18,14 @@ from typing import Any
 
 from locatk.formats.artifacts import registry
 from locatk.formats.artifacts.kinds import NO_UNIT, Boolean
+from locatk.formats.artifacts.cameras import CAMERAS
 from locatk.formats.artifacts.ledger import LEDGER
 from locatk.formats.artifacts.prices import PRICES
 from locatk.formats.artifacts.schema import HEADER, REQUIRED, Artifact, Key, Table, Tables, Variant
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "formats.md"
 
-ARTIFACTS = (*(entry.artifact for entry in registry.ARTIFACTS.values()), LEDGER, PRICES)
+ARTIFACTS = (*(entry.artifact for entry in registry.ARTIFACTS.values()), LEDGER, PRICES, CAMERAS)
 
 COLUMNS = "| key | value | default | meaning |\n|---|---|---|---|\n"
 
