@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading, umeyama
 from locatk.core.polaris.array import Samples
-from locatk.core.polaris.codec import capacity, layout_of
+from locatk.core.polaris.codec import layout_of
 from locatk.core.polaris.design.accuracy_bound import magnet_covariance, pose_covariance
-from locatk.core.polaris.design.planning import ReadingConditions, compact_spacing, sensor_array
+from locatk.core.polaris.design.planning import ReadingConditions, sensor_array
 from locatk.core.polaris.design.routes import (
     SiteForecast,
     forecast_routes,
@@ -60,15 +60,6 @@ Array = NDArray[np.float64]
 
 SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 """Signs of the errors of scale and drift of the odometry in the drives of a task."""
-
-CAPACITIES = (
-    ("4 magnets of order 3", Tags(magnets=4), math.log2(20_480)),
-    ("5 magnets of order 3", Tags(), math.log2(327_680)),
-    ("8 magnets of order 3", Tags(magnets=8), 24.0),
-    ("8 magnets of order 4, 16 orientations", Tags(order=4, magnets=8, orientations=16), 41.0),
-    ("3 magnets of order 2", Tags(order=2, magnets=3), 9.0),
-)
-"""Designs whose capacity the paper states (sections 5.3 and 8), with the bits."""
 
 TASKS, DRIVES, TAGS = 20, len(SIGNS), 4
 """Tasks, simulated drives of each, and tags along each route."""
@@ -190,7 +181,7 @@ def figures(data: Path) -> list[Figure]:
     return [
         *simulated_figures(),
         *measure_or_explain(lambda: recording_figures(data / "polaris"), missing),
-        *paper_figures(),
+        rate_figure(),
     ]
 
 
@@ -535,27 +526,10 @@ def _recording_figure(
     )  # fmt: skip
 
 
-# ---- calculations of the paper
-
-
-def paper_figures() -> Iterator[Figure]:
-    """Reproduce the calculations of the Polaris paper that belong to the design of tags."""
-    peer = "Polaris paper"
-    for title, tags, bits in CAPACITIES:
-        yield Figure(
-            f"polaris paper, Eq. 1: {title}", math.log2(capacity(tags)), "bit",
-            "capacity of the codec `mosk`", peer=peer, peer_value=bits,
-        )  # fmt: skip
-    tags = Tags()
-    spacing_mm = 1e3 * compact_spacing(tags.magnet, tags.clearance_m)
-    yield Figure(
-        "polaris paper, 5.2.3: spacing by the rule of 0.8", spacing_mm, "mm",
-        "2 x 0.5 mm N52 at 10 mm; distance without overlap: field at 0.1 of its peak, 49.7 mm",
-        peer=peer, peer_value=40.0,
-    )  # fmt: skip
-    conversion = Settings()
-    yield Figure(
-        "polaris paper, 7.1: sampling rate of the published firmware", conversion.max_rate_hz, "Hz",
-        "OSR 3, DIG_FILT 3: 16.05 ms for three axes and the readout; refutes 100 Hz",
-        peer=peer, peer_value=100.0,
+def rate_figure() -> Figure:
+    """Return the sampling rate that the published firmware can have."""
+    return Figure(
+        "polaris paper, 7.1: sampling rate of the published firmware", Settings().max_rate_hz, "Hz",
+        "OSR 3, DIG_FILT 3: 16.05 ms for three axes, and the readout; refutes 100 Hz",
+        peer="Polaris paper", peer_value=100.0,
     )  # fmt: skip
