@@ -29,7 +29,7 @@ from locatk.core.geometry import Similarity, apply_homography, fit_homography, u
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
 from locatk.core.lighthouse.design import RoomRequest, design_room
 from locatk.core.lighthouse.design.accuracy import PositionAccuracy
-from locatk.core.lighthouse.design.placement import seen_stations
+from locatk.core.lighthouse.design.report import report_room
 from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
 from locatk.core.lighthouse.devices.alignment import MARKER_SIGMA_M
 from locatk.core.lighthouse.motion.frames import common_motions
@@ -466,14 +466,8 @@ def _predicted_variance(scene: Scene, points_m: Array) -> float:
     """Return the mean predicted variance of positions at some of the driven places."""
     assert scene.room is not None
     step = max(1, len(points_m) // MAX_PREDICTED_PLACES)
-    points = points_m[::step]
-    position = np.stack([station.position for station in scene.stations])
-    rotation = np.stack([station.rotation for station in scene.stations])
-    is_seen = seen_stations(scene.room, position, rotation, points, REQUEST)
-    sigma = predict_solved_positions(
-        position, rotation, points, is_seen, is_planar=scene.room.is_planar
-    ).sigma_m
-    return float(np.mean(sigma[np.isfinite(sigma)] ** 2))
+    report = report_room(scene, scene.room, REQUEST, points_m=points_m[::step])
+    return float(np.mean(report.sigma_m[np.isfinite(report.sigma_m)] ** 2))
 
 
 def _positions(solution: Solution, session: SimulatedSession) -> tuple[Array, Array]:
