@@ -86,7 +86,7 @@ def _chi_probability(ratio: Array, size: int) -> Array:
     """
     if size == 2:
         return np.asarray(-np.expm1(-(ratio**2) / 2))
-    within = np.asarray(erf(ratio / math.sqrt(2)))
+    within: Array = np.asarray(erf(ratio / math.sqrt(2)), float)
     if size == 1:
         return within
     return within - math.sqrt(2 / math.pi) * ratio * np.exp(-(ratio**2) / 2)
@@ -96,7 +96,7 @@ def _unit_directions(size: int) -> Array:
     """Return unit vectors (k, size) that are evenly distributed; opposite ones count once."""
     if size == 1:
         return np.ones((1, 1))
-    index: Array = np.arange(DIRECTIONS) + 0.5
+    index: Array = np.asarray(np.arange(DIRECTIONS) + 0.5, float)
     if size == 2:
         angle = np.pi * index / DIRECTIONS
         return np.column_stack([np.cos(angle), np.sin(angle)])

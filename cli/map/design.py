@@ -15,7 +15,7 @@ from locatk.cli.command import Command, section
 from locatk.cli.map import landmark_text, proof_text
 from locatk.cli.map.options import Cells, Size, Walls, check_cells, geometry_of, geometry_options
 from locatk.cli.options import number
-from locatk.cli.site.forecast import LengthAndAngle
+from locatk.cli.route_options import LengthAndAngle
 from locatk.core.errors import InputError
 from locatk.core.units import metres
 
