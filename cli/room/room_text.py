@@ -72,28 +72,17 @@ def report_lines(report: RoomReport, heading_rad: float | None = None) -> list[t
 
 def station_rows(stations: Sequence[Station], mounts: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the rows of the table of stations: channel, mount, position, yaw and tilt."""
+    from locatk.core.lighthouse.drawing.mounting_sheet import view_angles
+
     rows = []
     for station, mount in zip(stations, mounts, strict=True):
         x, y, z = (f"{1e3 * value:.0f}" for value in station.position)
-        yaw, tilt = view_angles(station)
+        yaw, tilt, _ = view_angles(station)
         rows.append((str(station.channel), mount, x, y, z, f"{yaw:.0f}", f"{tilt:.0f}"))
     return rows
 
 
 STATION_HEADER = ("channel", "mount", "x mm", "y mm", "z mm", "yaw deg", "tilt deg")
-
-
-def view_angles(station: Station) -> tuple[float, float]:
-    """Return azimuth and elevation of the direction of view in degrees.
-
-    If it is vertical, the azimuth is that of the upper side of the housing.
-    """
-    x, y, z = station.rotation[:, 0].tolist()
-    across = math.hypot(x, y)
-    if across < 1e-6:
-        x, y = (-math.copysign(1.0, z) * station.rotation[:2, 2]).tolist()
-    yaw = math.degrees(math.atan2(y, x))
-    return yaw + 0.0, math.degrees(math.atan2(z, across)) + 0.0
 
 
 def place_text(report: RoomReport, index: int) -> str:
@@ -107,9 +96,11 @@ def place_text(report: RoomReport, index: int) -> str:
 
 def addition_text(addition: Addition) -> str:
     """Return the best additional station in words."""
+    from locatk.core.lighthouse.drawing.mounting_sheet import view_angles
+
     station, report = addition.station, addition.report
     x, y, z = (f"{value:.1f}" for value in station.position)
-    yaw, tilt = view_angles(station)
+    yaw, tilt, _ = view_angles(station)
     return (
         f"channel {station.channel} at {x}, {y}, {z} m, yaw {yaw:.0f} deg, tilt {tilt:.0f} deg: "
         f"{mm(report.p95_sigma_m)} at 95 % of the places, {_percent(report.covered_fraction)} "
@@ -173,9 +164,11 @@ def station_entries(
     stations: Sequence[Station], mounts: Sequence[str | None]
 ) -> list[dict[str, Any]]:
     """Return stations for ``--json``."""
+    from locatk.core.lighthouse.drawing.mounting_sheet import view_angles
+
     entries = []
     for station, mount in zip(stations, mounts, strict=True):
-        yaw, tilt = view_angles(station)
+        yaw, tilt, _ = view_angles(station)
         entries.append(
             {
                 "channel": station.channel,

@@ -234,7 +234,7 @@ def view_rotation(yaw_rad: Array, tilt_rad: Array) -> Array:
     return np.stack([forward, left, up], axis=-1)
 
 
-def working_points(room: Room, count: int = SEARCH_POINTS) -> Array:
+def working_points(room: Room, count: int) -> Array:
     """Return about ``count`` points (p, 3) on a regular grid in the working volume.
 
     They are the centres of equal cells; those in obstacles are omitted.
@@ -468,7 +468,7 @@ class PlacementProblem:
 
     def __init__(self, room: Room, request: RoomRequest, points_m: Array | None = None) -> None:
         self.room, self.request = room, request
-        self.points_m = working_points(room) if points_m is None else points_m
+        self.points_m = working_points(room, SEARCH_POINTS) if points_m is None else points_m
         if not len(self.points_m):
             raise InputError(
                 "the working volume is empty: it is outside the room or inside obstacles",

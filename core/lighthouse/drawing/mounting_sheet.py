@@ -149,7 +149,8 @@ def view_angles(station: Station) -> tuple[float, float, bool]:
     is_vertical = abs(tilt) >= VERTICAL_RAD
     if is_vertical:
         x, y = station.rotation[:2, 2].tolist()
-    return math.degrees(math.atan2(y, x)), math.degrees(tilt), is_vertical
+    # 0.0 instead of -0.0
+    return math.degrees(math.atan2(y, x)) + 0.0, math.degrees(tilt) + 0.0, is_vertical
 
 
 def _plan_page(scene: Scene, room: Room, title: str, paper_mm: Point) -> UnnumberedPage:

@@ -64,8 +64,8 @@ def _excess() -> list[Figure]:
             "%",
             f"largest of {ROOMS} random rooms with 2 to 4 stations, from the same candidates "
             f"({', '.join(f'{n} stations: {c}' for n, c in CANDIDATES.items())}); cost is "
-            f"coverage, then the 95th percentile of sigma. Mean {100 * np.mean(found):.2f} %; after the "
-            f"continuous refinement {100 * np.mean(refined):.0f} % (largest "
+            f"coverage, then the 95th percentile of sigma. Mean {100 * np.mean(found):.2f} %; "
+            f"after the continuous refinement {100 * np.mean(refined):.0f} % (largest "
             f"{100 * max(refined):.0f} %)",
             target=5.0,
         )

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from locatk.core.errors import ArtifactError
 from locatk.core.geometry import rotation_exp
 from locatk.core.lighthouse.calibration import MODELS, Calibration
+from locatk.core.lighthouse.room import MOUNTS, Obstacle, RobotSize, Room, rectangle
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.core.lighthouse.scene.model import FRAME_SOURCES, JOINT_PARAMETERS
 from locatk.formats.artifacts import scene as artifacts
@@ -69,6 +70,36 @@ def stations(draw: st.DrawFn, channel: int) -> Station:
     )
 
 
+lengths = st.integers(100, 9000).map(lambda mm: mm / 1000)
+corners = st.tuples(st.integers(-5000, 5000), st.integers(-5000, 5000))
+
+
+@st.composite
+def rectangles(draw: st.DrawFn) -> np.ndarray:
+    x, y = draw(corners)
+    return rectangle(draw(lengths), draw(lengths), (x / 1000, y / 1000))
+
+
+@st.composite
+def rooms(draw: st.DrawFn) -> Room:
+    low, high = sorted([draw(lengths), draw(lengths)])
+    tripods = draw(st.lists(st.tuples(lengths, lengths, lengths), max_size=2))
+    mounts = [mount for mount in MOUNTS if mount != "tripod" or tripods]
+    return Room(
+        draw(rectangles()),
+        high + draw(lengths),
+        draw(st.sampled_from([(low, low), (low, high)])),
+        draw(st.none() | rectangles()),
+        tuple(
+            Obstacle(draw(rectangles()), bottom, bottom + draw(lengths), draw(st.text(max_size=5)))
+            for bottom in draw(st.lists(lengths, max_size=2))
+        ),
+        tuple(draw(st.lists(st.sampled_from(mounts), min_size=1, max_size=3, unique=True))),
+        np.array(tripods, float).reshape(-1, 3),
+        draw(st.none() | st.builds(RobotSize, st.integers(1, 50), lengths, lengths)),
+    )
+
+
 @st.composite
 def scenes(draw: st.DrawFn) -> Scene:
     placed = draw(st.lists(channels, max_size=3, unique=True))
@@ -93,6 +124,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         ups=draw(st.dictionaries(channels, directions(), max_size=3)),
         frame_source=draw(st.none() | st.sampled_from(FRAME_SOURCES)),
         level_sigma_rad=draw(st.none() | st.floats(0, 3)),
+        room=draw(st.none() | rooms()),
     )
 
 
@@ -404,3 +436,54 @@ def test_unknown_keys_get_a_suggestion() -> None:
 def test_files_that_are_not_text(text: bytes) -> None:
     with pytest.raises(ArtifactError):
         loads_scene(text)
+
+
+# ---- the room
+
+ROOM = """
+format = "locatk-lighthouse-scene"
+format_version = 1
+
+[room]
+outline_mm = [[0, 0], [0, 4000], [5000, 4000], [5000, 0]]
+height_mm = 2800
+"""
+
+
+def test_a_file_with_a_room_only_is_a_scene() -> None:
+    scene = loads_scene(ROOM)
+    room = scene.room
+    assert room is not None
+    assert not scene.stations
+    assert room.height_m == 2.8
+    assert room.outline_m.tolist() == [[5, 0], [5, 4], [0, 4], [0, 0]]
+    assert room.photodiode_z_m == (0.0, 0.0)
+    assert room.mounts == ("wall", "ceiling")
+    assert loads_scene(ROOM + "lowest_photodiode_mm = 80\n").room.photodiode_z_m == (0.08, 0.08)
+
+
+def test_scenes_without_a_room_are_written_as_before() -> None:
+    assert "room" not in dumps_scene(Scene())
+
+
+@pytest.mark.parametrize(
+    ("added", "message"),
+    [
+        ("height = 3", "unknown key 'height'"),
+        ("highest_photodiode_mm = 3000", "photodiodes from 0 to 3 m"),
+        ('mounts = ["roof"]', "roof"),
+        ('mounts = ["tripod"]', "no positions of tripods"),
+        ("tripods_mm = [[1, 2]]", "list of 3 numbers"),
+        ("area_mm = [[0, 0], [1, 1]]", "2 corners"),
+        ("area_mm = [[0, 0], [9, 9], [9, 0], [0, 9]]", "crosses or touches itself"),
+        ("[room.robots]\ncount = 0\nradius_mm = 1\nheight_mm = 1", "robots.count"),
+        ("[[room.obstacles]]\noutline_mm = [[0,0],[9,0],[9,9]]\nhigh_mm = -1", "obstacles"),
+        ("[[room.obstacles]]\noutline_mm = [[0,0],[9,0],[9,9]]\nlow_mm = 2\nhigh_mm = 2",
+         "not above its lower face"),
+    ],
+)  # fmt: skip
+def test_rooms_with_wrong_keys_are_refused_in_one_line(added: str, message: str) -> None:
+    with pytest.raises(ArtifactError, match=message) as caught:
+        loads_scene(ROOM + added + "\n")
+    assert "room" in str(caught.value)
+    assert "\n" not in str(caught.value)
