@@ -153,6 +153,7 @@ def command(
       locatk site design tag.toml --route aisle.csv --accuracy 20,2 -o site.toml
     """
     from locatk.core.errors import error_context
+    from locatk.core.polaris.codec import capacity
     from locatk.core.polaris.design.routes import forecast_routes, plan_route
     from locatk.core.polaris.design.site import check_site, place_tags
     from locatk.formats.artifacts.tags import read_tags, write_tags
@@ -185,10 +186,11 @@ def command(
         with console.working("Planning"), error_context(route):
             placed_at, plan = plan_route(tags, waypoints, use, noise, *wanted, laying=laid)
         impossible = plan_warnings(plan, wanted)
-        if tags.ids is not None and len(placed_at) > len(tags.ids):
+        ids = capacity(tags) if tags.ids is None else len(tags.ids)
+        if len(placed_at) > ids:
             impossible = [
-                f"{len(placed_at)} tags are needed, but the family has {len(tags.ids)} ids: design "
-                f"more (`locatk tag design --count {len(placed_at)}`), or take a lower accuracy",
+                f"{len(placed_at)} tags are needed, but there are {ids} ids: design more (`locatk "
+                f"tag design --search --count {len(placed_at)}`), or take a lower accuracy",
                 *impossible,
             ]
             placed_at = []

@@ -21,6 +21,8 @@ LIMITS = {
     "play": "lateral error at which the array misses a tag",
     "maximum": "largest spacing that is planned",
     "field": "field of the magnets",
+    "length": "length of the straight parts of the route",
+    "count": "number of tags of a site",
 }
 """Descriptions of the limits of a spacing."""
 
@@ -140,8 +142,15 @@ def plan_warnings(plan: SpacingPlan, wanted: tuple[float, float]) -> list[str]:
     wish = length_text(wanted[0])
     if math.isfinite(wanted[1]):
         wish += f" and {math.degrees(wanted[1]):.2g} deg"
-    if plan.limited_by == "field":
-        return [f"{wish} is impossible: no pass over a tag is detected", *plan.remedies]
+    reasons = {
+        "field": "no pass over a tag is detected",
+        "length": "no tag is passed straight",
+        "count": "it needs too many tags",
+    }
+    if plan.limited_by in reasons:
+        return [f"{wish} is impossible: {reasons[plan.limited_by]}", *plan.remedies]
+    if not math.isfinite(plan.position_p95_m):
+        return [f"{wish} is impossible: no tag passes wholly below the array", *plan.remedies]
     possible = _errors(plan.position_p95_m, plan.heading_p95_rad)
     return [
         f"{wish} (95 %) is impossible on this route: tags {length_text(plan.spacing_m)} apart give "

@@ -156,8 +156,20 @@ def test_impossible_accuracies_are_answered_with_status_3(
         "site", "design", tag, "--route", aisle, "--accuracy", 5, "-o", tmp_path / "2.toml"
     )
     assert few.exit_code == 3
-    assert "the family has 6 ids: design more" in few.stderr
+    assert "tags are needed, but there are 6 ids: design more" in few.stderr
     assert not (tmp_path / "2.toml").exists()
+    narrow = ("--route", aisle, "--accuracy", 9, "--sensors", 4, "-o", tmp_path / "3.toml")
+    thin = locatk("site", "design", free, *narrow)
+    assert thin.exit_code == 3
+    assert "no tag passes wholly below the array" in thin.stderr
+    assert "take a wider array, of" in thin.stderr
+    for line, reason in (("100,0", "no tag is passed straight"), ("9e6,0", "too many tags")):
+        other = tmp_path / "other.csv"
+        other.write_text(f"x_mm,y_mm\n0,0\n{line}\n")
+        args = ("--route", other, "--accuracy", 9, "-o", tmp_path / f"{line[0]}.toml")
+        result = locatk("site", "design", free, *args)
+        assert result.exit_code == 3
+        assert reason in result.stderr
     beside = tmp_path / "beside.csv"
     beside.write_text("x_mm,y_mm\n0,500\n2900,500\n")
     missed = locatk("site", "check", out, "--route", beside)

@@ -587,10 +587,11 @@ class SpacingPlan:
         Errors along the route at this spacing, not exceeded with 95 %.
     fix_position_p95_m, fix_heading_p95_rad : float
         The same of a single pass, the limit for dense tags.
-    limited_by : {"position", "heading", "play", "maximum", "field"}
+    limited_by : {"position", "heading", "play", "maximum", "field", "length", "count"}
         Reason for no larger spacing (if feasible) or no accuracy (if not): error of position or
         heading; lateral error at which the array would miss the next tag; :data:`MAX_SPACING_M`;
-        or a field that is too weak for any pass.
+        a field that is too weak for any pass; a route without a straight part that is long enough
+        for a tag; or one that needs more than :data:`.site.MAX_SITE_TAGS` tags.
     remedies : tuple of str
         Changes that would help if the accuracy is impossible, with their effect.
     """
@@ -651,8 +652,9 @@ def spacing_for_accuracy(
     single = _quantiles(fix[None], np.ones(1))
     play_m = ((use.sensors - 1) * use.sensor_spacing_m - (tags.order - 1) * tags.spacing_m) / 2
 
-    def limits(spacing_m: float) -> tuple[tuple[float, float], tuple[str, ...]]:
-        """Return the errors at a spacing, and the names of the limits that they exceed."""
+    def limits(spacing_m: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
+        """Return the errors at a spacing (position, heading, across before a tag), and the limits
+        that they exceed."""
         route = Route(np.array([[0.0, 0.0], [PLANNED_GAPS * spacing_m, 0.0]]))
         places_m = spacing_m * np.arange(PLANNED_GAPS + 1)
         accuracy = predict_accuracy(
@@ -662,23 +664,27 @@ def spacing_for_accuracy(
             use.speed_mps,
             step_m=spacing_m / STEPS_PER_SPACING,
         )
-        errors = accuracy.position_quantile_m(), accuracy.heading_quantile_rad()
-        lateral_m = max(lateral_p95_m(accuracy, place) for place in places_m[1:].tolist())
+        errors = (
+            accuracy.position_quantile_m(),
+            accuracy.heading_quantile_rad(),
+            max(lateral_p95_m(accuracy, place) for place in places_m[1:].tolist()),
+        )
         exceeded = {
             "position": errors[0] > position_m,
             "heading": errors[1] > heading_rad,
-            "play": lateral_m > play_m,
+            "play": errors[2] > play_m,
         }
         return errors, tuple(name for name, is_exceeded in exceeded.items() if is_exceeded)
 
     errors, exceeded = limits(smallest_m)
     if exceeded:
-        remedies = _remedies(tags, use, noise, (position_m, heading_rad), single, exceeded, laying)
-        return SpacingPlan(False, smallest_m, *errors, *single, exceeded[0], remedies)
+        wanted = position_m, heading_rad
+        remedies = _remedies(tags, use, noise, wanted, single, errors[2] - play_m, laying)
+        return SpacingPlan(False, smallest_m, *errors[:2], *single, exceeded[0], remedies)
     low_m, high_m = smallest_m, MAX_SPACING_M
     largest_errors, exceeded = limits(high_m)
     if not exceeded:
-        return SpacingPlan(True, high_m, *largest_errors, *single, "maximum")
+        return SpacingPlan(True, high_m, *largest_errors[:2], *single, "maximum")
     while high_m > SPACING_RATIO * low_m:
         middle_m = math.sqrt(low_m * high_m)
         middle_errors, middle_exceeded = limits(middle_m)
@@ -686,7 +692,7 @@ def spacing_for_accuracy(
             high_m, exceeded = middle_m, middle_exceeded
         else:
             low_m, errors = middle_m, middle_errors
-    return SpacingPlan(True, low_m, *errors, *single, exceeded[0])
+    return SpacingPlan(True, low_m, *errors[:2], *single, exceeded[0])
 
 
 def _remedies(
@@ -695,10 +701,13 @@ def _remedies(
     noise: OdometryNoise,
     wanted: tuple[float, float],
     single: tuple[float, float],
-    exceeded: Sequence[str],
+    excess_m: float,
     laying: tuple[float, float] | None,
 ) -> tuple[str, ...]:
-    """Describe what would have to change for an accuracy that no spacing gives."""
+    """Describe what would have to change for an accuracy that no spacing gives.
+
+    ``excess_m`` is the lateral error before a tag less the play of the array.
+    """
     if single[0] > wanted[0] or single[1] > wanted[1]:
 
         def after(build_m: float | None) -> str:
@@ -713,9 +722,9 @@ def _remedies(
             "also measure the magnets as built (`locatk calibrate tag`): up to "
             f"{after(AS_BUILT_SIGMA_M)}",
         )
-    if "play" in exceeded:
-        needed = use.sensors + math.ceil(tags.spacing_m / use.sensor_spacing_m)
-        return (f"the robot misses tags: take a wider array, as of {needed} sensors",)
+    if excess_m > 0:
+        needed = use.sensors + math.ceil(2 * excess_m / use.sensor_spacing_m)
+        return (f"the robot misses tags: take a wider array, of {needed} sensors or more",)
     better = replace(
         noise,
         **{
@@ -848,8 +857,16 @@ def plan_route(
         )
 
     low_m, high_m = smallest_m, plan.spacing_m
+    route = Route(np.array([[point.x_m, point.y_m] for point in waypoints]))
+    if route.length_m > MAX_SITE_TAGS * plan.spacing_m:
+        remedy = f"divide the route into sites of at most {MAX_SITE_TAGS} tags"
+        return [], replace(plan, is_feasible=False, limited_by="count", remedies=(remedy,))
     points, result = forecast(high_m)
-    if is_enough(result):
+    if result.tags == 0 and plan.limited_by != "play":
+        straight_m = (tags.order - 1) * tags.spacing_m + 2 * RUN_UP_CLEARANCES * tags.clearance_m
+        remedy = f"a tag needs a straight part of {length_text(straight_m)}: take a longer route"
+        plan = replace(plan, is_feasible=False, limited_by="length", remedies=(remedy,))
+    elif is_enough(result):
         plan = replace(plan, is_feasible=True, remedies=())
     elif plan.is_feasible:
         points, result = forecast(low_m)
