@@ -174,7 +174,7 @@ def test_impossible_accuracies_are_answered_with_status_3(
     beside.write_text("x_mm,y_mm\n0,500\n2900,500\n")
     missed = locatk("site", "check", out, "--route", beside)
     assert missed.exit_code == 3
-    assert "beside: no tag passes wholly below the array" in missed.stderr
+    assert "on route beside, no tag passes wholly below the array" in missed.stderr
 
 
 # ---- check

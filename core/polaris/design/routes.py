@@ -543,8 +543,8 @@ def _route_warnings(tags: Tags, use: ReadingConditions, forecast: RouteForecast)
     if not passes:
         width_m, tag_m = (use.sensors - 1) * use.sensor_spacing_m, (tags.order - 1) * tags.spacing_m
         return [
-            f"{name}: no tag passes wholly below the array of {length_text(width_m)}; a tag is "
-            f"{length_text(tag_m)} wide, and a robot that turns over it cannot read it"
+            f"on route {name}, no tag passes wholly below the array of {length_text(width_m)}; a tag "
+            f"is {length_text(tag_m)} wide, and a robot that turns over it cannot read it"
         ]
     missed = forecast.missed
     if not missed:
@@ -552,8 +552,8 @@ def _route_warnings(tags: Tags, use: ReadingConditions, forecast: RouteForecast)
     first, lateral_m = max(missed, key=lambda pair: pair[1] - pair[0].play_m)
     number = "1 tag" if len(missed) == 1 else f"{len(missed)} of {len(passes)} tags"
     return [
-        f"{name}: {number} may be missed: before tag {first.tag_id} the robot is off by up to "
-        f"{length_text(lateral_m)} across (95 %), and all magnets are below the array up to "
+        f"on route {name}, {number} may be missed: before tag {first.tag_id} the robot is off by "
+        f"up to {length_text(lateral_m)} across (95 %), and all magnets are below the array up to "
         f"{length_text(first.play_m)}; lay tags closer together, or take a wider array"
     ]
 
@@ -653,8 +653,7 @@ def spacing_for_accuracy(
     play_m = ((use.sensors - 1) * use.sensor_spacing_m - (tags.order - 1) * tags.spacing_m) / 2
 
     def limits(spacing_m: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
-        """Return the errors at a spacing (position, heading, across before a tag), and the limits
-        that they exceed."""
+        """Return the errors of position, heading, and across before a tag, and exceeded limits."""
         route = Route(np.array([[0.0, 0.0], [PLANNED_GAPS * spacing_m, 0.0]]))
         places_m = spacing_m * np.arange(PLANNED_GAPS + 1)
         accuracy = predict_accuracy(

@@ -208,7 +208,7 @@ def test_forecast_warns_of_missed_tags_and_of_none() -> None:
     route = Route(np.array([[-0.5, 0.0], [9.5, 0.0]]), "aisle")
     far = forecast_routes(aisle(3.0, 4), [route])
     assert "may be missed" in far.warnings[0]
-    assert far.warnings[0].startswith("aisle: ")
+    assert far.warnings[0].startswith("on route aisle, ")
     beside = forecast_routes(aisle(1.0, 5), [Route(np.array([[0.0, 0.3], [4.0, 0.3]]))])
     assert "no tag passes wholly" in beside.warnings[0]
     assert beside.tags == 0
