@@ -543,8 +543,8 @@ def _route_warnings(tags: Tags, use: ReadingConditions, forecast: RouteForecast)
     if not passes:
         width_m, tag_m = (use.sensors - 1) * use.sensor_spacing_m, (tags.order - 1) * tags.spacing_m
         return [
-            f"on route {name}, no tag passes wholly below the array of {length_text(width_m)}; a tag "
-            f"is {length_text(tag_m)} wide, and a robot that turns over it cannot read it"
+            f"on route {name}, no tag passes wholly below the array of {length_text(width_m)}; a "
+            f"tag is {length_text(tag_m)} wide, and a robot that turns over it cannot read it"
         ]
     missed = forecast.missed
     if not missed:
