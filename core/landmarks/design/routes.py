@@ -34,7 +34,7 @@ from locatk.core.landmarks.design.visit_accuracy import (
     installation_covariance,
     predict_visit,
     straight_path,
-    territory_reach,
+    visit_reach,
 )
 from locatk.core.landmarks.design.visit_accuracy import visit_covariance as visit_covariance
 from locatk.core.landmarks.field import basis
@@ -48,6 +48,11 @@ from locatk.core.landmarks.map.floor import (
     as_built_landmark,
 )
 from locatk.core.landmarks.map.windows import letters_as_read
+from locatk.core.landmarks.preprocessing import (
+    MIN_FIELD_SIGMAS,
+    MIN_FIELD_THRESHOLDS,
+    MIN_PEAK_THRESHOLDS,
+)
 from locatk.core.landmarks.solver import SolveOptions
 from locatk.core.routes import Route, RouteAccuracy, RouteFix, predict_accuracy
 from locatk.core.streaming.planar_filter import OdometryNoise
@@ -265,9 +270,9 @@ def find_visits(
 ) -> tuple[RouteVisit, ...]:
     """Return the passes of a route over landmarks, in order.
 
-    A pass is an interval in which a sensor is in the territory of a landmark, plus
+    A pass is an interval in which the solver notices the field of a landmark, plus
     :data:`~.visit_accuracy.REACH_M` on both sides. Its fix is at the point next to the centre of
-    the landmark if ``is_smoothed``. Otherwise it is where the last sensor leaves the territory,
+    the landmark if ``is_smoothed``. Otherwise it is where the last sensor leaves that field,
     because a live robot has no fix before. If a landmark is visited several times, the
     errors of its installation are those of all visits; each of n fixes has n times their
     variance, so that all together count them once.
@@ -282,9 +287,13 @@ def find_visits(
     centres = np.array([pose[:2] for pose, _ in landmarks])
     arm = float(np.hypot(*sensors.T).max())
     near = cKDTree(poses[:, :2]).query_ball_point(
-        centres, territory_reach(floor.geometry) - floor.geometry.circle_m + arm, return_sorted=True
+        centres, visit_reach(floor.geometry) - floor.geometry.circle_m + arm, return_sorted=True
     )
     margin = math.ceil(REACH_M / STEP_M)
+    peak_t = MIN_PEAK_THRESHOLDS * floor.geometry.threshold_t
+    field_t = max(
+        MIN_FIELD_THRESHOLDS * floor.geometry.threshold_t, MIN_FIELD_SIGMAS * errors.noise_t
+    )
     found = []
     for cell, (landmark, strength), indices in zip(cells, landmarks, near, strict=True):
         if not indices:
@@ -292,11 +301,13 @@ def find_visits(
         index = np.asarray(indices, np.int64)
         local = _in_landmark_frame(poses[index], landmark)
         field = np.abs(basis(floor.geometry, _sensor_points(local, sensors)) @ strength)
-        inside = index[(field >= floor.geometry.threshold_t).any(axis=1)]
-        # Sensors on both sides of the centre may leave the territory during a pass.
-        for part in np.split(inside, np.flatnonzero(np.diff(inside) > 2 * margin) + 1):
-            if not len(part):
+        strongest = field.max(axis=1)
+        inside = np.flatnonzero(strongest >= field_t)
+        # Sensors on both sides of the centre may leave the field during a pass.
+        for span in np.split(inside, np.flatnonzero(np.diff(index[inside]) > 2 * margin) + 1):
+            if not len(span) or strongest[span].max() < peak_t:
                 continue
+            part = index[span]
             first, stop = max(part[0] - margin, 0), min(part[-1] + margin + 1, len(poses))
             kept = np.arange(first, stop, math.ceil((stop - first) / MAX_VISIT_POINTS))
             path = _in_landmark_frame(poses[kept], landmark)
@@ -642,7 +653,7 @@ def max_pass_offset(
 
     It is a multiple of 5 mm; 0 if no pass reads all landmarks.
     """
-    offsets = PASS_STEP_M * np.arange(math.ceil(territory_reach(geometry) / PASS_STEP_M))
+    offsets = PASS_STEP_M * np.arange(math.ceil(visit_reach(geometry) / PASS_STEP_M))
     for offset in offsets[::-1].tolist():
         path = straight_path(geometry, offset, 0.0)
         visits = (
@@ -680,8 +691,8 @@ def best_shift(floor: FloorMap, route: Route, pass_m: float) -> RouteShift | Non
     """Return the shift of a route with the shortest stretch between landmarks.
 
     A landmark counts if the route is within ``pass_m`` of its centre. Shifts are multiples of an
-    eighth of the pitch, up to half a pitch. Of those with the same stretch (to 10 mm), it is the
-    one that passes landmarks more closely, then the smallest.
+    eighth of the pitch, up to half a pitch. Of those with the same stretch (to an eighth as well),
+    it is the one that passes landmarks more closely, then the smallest.
 
     Returns
     -------
@@ -701,9 +712,11 @@ def best_shift(floor: FloorMap, route: Route, pass_m: float) -> RouteShift | Non
             gap_m = np.asarray(tree.query(position + (x, y))[0])
             stops = np.concatenate([[0.0], along[gap_m <= pass_m], [route.length_m]])
             longest_m = float(np.diff(stops).max())
-            ranked.append((round(longest_m, 2), round(gap_m.mean(), 3), math.hypot(x, y), x, y))
-    unshifted_m = next(item[0] for item in ranked if item[2] == 0)
-    longest_m, _, _, x, y = min(ranked)
+            steps = math.ceil(longest_m / (floor.pitch_m / SHIFT_STEPS))
+            rank = steps, round(gap_m.mean(), 3), math.hypot(x, y)
+            ranked.append((rank, x, y, longest_m))
+    unshifted_m = next(longest_m for rank, _, _, longest_m in ranked if rank[-1] == 0)
+    _, x, y, longest_m = min(ranked)
     if unshifted_m - longest_m < MIN_SHIFT_GAIN_PITCHES * floor.pitch_m:
         return None
     return RouteShift(x, y, longest_m, unshifted_m)

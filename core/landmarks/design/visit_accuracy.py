@@ -35,6 +35,7 @@ from locatk.core.landmarks.field import basis_gradient
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, code_of, signs
 from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
+from locatk.core.landmarks.preprocessing import MARGIN_M
 from locatk.core.streaming.planar_filter import OdometryNoise
 
 Array = NDArray[np.float64]
@@ -46,8 +47,8 @@ deviations change by less than 1 % at heights of 6 mm and more."""
 STEP_RAD = math.radians(3)
 """Rotation on the spot between two points: the sensors then move by 1.3 mm."""
 
-REACH_M = 0.06
-"""Path before and after the territory that counts as part of a visit [m], as in the solver."""
+REACH_M = MARGIN_M
+"""Path before and after the field of a landmark that counts as part of a visit [m]."""
 
 MAX_POSITION_SIGMA_M = 6e-3
 MAX_HEADING_SIGMA_RAD = math.radians(8)
@@ -188,7 +189,7 @@ def visit_covariance(
 
 def straight_path(geometry: Geometry, offset_m: float, heading_rad: float) -> Array:
     """Return a straight path (n, 3) over a landmark, which the middle point is next to."""
-    reach = territory_reach(geometry) + REACH_M
+    reach = visit_reach(geometry) + REACH_M
     count = math.ceil(reach / STEP_M)
     along = STEP_M * np.arange(-count, count + 1)
     c, s = math.cos(heading_rad), math.sin(heading_rad)
@@ -196,9 +197,12 @@ def straight_path(geometry: Geometry, offset_m: float, heading_rad: float) -> Ar
     return np.column_stack([x, y, np.full(len(along), heading_rad)])
 
 
-def territory_reach(geometry: Geometry) -> float:
-    """Return a distance [m] from the centre beyond which no sensor is in the territory."""
-    return geometry.radius_m + geometry.bar_length_m + geometry.circle_m
+def visit_reach(geometry: Geometry) -> float:
+    """Return a distance [m] from the centre beyond which a robot does not notice a landmark.
+
+    At twice the length of the bars beyond them, the field of the default landmark is 0.4 mT.
+    """
+    return geometry.radius_m + 2 * geometry.bar_length_m + geometry.circle_m
 
 
 def installation_covariance(pose: Array, errors: VisitErrors) -> Array:

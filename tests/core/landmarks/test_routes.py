@@ -163,15 +163,15 @@ def test_bad_odometry_does_not_connect_landmarks() -> None:
 
 
 def test_grazed_landmarks_are_not_read_but_named() -> None:
-    path = route((0.0, 0.2), (0.5, 0.2), (0.5, 0.274), (1.2, 0.274))
-    errors = VisitErrors(noise_t=1e-3)
+    path = route((0.0, 0.2), (0.5, 0.2), (0.5, 0.27), (1.2, 0.27))
+    errors = VisitErrors(noise_t=4e-4)
     check = check_routes(FLOOR, [path], errors=errors)[0]
     grazed = [visit.cell for visit in check.visits if not visit.is_read]
     assert grazed
     assert all(cell[0] == 1 and cell[1] >= 3 for cell in grazed)
     limit_m = max_pass_offset(FLOOR.geometry, errors=errors)
-    assert limit_m < min(0.074, max_pass_offset(FLOOR.geometry))
-    assert f"{grazed[0][0]},{grazed[0][1]} at 74 mm" in check.notes[0]
+    assert limit_m < min(0.07, max_pass_offset(FLOOR.geometry))
+    assert f"{grazed[0][0]},{grazed[0][1]} at 70 mm" in check.notes[0]
     assert f"within {1e3 * limit_m:.0f} mm" in check.notes[0]
 
 
