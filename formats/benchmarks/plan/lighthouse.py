@@ -119,7 +119,7 @@ def figures(data: Path) -> list[Figure]:
     for name, measure in (
         ("20 random rooms", _random_rooms),
         ("designed rooms", _designed_rooms),
-        ("published grid", partial(_grid, folder)),
+        ("published grid", partial(grid_figures, folder)),
         ("published floor, two stations", partial(_floor_of_two, folder)),
         ("published floor, one station", partial(_floor_of_one, folder)),
     ):
@@ -273,7 +273,7 @@ def _designed_rooms() -> list[Figure]:
 # ---- published recordings
 
 
-def _grid(data: Path) -> list[Figure]:
+def grid_figures(data: Path) -> list[Figure]:
     """Compare predictions for the scene of the published grid with its errors and its scatter."""
     session, truth_mm = suite.grid_session(data)
     solution = solve(session.sweeps, Scene(), SolveOptions(scene="two-3d"))
@@ -358,7 +358,7 @@ def _floor_figures(
     points = np.concatenate(places)
     accuracy = _predict(scene, points)
     corners = np.stack([mark.position[:2] for mark in marks])
-    of_marks = _homography_variance(corners, points[:, :2], is_aligned=not are_marks_of_scene)
+    of_marks = homography_variance(corners, points[:, :2], is_aligned=not are_marks_of_scene)
     variance = np.mean(accuracy.sigma_m**2) + (2 if are_marks_of_scene else 1) * of_marks
     own_mm = 1e3 * float(np.sqrt(np.mean(accuracy.sigma_m**2)))
     how = (
@@ -376,7 +376,7 @@ def _floor_figures(
     return [*rows, _recording_figure(repeatability, accuracy.noise_sigma_m, scatter_m, how)]
 
 
-def _homography_variance(corners: Array, points: Array, *, is_aligned: bool) -> float:
+def homography_variance(corners: Array, points: Array, *, is_aligned: bool) -> float:
     """Return the mean variance of points (n, 2) by a homography of four uncertain corners (4, 2).
 
     If the points are aligned with others, a similarity has no errors.
