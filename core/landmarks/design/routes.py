@@ -80,8 +80,9 @@ PASS_STEP_M = 5e-3
 SHIFT_STEPS = 8
 """Shifts of a route that are tried along each axis, over one pitch."""
 
-MIN_SHIFT_GAIN_PITCHES = 0.5
-"""Length by which a shift must shorten the longest stretch without a landmark to be named."""
+MIN_SHIFT_GAIN, MIN_SHIFT_GAIN_PITCHES = 0.25, 0.5
+"""Part of the longest stretch without a landmark, and length in pitches, by which a shift must
+shorten it to be named."""
 
 MIN_FLATNESS = 0.5
 """Ratio of the smallest and the largest standard deviation on a route from which on the errors of
@@ -573,9 +574,10 @@ class _Advisor:
             count = len({visit.cell for visit in check.visits if visit.is_read})
             problem = f"no landmark is read on {check.route.length_m:.3g} m"
             if count:
+                others = check.ambiguous_places
                 problem = (
-                    f"{check.ambiguous_places} other places of the map have the {count} "
-                    f"landmark{'s' * (count != 1)} that are read on it"
+                    f"{others} other place{'s' * (others != 1)} of the map "
+                    f"{'has' if others == 1 else 'have'} the same landmarks ({count}) along it"
                 )
             remedy = self.shorten_gap(LONGER_ROUTE)
             yield f"route {name} is not localisable: {problem}; {remedy}"
@@ -697,7 +699,7 @@ def best_shift(floor: FloorMap, route: Route, pass_m: float) -> RouteShift | Non
     Returns
     -------
     RouteShift or None
-        None if no shift makes the longest stretch shorter by :data:`MIN_SHIFT_GAIN_PITCHES`.
+        None if no shift makes the longest stretch shorter by :data:`MIN_SHIFT_GAIN` and :data:`MIN_SHIFT_GAIN_PITCHES`.
     """
     cells = floor.cells()
     if not cells:
@@ -717,7 +719,8 @@ def best_shift(floor: FloorMap, route: Route, pass_m: float) -> RouteShift | Non
             ranked.append((rank, x, y, longest_m))
     unshifted_m = next(longest_m for rank, _, _, longest_m in ranked if rank[-1] == 0)
     _, x, y, longest_m = min(ranked)
-    if unshifted_m - longest_m < MIN_SHIFT_GAIN_PITCHES * floor.pitch_m:
+    gain_m = max(MIN_SHIFT_GAIN_PITCHES * floor.pitch_m, MIN_SHIFT_GAIN * unshifted_m)
+    if unshifted_m - longest_m < gain_m:
         return None
     return RouteShift(x, y, longest_m, unshifted_m)
 

@@ -274,11 +274,11 @@ def predict_visit(
     test = difference - jacobian @ (covariance @ (jacobian.T @ difference))
     square = np.maximum(np.einsum("rk,rk->k", difference, test), 0.0)
     variance = square
-    pose_covariance: Array = covariance[:3, :3]
+    pose_covariance = np.asarray(covariance[:3, :3], np.float64)
     if errors.disturbance_t:
         iron = root[:, None] * _iron_covariance(position.reshape(-1, 2), errors) * root
         estimate = covariance[:3] @ jacobian.T
-        pose_covariance = np.asarray(pose_covariance + estimate @ iron @ estimate.T)
+        pose_covariance = pose_covariance + estimate @ iron @ estimate.T
         variance = square + np.einsum("rk,rk->k", test, iron @ test)
     margin = square / 2 / np.sqrt(np.maximum(variance, np.finfo(float).tiny))
     misread = min(1.0, float(ndtr(-margin).sum()))
