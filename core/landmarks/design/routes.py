@@ -699,7 +699,8 @@ def best_shift(floor: FloorMap, route: Route, pass_m: float) -> RouteShift | Non
     Returns
     -------
     RouteShift or None
-        None if no shift makes the longest stretch shorter by :data:`MIN_SHIFT_GAIN` and :data:`MIN_SHIFT_GAIN_PITCHES`.
+        None if no shift makes the longest stretch shorter by :data:`MIN_SHIFT_GAIN` and
+        :data:`MIN_SHIFT_GAIN_PITCHES`.
     """
     cells = floor.cells()
     if not cells:
