@@ -5,8 +5,8 @@ an unknown constant offset of each axis of each sensor. The information is that 
 all sensors; nuisance parameters are marginalized (Schur complement).
 
 Fields of the environment are no part of the bound's model, as they are none of the solver's: the
-covariance of the errors that they cause in the estimate for white noise is added. The estimate
-then also has a drift of each axis of each sensor as an unknown, as the solver's has.
+covariance of the errors that they cause in the estimate for white noise is added. The background
+of each axis of each sensor is then a polynomial, as the solver fits it if it sees a trend.
 """
 
 from __future__ import annotations
@@ -40,6 +40,15 @@ recordings published with the Polaris paper."""
 
 PASS_MARGIN_CLEARANCES = 4.0
 """Length of the pass before and behind the tag, in clearances."""
+
+BACKGROUND_DEGREE = 4
+"""Degree of the background in an environment with varying fields, as of the solver
+(:data:`locatk.core.polaris.detection.magnets.DRIFT_TREND_TERMS`)."""
+
+VARYING_MARGIN_CLEARANCES = 8.0
+"""Length of the pass before and behind the tag in such an environment, in clearances. The solver
+takes all samples with a change above the noise: the field of a magnet, 200 times the noise (default
+tag), falls to it within 5.9 clearances (with the cube of the distance), and ten samples more."""
 
 MAX_SAMPLES = 400
 """Largest number of samples of a pass. Denser samples are averaged in groups, which changes the
@@ -144,15 +153,15 @@ def magnet_covariance(
         raise InputError(f"a step of {step_m} m from sample to sample is not positive")
     position_m = rotate(cell_positions(tags, layout.cells), heading_rad) + [0.0, offset_m]
     angle_rad = symbol_angles(tags, layout.symbols) + heading_rad
-    path_m, group = _sample_path(position_m, step_m, PASS_MARGIN_CLEARANCES * tags.clearance_m)
+    has_environment = environment.field_t > 0
+    margin = VARYING_MARGIN_CLEARANCES if has_environment else PASS_MARGIN_CLEARANCES
+    path_m, group = _sample_path(position_m, step_m, margin * tags.clearance_m)
     noise = noise / math.sqrt(group)
 
     columns, path_column = _derivatives(tags, position_m, angle_rad, array, path_m, nuisance)
     columns, path_column = columns / noise, path_column / noise
-    has_environment = environment.field_t > 0
-    # Offsets (and drifts) are linear unknowns: removing their part of each sensor's axis
-    # marginalizes them.
-    remaining = _without_background(path_m, 1 if has_environment else 0)
+    # The background is a linear unknown: removing its part of each sensor's axis marginalizes it.
+    remaining = _without_background(path_m, BACKGROUND_DEGREE if has_environment else 0)
     columns = np.einsum("nk,pksi->pnsi", remaining, columns, optimize=True)
     flat = columns.reshape(len(columns), -1)
     information = flat @ flat.T

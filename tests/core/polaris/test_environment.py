@@ -36,13 +36,13 @@ MINI = Tags(order=2, magnets=3, spacing_m=0.02, clearance_m=0.01)
 def dense_covariance(environment: Environment, sensors: SensorArray, step_m: float) -> Array:
     """Covariance of x, y and angle of the magnets from a dense weighted least-squares estimate.
 
-    Unknowns are also heights, moments, and an offset and a drift of each axis of each sensor;
-    derivatives are central differences of magpylib's dipoles.
+    Unknowns are also the height, moments, and a polynomial of the fourth degree for each axis of
+    each sensor; derivatives are central differences of magpylib's dipoles.
     """
     layout = layout_of(MINI, 77)
     position = cell_positions(MINI, layout.cells)
     angle = symbol_angles(MINI, layout.symbols)
-    margin = 4 * MINI.clearance_m
+    margin = 8 * MINI.clearance_m
     low, high = position[:, 0].min() - margin, position[:, 0].max() + margin
     x = np.arange(math.floor(low / step_m), math.ceil(high / step_m) + 1) * step_m
     points = x[:, None, None] * [1.0, 0.0, 0.0] + sensors.position_m
@@ -61,9 +61,9 @@ def dense_covariance(environment: Environment, sensors: SensorArray, step_m: flo
     for k in range(len(start)):
         step = 1e-6 * (np.arange(len(start)) == k)
         columns.append((field(start + step) - field(start - step)).ravel() / 2e-6)
+    trends = np.polynomial.legendre.legvander(x / np.abs(x).max(), 4)
     for channel in np.eye(points[0].size).reshape(-1, *points[0].shape):
-        columns += [np.tile(channel, (len(x), 1, 1)).ravel()]
-        columns += [(channel * x[:, None, None] / 0.05).ravel()]
+        columns += [(channel * trend[:, None, None]).ravel() for trend in trends.T]
     jacobian = np.array(columns).T
     noise = np.broadcast_to(sensors.noise_t, points.shape).ravel()
     scale = np.linalg.norm(jacobian / noise[:, None], axis=0)
@@ -133,7 +133,7 @@ def test_a_design_for_iron_says_what_to_change() -> None:
         evaluate_design(Tags(), ReadingConditions(environment=environment))
         for environment in (QUIET, REINFORCED)
     )
-    assert iron.free_speed.angle_rad > 2 * quiet.free_speed.angle_rad
+    assert iron.free_speed.angle_rad > 1.5 * quiet.free_speed.angle_rad
     assert iron.between_to_noise < quiet.between_to_noise
     assert iron.misread > quiet.misread
     assert not iron.warnings
