@@ -74,7 +74,7 @@ def station_rows(stations: Sequence[Station], mounts: Sequence[str]) -> list[tup
     """Return the rows of the table of stations: channel, mount, position, yaw and tilt."""
     from locatk.core.lighthouse.drawing.mounting_sheet import view_angles
 
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for station, mount in zip(stations, mounts, strict=True):
         x, y, z = (f"{1e3 * value:.0f}" for value in station.position)
         yaw, tilt, _ = view_angles(station)

@@ -13,6 +13,7 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
@@ -103,10 +104,9 @@ def draw_room_maps(scene: Scene, report: RoomReport) -> Figure:
     # Each column is a third of the picture, of which axes and colour bar take 1.3 inches.
     scale = (WIDTH_INCHES / 3 - 1.3) / width
     plan, section = float(np.clip(depth * scale, 1.6, 9.0)), max(1.0, room.height_m * scale)
-    figure = Figure(figsize=(WIDTH_INCHES, plan + section + 1.9), layout="constrained")
-    engine = figure.get_layout_engine()
-    assert engine is not None  # as named
-    engine.set(rect=(0.0, 0.0, 0.985, 1.0))
+    # The labels of the last colour bar need some space.
+    layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 0.985, 1.0))
+    figure = Figure(figsize=(WIDTH_INCHES, plan + section + 1.9), layout=layout)
     grid = figure.add_gridspec(2, 3, height_ratios=(plan, section))
     sigma = 1e3 * np.where(report.is_covered, report.sigma_m, np.inf)
     dilution = np.where(report.is_covered, report.dilution, np.inf)

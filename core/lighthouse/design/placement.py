@@ -61,9 +61,15 @@ POSITION_DECIMALS = 2
 SOLVED_POINTS = 200
 """Number of points at which accuracy in a solved scene is compared."""
 
-SOLVED_EVALUATIONS = 6_000
-"""Number of comparisons in solved scenes, times the square of the number of stations: about three
+SOLVED_EVALUATIONS = 12_000
+"""Number of comparisons in solved scenes, times the square of the number of stations: about four
 seconds."""
+
+MAX_PART = 250
+"""Largest number of random placements, and of comparisons in a refinement."""
+
+REFINED_STARTS = 2
+"""Number of placements that are refined in solved scenes."""
 
 WALL_POSITIONS = 44
 """Number of positions along the walls that are tried, at each height."""
@@ -718,38 +724,56 @@ def _moves(room: Room, pose: StationPoses, length_m: float, angle_rad: float) ->
     return _concatenate(moved, turned)
 
 
-def place_stations(problem: PlacementProblem, count: int) -> StationPoses:
-    """Return the poses of ``count`` stations with a low cost, in the order of the search."""
+def place_stations(
+    problem: PlacementProblem, count: int, evaluations: int | None = None
+) -> StationPoses:
+    """Return the poses of ``count`` stations with a low cost.
+
+    The result of the search and random placements are compared by their accuracy in a solved scene
+    (:class:`SolvedCost`), which takes more time to compute than that of the search; the best ones
+    are refined. ``evaluations`` limits this effort, see :data:`SOLVED_EVALUATIONS`.
+    """
     poses = candidates(problem.room, problem.points_m)
     views = problem.views(poses)
-    poses = refine(problem, poses.take(choose_stations(problem, views, count)))
+    found = refine(problem, poses.take(choose_stations(problem, views, count)))
     # The grid of the search has gaps at the edges of beams.
     fine = working_points(problem.room, REFINEMENT_POINTS)
-    poses = refine(PlacementProblem(problem.room, problem.request, fine), poses)
-    return rounded(refine_solved(problem, poses))
-
-
-def refine_solved(problem: PlacementProblem, poses: StationPoses) -> StationPoses:
-    """Move and turn stations so that positions in the solved scene become more accurate.
-
-    The search treats the calibration errors of planes as independent. In a solved scene they are
-    not, which takes more time to compute (:class:`SolvedCost`). The number of computations is
-    limited by :data:`SOLVED_EVALUATIONS`.
-    """
+    found = refine(PlacementProblem(problem.room, problem.request, fine), found)
+    effort = SOLVED_EVALUATIONS if evaluations is None else evaluations
+    part = min(effort // (len(found) ** 2 * (1 + REFINED_STARTS)), MAX_PART)
     function = SolvedCost(problem.room, problem.request)
-    remaining = SOLVED_EVALUATIONS // len(poses) ** 2
+    useful = np.flatnonzero(np.any(views.is_seen, axis=1))
+    random = np.random.default_rng(0)
+    starts = [found]
+    for _ in range(part if len(useful) >= count else 0):
+        start = poses.take(random.choice(useful, count, replace=False))
+        if is_separated(start.position_m):
+            starts.append(start)
+    costs = [function(start) for start in starts]
+    order = np.argsort(costs, kind="stable")[:REFINED_STARTS]
+    refined = [refine_solved(problem.room, function, starts[k], part) for k in order]
+    return rounded(min(refined, key=function))
+
+
+def refine_solved(
+    room: Room, function: SolvedCost, poses: StationPoses, evaluations: int
+) -> StationPoses:
+    """Move and turn stations as long as positions in the solved scene become more accurate.
+
+    At most about ``evaluations`` placements are compared.
+    """
     cost = function(poses)
     for length_m, angle_rad in REFINEMENT_STEPS:
         improves = True
         while improves:
             improves = False
             for k in range(len(poses)):
-                if remaining <= 0:
+                if evaluations <= 0:
                     return poses
-                moves = _moves(problem.room, poses.take([k]), length_m, angle_rad)
+                moves = _moves(room, poses.take([k]), length_m, angle_rad)
                 options = [_replaced(poses, k, moves.take([i])) for i in range(len(moves))]
                 options = [each for each in options if is_separated(each.position_m)]
-                remaining -= len(options)
+                evaluations -= len(options)
                 costs = [function(each) for each in options]
                 if costs and min(costs) < cost * (1 - 1e-3):
                     cost = min(costs)

@@ -311,7 +311,8 @@ def assumed_room(scene: Scene) -> Room:
     if top <= 0:
         raise InputError("all stations are below the floor", hint="Check the frame of the scene")
     z = (max(scene.floor_z, 0.0),) * 2 if scene.planar else (0.0, 0.5 * top)
-    return Room(rectangle(*size, (float(low[0]), float(low[1]))), top + MOUNT_DEPTH_M, z)
+    outline = rectangle(float(size[0]), float(size[1]), (float(low[0]), float(low[1])))
+    return Room(outline, top + MOUNT_DEPTH_M, z)
 
 
 def _stacked(scene: Scene) -> tuple[Array, Array]:

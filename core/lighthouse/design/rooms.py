@@ -9,6 +9,7 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.design.placement import (
+    SOLVED_EVALUATIONS,
     PlacementProblem,
     RoomRequest,
     SolvedCost,
@@ -27,8 +28,9 @@ from locatk.core.lighthouse.design.report import (
 from locatk.core.lighthouse.room import Room
 from locatk.core.lighthouse.scene import Scene
 
-SEARCH_GAIN = 1.5
-"""Ratio by which the whole search improves a grown placement at most, from experience."""
+SEARCH_EFFORTS = ((2.0, SOLVED_EVALUATIONS // 8), (1.3, SOLVED_EVALUATIONS))
+"""Efforts of searches for the smallest number of stations: ratios of the standard deviation before
+to the wanted one up to which it is tried, and numbers of comparisons."""
 
 FRAME = "room"
 """Name of the frame of designed scenes."""
@@ -182,16 +184,20 @@ def _smallest_design(problem: PlacementProblem) -> RoomDesign:
     best: RoomDesign | None = None
     best_count, best_sigma_m = 0, np.inf
     for poses in grow_placements(problem):
+        count = len(poses)
         sigma_m = percentile(function.sigmas(poses.position_m, poses.rotation))
         if not sigma_m >= best_sigma_m or np.isinf(best_sigma_m):
-            best_count, best_sigma_m = len(poses), sigma_m
-        if len(poses) < problem.min_seen or sigma_m > SEARCH_GAIN * accuracy_m:
-            continue
-        design = _design(room, request, place_stations(problem, len(poses)))
-        if best is None or _rank(design) < _rank(best):
-            best = design
-        if design.is_reached:
-            return design
+            best_count, best_sigma_m = count, sigma_m
+        # The search improves what was grown; with little effort first.
+        for gain, evaluations in SEARCH_EFFORTS:
+            if count < problem.min_seen or sigma_m > gain * accuracy_m:
+                break
+            design = _design(room, request, place_stations(problem, count, evaluations))
+            if best is None or _rank(design) < _rank(best):
+                best = design
+            if design.is_reached:
+                return design
+            sigma_m = design.report.p95_sigma_m
     if best is None:
         best = _design(room, request, place_stations(problem, best_count))
     return best
