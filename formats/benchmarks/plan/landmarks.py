@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from locatk.core.geometry import heading_from_quaternion
 from locatk.core.landmarks.design.generation import DesignOptions, design_map
-from locatk.core.landmarks.design.routes import RouteCheck, check_routes
+from locatk.core.landmarks.design.routes import RouteCheck, check_routes, find_visits
 from locatk.core.landmarks.design.visit_accuracy import VisitErrors
-from locatk.core.landmarks.landmark import Geometry
+from locatk.core.landmarks.landmark import CODE_COUNT, Geometry
 from locatk.core.landmarks.map.floor import FloorMap
 from locatk.core.landmarks.simulation.options import Aims, Errors, SimulationOptions
 from locatk.core.landmarks.simulation.robot import RobotLimits
@@ -49,6 +49,12 @@ FIRST_SEED = 25_000
 MEDIAN_RATIO, TAIL_RATIO = 1.25, 2.0
 """Goals: largest ratio of predicted and reached standard deviation, or its inverse, in the median
 and for 90 % of the tasks."""
+
+GRAZING_DRIVES, GRAZING_OFFSETS_M = 36, (0.06, 0.07, 0.08)
+"""Drives past four landmarks each, and their distances from the centres [m]."""
+
+GRAZING_NOISE_T, GRAZING_PITCH_M = 3e-4, 0.35
+"""Noise of a reading, and distance between these landmarks."""
 
 KINDS = (
     "position at landmarks, `locatk solve`",
@@ -195,7 +201,7 @@ def figures(data: Path) -> list[Figure]:
     measured = []
     for kind, ratio in zip(KINDS, ratios.T, strict=True):
         measured += _ratio_figures(f"landmarks: predicted over reached, {kind}", ratio, how)
-    return [*measured, *_coverage_figures(results, tasks)]
+    return [*measured, *_coverage_figures(results, tasks), misread_figure()]
 
 
 def _ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
@@ -238,6 +244,42 @@ def _coverage_figures(results: list[TaskErrors], tasks: list[PlanningTask]) -> I
     agree = _mean(np.isfinite(first[:, 0]) == np.isfinite(first[:, 1]))
     how = "tasks in which prediction and `locatk live` agree on whether the robot is localised"
     yield Figure("landmarks: localisable or not, right", 100 * agree, "%", how)
+
+
+def misread_figure(drives: int = GRAZING_DRIVES) -> Figure:
+    """Compare predicted and reached misreadings of landmarks that are only grazed."""
+    rng = np.random.default_rng(FIRST_SEED)
+    errors = Errors(noise_t=GRAZING_NOISE_T)
+    predicted, is_wrong = [], []
+    for number in range(drives):
+        codes = rng.integers(0, CODE_COUNT, (1, 4))
+        offset_m = GRAZING_OFFSETS_M[number % len(GRAZING_OFFSETS_M)]
+        floor = FloorMap(codes, pitch_m=GRAZING_PITCH_M)
+        ends = np.array([[-0.3, offset_m], [3 * GRAZING_PITCH_M + 0.3, offset_m]])
+        task = PlanningTask(floor, Route(ends), errors, OdometryNoise(), 0.1)
+        session = task.simulate(FIRST_SEED + number)
+        found = find_visits(floor, task.route, errors=VisitErrors(noise_t=GRAZING_NOISE_T))
+        probability = {
+            visit.cell[1]: visit.accuracy.misread_probability
+            for visit in found
+            if visit.accuracy.is_usable
+        }
+        truth = session.truth[0]
+        for one in solve(session.samples, None, odometry=session.odometry).detections:
+            x_m = np.interp(one.time_s * 1e9, truth.time_ns, truth.position[:, 0])
+            column = round(float(x_m) / GRAZING_PITCH_M)
+            if one.code is not None and column in probability:
+                predicted.append(probability[column])
+                # Without a map, the frame of a code is that of the robot, which drives along x.
+                is_wrong.append(one.code != codes[0, column])
+    return Figure(
+        "landmarks: misread codes of grazed landmarks",
+        100 * float(np.mean(is_wrong)),
+        "%",
+        f"{len(is_wrong)} simulated passes at 60, 70 and 80 mm, noise 0.3 mT, solved without a map",
+        peer="prediction",
+        peer_value=100 * float(np.mean(predicted)),
+    )
 
 
 def _mean(values: NDArray[np.bool_]) -> float:
