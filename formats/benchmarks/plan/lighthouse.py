@@ -31,8 +31,11 @@ from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
 from locatk.core.lighthouse.design import RoomRequest, design_room
 from locatk.core.lighthouse.design.accuracy import PositionAccuracy
 from locatk.core.lighthouse.design.placement import seen_stations
+from locatk.core.lighthouse.design.report import report_room
 from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
 from locatk.core.lighthouse.devices.alignment import MARKER_SIGMA_M
+from locatk.core.lighthouse.epochs import group_epochs
+from locatk.core.lighthouse.localization.photodiodes import track_photodiodes
 from locatk.core.lighthouse.motion.frames import common_motions
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.recording import Sweeps
@@ -50,6 +53,7 @@ from locatk.core.lighthouse.scene.standstills import find_standstills
 from locatk.core.lighthouse.simulation import SimulatedSession, SimulationOptions, simulate
 from locatk.core.lighthouse.solver import SolveOptions, solve
 from locatk.core.solution import Solution
+from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
 from locatk.formats.benchmarks.lighthouse import suite
 
@@ -70,6 +74,9 @@ robots still creep."""
 
 ROBOTS, DURATION_S, SPEED_MPS = 10, 40.0, 0.3
 """Robots with one photodiode that report ten times a second, and drive through the whole room."""
+
+MOUNTED_S = 4.0
+"""Duration of sessions in which nothing is solved [s]."""
 
 MAX_PREDICTED_PLACES = 1000
 """Largest number of the driven places at which a prediction is computed."""
@@ -118,6 +125,7 @@ def figures(data: Path) -> list[Figure]:
     rows: list[Figure] = []
     for name, measure in (
         ("20 random rooms", _random_rooms),
+        ("rooms as mounted", _mounted_rooms),
         ("designed rooms", _designed_rooms),
         ("published grid", partial(grid_figures, folder)),
         ("published floor, two stations", partial(_floor_of_two, folder)),
@@ -138,13 +146,41 @@ def _random_rooms() -> list[Figure]:
     ]
     ratio = np.array([each.ratio for each in compared if each.sessions])
     solved = sum(each.sessions for each in compared)
-    low, median, high = np.percentile(ratio, [5, 50, 95])
     how = (
         "rooms of 3 to 8 m, 2 to 6 stations on random places of the walls, on a plane or in space; "
         f"{solved} of {TASKS * SESSIONS} sessions solved, each with other stations, after a "
         "similarity"
     )
-    name = f"{NAME}, {TASKS} random rooms"
+    return _ratio_figures(f"{TASKS} random rooms", ratio, how)
+
+
+def _mounted_rooms() -> list[Figure]:
+    """Compare predictions for stations as they are mounted by hand, before anything is solved."""
+    ratio = []
+    for number in range(TASKS):
+        scene = draw_room(number)
+        assert scene.room is not None
+        predicted, reached = [], []
+        for seed in range(SESSIONS):
+            session = _simulate(scene, FIRST_SEED + 5_000 + 100 * number + seed, MOUNTED_S)
+            tracks = track_photodiodes(group_epochs(session.sweeps), scene)
+            estimate, truth = _positions(tracks.trajectories, session)
+            report = report_room(scene, scene.room, REQUEST, given_errors=True, points_m=truth)
+            predicted.append(np.mean(report.sigma_m[np.isfinite(report.sigma_m)] ** 2))
+            offset = (estimate - truth)[:, : 2 if scene.planar else 3]
+            reached.append(np.mean(np.sum(offset**2, axis=1)))
+        ratio.append(np.sqrt(np.mean(predicted) / np.mean(reached)))
+    how = (
+        "the same rooms with the designed poses, beside which the stations are mounted; rms of "
+        f"{SESSIONS} mountings, in the frame of the room"
+    )
+    return _ratio_figures(f"{TASKS} rooms as mounted", np.array(ratio), how)
+
+
+def _ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
+    """Return the median and the tails of ratios."""
+    low, median, high = np.percentile(ratio, [5, 50, 95])
+    name = f"{NAME}, {name}"
     return [
         Figure(f"{name}: median", float(median), "", f"{how}; goal 0.8 to 1.25"),
         Figure(
@@ -430,16 +466,7 @@ def compare_sessions(scene: Scene, sessions: Sequence[int], first_seed: int) -> 
     """Predict the accuracy in a room, and reach it in simulated sessions."""
     predicted, reached, refused = [], [], []
     for number in sessions:
-        session = simulate(
-            SimulationOptions(
-                robots=ROBOTS,
-                duration_s=DURATION_S,
-                speed_mps=SPEED_MPS,
-                noise_rad=ANGLE_SIGMA_RAD,
-                room=scene,
-                seed=first_seed + number,
-            )
-        )
+        session = _simulate(scene, first_seed + number, DURATION_S)
         try:
             solution = solve(session.sweeps, session.scene)
         except LocatkError as error:
@@ -448,7 +475,7 @@ def compare_sessions(scene: Scene, sessions: Sequence[int], first_seed: int) -> 
         if solution.artifact.frame_source == "design":
             refused.append("the designed poses were used")
             continue
-        estimate, truth = _positions(solution, session)
+        estimate, truth = _positions(solution.trajectories, session)
         dims = 2 if scene.planar else 3
         to = umeyama(estimate[:, :dims], truth[:, :dims])
         offset = to.apply(estimate[:, :dims]) - truth[:, :dims]
@@ -487,11 +514,24 @@ def _stacked(scene: Scene) -> tuple[Array, Array]:
     return position, rotation
 
 
-def _positions(solution: Solution, session: SimulatedSession) -> tuple[Array, Array]:
+def _simulate(scene: Scene, seed: int, duration_s: float) -> SimulatedSession:
+    return simulate(
+        SimulationOptions(
+            robots=ROBOTS,
+            duration_s=duration_s,
+            speed_mps=SPEED_MPS,
+            noise_rad=ANGLE_SIGMA_RAD,
+            room=scene,
+            seed=seed,
+        )
+    )
+
+
+def _positions(tracks: Sequence[Trajectory], session: SimulatedSession) -> tuple[Array, Array]:
     """Return the estimated and the true positions (n, 3) at the times of all poses."""
     truth = {track.device: track for track in session.truth}
     estimates, trues = [], []
-    for track in solution.trajectories:
+    for track in tracks:
         true = truth[track.device]
         axes = [np.interp(track.time_ns, true.time_ns, axis) for axis in true.position.T]
         estimates.append(track.position)
