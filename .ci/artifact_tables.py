@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from locatk.formats.artifacts import registry
-from locatk.formats.artifacts.kinds import NO_UNIT, Boolean
 from locatk.formats.artifacts.cameras import CAMERAS
+from locatk.formats.artifacts.kinds import NO_UNIT, Boolean
 from locatk.formats.artifacts.ledger import LEDGER
 from locatk.formats.artifacts.prices import PRICES
 from locatk.formats.artifacts.schema import HEADER, REQUIRED, Artifact, Key, Table, Tables, Variant

@@ -264,7 +264,8 @@ def _around(routes: Sequence[Route], margin_m: float) -> NDArray[np.float64]:
     """Return the rectangle (4, 2) around routes and the robots on them."""
     waypoints = np.concatenate([route.waypoint_m for route in routes])
     low, high = waypoints.min(axis=0) - margin_m, waypoints.max(axis=0) + margin_m
-    return rectangle(*(high - low).tolist(), (float(low[0]), float(low[1])))
+    length_m, width_m = (high - low).tolist()
+    return rectangle(length_m, width_m, (float(low[0]), float(low[1])))
 
 
 def _read_route(path: Path) -> Route:

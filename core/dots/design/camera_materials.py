@@ -11,7 +11,7 @@ PAPER_PRICES = {
     "image sensor": Price(12.86, "EUR", "2016", "Hostettler et al., ICRA 2016, Table II"),
     "infrared LED": Price(0.46, "EUR", "2016", "Hostettler et al., ICRA 2016, Table II"),
     "LED switch": Price(0.06, "EUR", "2016", "Hostettler et al., ICRA 2016, Table II"),
-    "resistor": Price(0.29 / 3, "EUR", "2016", "Hostettler et al., ICRA 2016, Table II"),
+    "resistor": Price(0.29, "EUR", "2016", "Hostettler et al., ICRA 2016, Table II"),
 }
 """Prices of the paper's parts: a lens of 5.5 mm, the MT9V034, three VSMY3850."""
 
