@@ -105,8 +105,9 @@ def command(
 
     ROOM is length x width x height in metres, a scene with a table [room] (.toml), or a floor plan
     (.dxf, .svg). Places without enough stations are avoided first, then the standard deviation of
-    positions is minimised. It contains the noise of the angles and the errors of the calibration
-    after the scene was solved from a recording (`locatk calibrate scene`).
+    positions (sigma) is minimised. It contains the noise of the angles, and the errors that the
+    calibrations leave in a scene that is solved from a recording in the room. The frame of the
+    scene adds its own.
 
     OUTPUT is the --artifact of `locatk simulate lighthouse`, `locatk solve` and `locatk live`. If a
     wish cannot be fulfilled, the best room is written with a warning, and the exit status is 3.

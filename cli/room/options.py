@@ -86,7 +86,7 @@ room_options = combine(
         ),
         click.option(
             "--floor",
-            type=click.FloatRange(0, MAX_LENGTH_MM),
+            type=click.FloatRange(0),
             metavar="MM",
             help="All photodiodes move at this height; the default is 0, or that of ROOM.",
         ),

@@ -233,9 +233,8 @@ def report_room(
     distance = np.linalg.norm(points[None] - position[:, None], axis=-1)
     is_near = is_seen & (distance <= MEASURED_RANGE_M)
     is_far = (count >= min_seen) & (is_near.sum(axis=0) < min_seen)
-    return replace(
-        report, warnings=tuple(_warnings(report)), notes=tuple(_notes(float(is_far.mean())))
-    )
+    notes = _notes(len(position), float(is_far.mean()))
+    return replace(report, warnings=tuple(_warnings(report)), notes=tuple(notes))
 
 
 def deck_heading_sigma(scene: Scene, report: RoomReport, room: Room, request: RoomRequest) -> float:
@@ -419,14 +418,20 @@ def _warnings(report: RoomReport) -> list[str]:
     return messages
 
 
-def _notes(far_fraction: float) -> list[str]:
-    if far_fraction <= NEGLIGIBLE_FRACTION:
-        return []
-    return [
-        f"{_percent(far_fraction)} of the working volume needs stations more than "
-        f"{MEASURED_RANGE_M:g} m away. HTC states a range of {MAX_RANGE_M:g} m, but reception was "
-        f"published up to {MEASURED_RANGE_M:g} m only: try it before you drill"
-    ]
+def _notes(stations: int, far_fraction: float) -> list[str]:
+    notes = []
+    if stations == 1:
+        notes.append(
+            "the scene of a single station is solved from four or more markers, on which a robot "
+            "stops (`locatk calibrate scene`)"
+        )
+    if far_fraction > NEGLIGIBLE_FRACTION:
+        notes.append(
+            f"{_percent(far_fraction)} of the working volume needs stations more than "
+            f"{MEASURED_RANGE_M:g} m away. HTC states a range of {MAX_RANGE_M:g} m, but reception "
+            f"was published up to {MEASURED_RANGE_M:g} m only: try it before you drill"
+        )
+    return notes
 
 
 def _percent(fraction: float) -> str:

@@ -60,7 +60,7 @@ def _short_search() -> Iterator[None]:
         patch.setattr(placement, "SEARCH_POINTS", 150)
         patch.setattr(placement, "REFINEMENT_POINTS", 500)
         patch.setattr(placement, "SEARCH_BUDGET", 2_000_000)
-        patch.setattr(placement, "SOLVED_EVALUATIONS", 300)
+        patch.setattr(placement, "MAX_PART", 20)
         yield
 
 
@@ -294,7 +294,8 @@ def test_places_beyond_published_recordings_are_noted() -> None:
     station = station_of(1, np.array([4.0, 4.0, 5.9]), view_rotation(0.0, -np.pi / 2))
     report = report_room(Scene((station,), scale="design", frame_source="design"), hall)
     assert any("5 m" in text for text in report.notes)
-    assert not report_room(facing_down((2.5, 2.0)), FLOOR).notes
+    assert not report_room(facing_down((1.5, 2.0), (3.5, 2.0)), FLOOR).notes
+    assert "markers" in report_room(facing_down((2.5, 2.0)), FLOOR).notes[0]
 
 
 def test_calibration_errors_are_those_of_real_units() -> None:
