@@ -147,12 +147,14 @@ def solve(
     """
     scene = scene or Scene()
     options = options or SolveOptions()
-    if not is_design(scene) or options.method != "bundle":
+    if not is_design(scene):
         return _solve(sweeps, scene, options, odometry, receivers, imu)
     try:
         solution = _solve(sweeps, design_prior(scene), options, odometry, receivers, imu)
         return place_in_design(solution, scene)
     except DegenerateError as error:
+        if options.method == "paper":
+            raise
         given = with_mounting_tolerance(scene)
         solution = _solve(sweeps, given, options, odometry, receivers, imu)
         warning = designed_poses_warning(error)

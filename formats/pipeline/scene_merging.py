@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from locatk.core.lighthouse.scene import Marker, Scene
+from locatk.core.lighthouse.scene.designed_frame import is_design
 from locatk.core.solution import SolverWarning
 
 MAX_MARKER_DIFFERENCE_M = 1e-3
@@ -30,9 +31,14 @@ def merge_scenes(given: Scene, own: Scene | None) -> tuple[Scene, list[SolverWar
     - Distances are those of the artifact, or else of the session.
     - Without stations and markers in the artifact, ``frame``, ``planar`` and ``floor_z`` are those
       of the session.
+    - Designed stations of the session remain if the artifact has none: they are a prior.
     """
     if own is None:
         return given, []
+    if is_design(own) and not given.stations:
+        design = replace(own, calibrations=given.calibrations, ids=given.ids, ups=given.ups)
+        design = replace(design, markers=given.markers, distances=given.distances)
+        return merge_scenes(design, replace(own, stations=()))
     markers, conflicts = _merge_markers(given, own)
     merged = replace(
         given,
@@ -52,10 +58,11 @@ def knowledge_of_stations(scene: Scene) -> Scene:
     """Return a scene whose stations have yet to be estimated, with what is known of them.
 
     Their factory calibrations, serial numbers and directions of gravity are kept. Estimated
-    calibrations are not: they fit the poses that they were estimated with.
+    calibrations are not: they fit the poses that they were estimated with. A design is returned as
+    it is: its stations are estimated anyway.
     """
     stations = scene.stations
-    if not stations:
+    if not stations or is_design(scene):
         return scene
     factory = {s.channel: s.calibration for s in stations if s.calibration.source == "factory"}
     ids = {s.channel: s.id for s in stations if s.id is not None}

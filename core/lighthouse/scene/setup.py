@@ -263,6 +263,7 @@ def place_on_floor(
         scene.transformed(frame.to_floor),
         frame="floor",
         frame_source="floor",
+        room=None,
         scale="distance" if setup.x_distance_m is not None else scene.scale,
         level_sigma_rad=frame.level_sigma_rad,
     )

@@ -272,6 +272,17 @@ def test_markers_count_more_than_the_design() -> None:
     assert "channel 3" in warning.message
 
 
+def test_the_published_method_is_placed_in_the_design_as_well() -> None:
+    rng = np.random.default_rng(3)
+    truth = rooms.room(rng, 2)
+    sweeps, stays = recording(rng, truth)
+    solution = solve(sweeps, design_of(truth, rng), SolveOptions(method="paper", scene="two-3d"))
+    (track,) = solution.trajectories
+    true = rooms.path(stays, (track.time_ns - rooms.START_NS) * 1e-9)
+    assert np.linalg.norm((track.position - true).mean(axis=0)) < 0.1
+    assert solution.artifact.frame == "room"
+
+
 def test_one_station_is_used_where_it_was_designed() -> None:
     offsets, sigmas = [], []
     for seed in range(12):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from locatk.core.lighthouse.calibration import Calibration
@@ -94,3 +96,16 @@ def test_a_scene_that_is_calibrated_anew_keeps_what_stations_sent() -> None:
 def test_a_session_without_scene() -> None:
     given = Scene(ids={1: 7})
     assert merge_scenes(given, None) == (given, [])
+
+
+def test_a_design_stays_a_prior_of_its_session() -> None:
+    stations = (Station(1, np.zeros(3), np.eye(3), FACTORY),)
+    design = Scene(stations, planar=True, floor_z=0.1, frame="room", frame_source="design")
+    assert knowledge_of_stations(design) is design
+    known = marker("a", 1.0)
+    merged, conflicts = merge_scenes(Scene(markers=(known,), ids={1: 7}), design)
+    assert conflicts == []
+    assert (merged.stations, merged.frame, merged.frame_source) == (stations, "room", "design")
+    assert (merged.markers, merged.ids) == ((known,), {1: 7})
+    solved = replace(design, frame_source="floor", frame="other")
+    assert merge_scenes(solved, design)[0].frame == "other"
