@@ -226,7 +226,8 @@ class RoomLight:
     ----------
     room : Room
     paths : sequence of RobotPath
-        Of all robots. They hide each other if the room states their size.
+        Of all robots. They hide each other if the room states their size. Paths cross: a robot that
+        would touch the one in question is ignored.
     """
 
     def __init__(self, room: Room, paths: Sequence[RobotPath]) -> None:
@@ -248,11 +249,13 @@ class RoomLight:
                     station, points, obstacle.outline_m, obstacle.low_m, obstacle.high_m
                 )
             if room.robots is not None:
+                size, time_s = room.robots, time_s.ravel()
+                own = self._paths[robot].position(time_s)[:, :2]
                 for other, path in enumerate(self._paths):
                     if other != robot:
-                        axis = path.position(time_s.ravel())[:, :2]
-                        size = room.robots
-                        result |= _crosses_cylinder(
+                        axis = path.position(time_s)[:, :2]
+                        is_apart = np.linalg.norm(axis - own, axis=1) > 2 * size.radius_m
+                        result |= is_apart & _crosses_cylinder(
                             station, points, axis, size.radius_m, size.height_m
                         )
             return np.asarray(result.reshape(shape))

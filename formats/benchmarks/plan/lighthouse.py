@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -75,6 +75,12 @@ robots still creep."""
 ROBOTS, DURATION_S, SPEED_MPS = 10, 40.0, 0.3
 """Robots with one photodiode that report ten times a second, and drive through the whole room."""
 
+CROWDS = ((4.0, 4.0, 2, 15), (6.0, 5.0, 3, 30), (5.0, 5.0, 4, 10))
+"""Length and width [m], stations and robots of rooms in which robots hide each other."""
+
+REPORT_HZ = 10.0
+"""Reports of a robot per second, as a DotBot."""
+
 MOUNTED_S = 4.0
 """Duration of sessions in which nothing is solved [s]."""
 
@@ -127,6 +133,7 @@ def figures(data: Path) -> list[Figure]:
         ("20 random rooms", _random_rooms),
         ("rooms as mounted", _mounted_rooms),
         ("designed rooms", _designed_rooms),
+        ("rooms with many robots", _crowded_rooms),
         ("published grid", partial(grid_figures, folder)),
         ("published floor, two stations", partial(_floor_of_two, folder)),
         ("published floor, one station", partial(_floor_of_one, folder)),
@@ -304,6 +311,41 @@ def _designed_rooms() -> list[Figure]:
             )
         )  # fmt: skip
     return rows
+
+
+def _crowded_rooms() -> list[Figure]:
+    """Compare the predicted fractions of time in which enough stations are seen among robots."""
+    differences, parts = [], []
+    for length_m, width_m, stations, robots in CROWDS:
+        room = Room(
+            rectangle(length_m, width_m), 2.6, (0.1, 0.1), robots=RobotSize(robots, 0.12, 0.3)
+        )
+        rng = np.random.default_rng(FIRST_SEED + 20_000 + robots)
+        scene = Scene(
+            _random_stations(rng, room, stations),
+            planar=True, floor_z=0.1, scale="design", frame_source="design", room=room,
+        )  # fmt: skip
+        session = simulate(
+            SimulationOptions(robots=robots, duration_s=DURATION_S, room=scene, seed=FIRST_SEED)
+        )
+        received = np.isfinite(group_epochs(session.sweeps).counts).all(axis=2).sum(axis=1)
+        reports = robots * DURATION_S * REPORT_HZ
+        places = np.concatenate([track.position[::100] for track in session.truth])
+        for seen in (1, 2):
+            request = replace(REQUEST, min_seen=seen)
+            report = report_room(scene, room, request, points_m=places)
+            predicted = float(report.availability.mean())
+            reached = np.count_nonzero(received >= seen) / reports
+            differences.append(100 * abs(predicted - reached))
+            parts.append(f"{100 * predicted:.1f} and {100 * reached:.1f} %")
+    return [
+        Figure(
+            "lighthouse: time in view of stations among robots, largest difference",
+            float(max(differences)), "%",
+            f"predicted and simulated time with one station or more, and two or more, in "
+            f"{len(CROWDS)} rooms: {', '.join(parts)}",
+        )
+    ]  # fmt: skip
 
 
 # ---- published recordings
