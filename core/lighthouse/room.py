@@ -213,7 +213,7 @@ def checked_outline(outline: ArrayLike) -> Array:
 
 
 def _crosses_itself(corners: Array) -> bool:
-    """Return True if two edges that are no neighbours meet, or if neighbours overlap."""
+    """Return True if two edges that are no neighbours meet."""
     n = len(corners)
     start, end = corners, np.roll(corners, -1, axis=0)
 
@@ -235,10 +235,5 @@ def _crosses_itself(corners: Array) -> bool:
     is_apart |= np.any((low_1 > high_2) | (low_2 > high_1), axis=-1)
     distance = (np.arange(n)[None] - np.arange(n)[:, None]) % n
     is_neighbour = (distance <= 1) | (distance == n - 1)
-    if np.any(~is_apart & ~is_neighbour):
-        return True
-    # A neighbour that folds back onto its edge.
-    along, following = end - start, np.roll(end - start, -1, axis=0)
-    cross = along[:, 0] * following[:, 1] - along[:, 1] * following[:, 0]
-    is_back = (np.abs(cross) <= tolerance) & (np.sum(along * following, axis=1) < 0)
-    return bool(np.any(is_back))
+    # A neighbour that folds back onto its edge ends on it, where the edge after it begins.
+    return bool(np.any(~is_apart & ~is_neighbour))

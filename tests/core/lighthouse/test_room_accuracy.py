@@ -117,19 +117,21 @@ def test_places_that_a_plane_does_not_meet_have_no_gradient() -> None:
 def test_errors_of_stations_are_those_of_displaced_stations() -> None:
     """Displace stations, triangulate with the designed ones, and compare in first order."""
     point = np.array([2.1, 1.7, 0.4])
-    covariance = np.diag([0.02**2] * 3 + [0.01**2] * 3)
+    scale = np.array([0.02] * 3 + [0.01] * 3)
+    root = scale[:, None] * np.random.default_rng(6).normal(size=(6, 6))
+    covariance = root @ root.T
     expected = np.zeros((3, 3))
     gradient = angle_gradients(STATIONS, ROTATIONS, point[None])[:, 0].reshape(6, 3)
     for s in range(3):
-        for k, sigma in enumerate(np.sqrt(np.diag(covariance))):
-            step = np.zeros(6)
-            step[k] = 1e-6
+        for k in range(6):
+            step = 1e-6 * root[:, k] / np.linalg.norm(root[:, k])
             moved = rotor_angles(
                 STATIONS[s] + step[:3], rotation_exp(step[3:]) @ ROTATIONS[s], point
             )
             change = np.zeros(6)
             change[2 * s : 2 * s + 2] = moved - rotor_angles(STATIONS[s], ROTATIONS[s], point)
-            shift = np.linalg.lstsq(gradient, change, rcond=None)[0] / 1e-6 * sigma
+            shift = np.linalg.lstsq(gradient, change, rcond=None)[0] / 1e-6
+            shift *= np.linalg.norm(root[:, k])
             expected += np.outer(shift, shift)
     seen = np.ones((3, 1), bool)
     predicted = predict_positions(
@@ -163,7 +165,8 @@ def test_traces_of_inverses_are_those_of_numpy() -> None:
         matrix = root @ root.transpose(0, 2, 1)
         expected = np.trace(np.linalg.inv(matrix), axis1=1, axis2=2)
         assert variance_of(matrix) == pytest.approx(expected, rel=1e-9)
-        assert np.isinf(variance_of(np.ones((1, dims, dims)))).all()
+        row = rng.normal(size=(200, dims))
+        assert np.isinf(variance_of(row[:, :, None] * row[:, None])).all()
 
 
 def test_information_is_additive_and_weighted() -> None:

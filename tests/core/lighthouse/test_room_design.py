@@ -100,6 +100,18 @@ def test_stations_that_are_alike_are_not_put_into_one_place() -> None:
     assert not is_separated(poses.position_m[[0, 0]] + [[0, 0, 0], [0, 0, 0.9 * MIN_SEPARATION_M]])
 
 
+def test_places_in_line_with_all_stations_are_not_covered() -> None:
+    """From 6 m, two stations that are 35 cm apart give directions, but hardly positions."""
+    room = Room(rectangle(7.0, 2.0), 2.8, (0.0, 1.0))
+    problem = PlacementProblem(room, RoomRequest(2), working_points(room, 200))
+    yaw, tilt = np.zeros(2), np.full(2, -0.4)
+    near = np.array([[0.1, 0.8, 2.7], [0.1, 1.15, 2.7]])
+    rotation = view_rotation(yaw, tilt)
+    views = problem.views_of(near, rotation)
+    seen = (views.is_seen.sum(axis=0) < 2).mean()
+    assert problem.cost(views) > 1e3 * (seen / 2 + 0.03)
+
+
 def test_a_design_fulfils_its_promises(design: RoomDesign) -> None:
     scene, report = design.scene, design.report
     assert [station.channel for station in scene.stations] == [1, 2, 3]
@@ -226,6 +238,20 @@ def test_best_addition_covers_what_is_hidden() -> None:
     all_channels = replace(scene, stations=tuple(replace(scene.stations[0], channel=c)
                                                  for c in range(1, 17)))  # fmt: skip
     assert best_addition(all_channels, L_ROOM, RoomRequest()) is None
+
+
+def test_an_addition_that_makes_a_room_worse_is_not_named() -> None:
+    """A station over a floor is solved by markers; two stations solve each other, less well."""
+    scene = replace(facing_down((2.5, 2.0)), room=FLOOR)
+    before, addition = check_room(scene), best_addition(scene, FLOOR, RoomRequest())
+    assert before.covered_fraction > 0.99
+    assert addition is None or addition.report.p95_sigma_m < 1.05 * before.p95_sigma_m
+
+
+def test_places_need_as_many_stations_as_are_wanted() -> None:
+    scene = facing_down((2.5, 2.0))
+    assert check_room(scene, FLOOR, RoomRequest(min_seen=2)).covered_fraction == 0.0
+    assert check_room(scene, FLOOR, RoomRequest(min_seen=1)).covered_fraction > 0.99
 
 
 def test_a_station_that_sees_nothing_is_reported() -> None:

@@ -174,5 +174,11 @@ def test_open_outlines_and_missing_layers_of_dxf(tmp_path: Path) -> None:
     assert "Close" in (caught.value.hint or "")
     with pytest.raises(FormatError, match="open"):
         read_dxf_room(dxf(tmp_path), "WALLS", "CABLES")
+    document = ezdxf.readfile(dxf(tmp_path))
+    document.modelspace().add_lwpolyline([(0, 0), (9000, 0)], dxfattribs={"layer": "WALLS"})
+    document.saveas(path)
+    assert len(read_dxf_room(path).outline_m) == 4  # of all layers, the largest closed one
+    with pytest.raises(FormatError, match="open"):
+        read_dxf_room(path, "WALLS")
     with pytest.raises(FormatError, match="nothing is on layer"):
         read_dxf_room(path, "ROOMS")
