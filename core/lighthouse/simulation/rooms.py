@@ -80,13 +80,16 @@ def mounted_stations(rng: np.random.Generator, scene: Scene) -> list[Station]:
 class RoomPath:
     """Path of a robot in straight legs between random points of a room, with rests in between.
 
-    See :class:`~locatk.core.lighthouse.simulation.paths.RobotPath`.
+    See :class:`~locatk.core.lighthouse.simulation.paths.RobotPath`. It begins with a tour of the
+    markers.
 
     Parameters
     ----------
     rng : Generator
     room : Room
     duration_s, top_speed_mps : float
+    markers : (k, 3) ndarray
+        Positions of the markers in metres; k may be 0.
 
     Raises
     ------
@@ -95,20 +98,25 @@ class RoomPath:
     """
 
     def __init__(
-        self, rng: np.random.Generator, room: Room, duration_s: float, top_speed_mps: float
+        self,
+        rng: np.random.Generator,
+        room: Room,
+        duration_s: float,
+        top_speed_mps: float,
+        markers: Array,
     ) -> None:
         floor = _FreeFloor(room)
         points = [floor.draw(rng)]
+        self.tour = MarkerTour(duration_s, markers, points[0])
         leg_s: list[float] = []
         rest_s: list[float] = []
-        while sum(leg_s) + sum(rest_s) < duration_s:
+        while self.tour.end_s + sum(leg_s) + sum(rest_s) < duration_s:
             points.append(floor.draw(rng, points[-1]))
             length_m = float(np.linalg.norm(points[-1] - points[-2]))
             leg_s.append(max(MIN_LEG_S, StopAndGo.PEAK_SPEED_RATIO * length_m / top_speed_mps))
             rest_s.append(float(rng.uniform(*REST_DURATION_S)))
         self.points = np.stack(points)
-        self.tour = MarkerTour(duration_s, np.zeros((0, 3)), self.points[0])
-        ends_s = np.cumsum(np.array(leg_s) + np.array(rest_s))
+        ends_s = self.tour.end_s + np.cumsum(np.array(leg_s) + np.array(rest_s))
         legs, rests = np.array(leg_s), np.array(rest_s)
         self._drive = StopAndGo(ends_s - legs - rests, legs, np.ones(len(legs)))
         along = np.diff(self.points, axis=0)
@@ -121,7 +129,9 @@ class RoomPath:
         """Return positions (..., 3) in metres at times (...)."""
         leg = self._drive(np.asarray(time_s))
         number = np.arange(len(self.points))
-        return np.stack([np.interp(leg, number, self.points[:, i]) for i in range(3)], axis=-1)
+        position = np.stack([np.interp(leg, number, self.points[:, i]) for i in range(3)], axis=-1)
+        self.tour.place(position, np.asarray(time_s))
+        return position
 
     def heading(self, time_s: Array) -> Array:
         """Return headings (...) in radians."""

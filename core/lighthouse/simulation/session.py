@@ -133,7 +133,7 @@ class SimulationOptions:
         Scene with stations and their room. If it is a design, the true stations are beside the
         designed poses, by their covariances. Robots drive within its working area and heights at
         ``speed_mps``; walls, obstacles and robots stop light. ``stations`` and ``planar`` are not
-        used, robots do not visit markers, and the scene of the session is this one.
+        used, robot 1 visits its markers, and the scene of the session is this one.
     seed : int
         At least 0.
 
@@ -260,7 +260,8 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
     stations = [_deviate(station, deviation_rng, options) for station in stations]
     if options.station_turn_rad:
         stations[-1] = _turn(stations[-1], options)
-    markers_m = FLOOR_MARKERS_M if options.planar else RAISED_MARKERS_M
+    markers = _markers(options)
+    markers_m = np.array([marker.position for marker in markers]).reshape(-1, 3)
     paths = [_make_path(path_rng, robot, markers_m, options) for robot in range(options.robots)]
     light = None if room is None else RoomLight(room, paths)
     links: list[OpticalLink] = []
@@ -292,14 +293,11 @@ def simulate(options: SimulationOptions | None = None) -> SimulatedSession:
     digits = len(str(options.robots))
     names = tuple(f"robot-{k + 1:0{digits}d}" for k in range(options.robots))
     sweeps, is_outlier = _to_sweeps(pairs, links, names, options.labelled)
+    visited = _with_visits(markers, names[0], paths[0].tour.visits_s)
     if options.room is None:
-        scene = Scene(
-            markers=_visited_markers(markers_m, names[0], paths[0].tour.visits_s),
-            planar=options.planar,
-            scale="markers",
-        )
+        scene = Scene(markers=visited, planar=options.planar, scale="markers")
     else:
-        scene = options.room
+        scene = replace(options.room, markers=visited)
     if options.factory_data:
         scene = replace(scene, calibrations=factory_data)
     return SimulatedSession(
@@ -393,13 +391,21 @@ def _unit_calibration(unit: Array) -> Calibration:
 # ---- robots
 
 
+def _markers(options: SimulationOptions) -> tuple[Marker, ...]:
+    """Return the markers of the room, or around the origin without a room."""
+    if options.room is not None:
+        return options.room.markers
+    positions = FLOOR_MARKERS_M if options.planar else RAISED_MARKERS_M
+    return tuple(Marker(f"marker-{k + 1}", position) for k, position in enumerate(positions))
+
+
 def _make_path(
     rng: np.random.Generator, robot: int, markers_m: Array, options: SimulationOptions
 ) -> RobotPath:
-    """Return the path of a robot; the first one visits the markers, but not in a room."""
-    if options.room is not None and options.room.room is not None:
-        return RoomPath(rng, options.room.room, options.duration_s, options.speed_mps)
+    """Return the path of a robot; the first one visits the markers."""
     visited_m = markers_m[: 0 if robot else None]
+    if options.room is not None and options.room.room is not None:
+        return RoomPath(rng, options.room.room, options.duration_s, options.speed_mps, visited_m)
     if options.flying:
         return FlownPath(rng, options.duration_s, visited_m, options.speed_mps)
     return DrivenPath(rng, options.planar, options.duration_s, visited_m)
@@ -453,12 +459,11 @@ def _to_sweeps(
     return sweeps, pairs.is_outlier[is_received][order]
 
 
-def _visited_markers(markers_m: Array, device: str, visits_s: Array) -> tuple[Marker, ...]:
+def _with_visits(markers: Sequence[Marker], device: str, visits_s: Array) -> tuple[Marker, ...]:
     """Return the first k markers; ``visits_s`` (k, 2) are starts and ends of their visits."""
-    visits_ns = stamps_ns(visits_s)
     return tuple(
-        Marker(f"marker-{k + 1}", position, (MarkerVisit(device, int(start), int(end)),))
-        for k, (position, (start, end)) in enumerate(zip(markers_m, visits_ns, strict=False))
+        replace(marker, visits=(MarkerVisit(device, int(start), int(end)),))
+        for marker, (start, end) in zip(markers, stamps_ns(visits_s), strict=False)
     )
 
 

@@ -10,12 +10,13 @@ import pytest
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
 from locatk.core.lighthouse.room import Obstacle, RobotSize, Room, rectangle
-from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.core.lighthouse.simulation.rooms import RoomLight, RoomPath, mounted_stations
 from locatk.core.lighthouse.solver import solve
 from tests.core.lighthouse.rooms import looking_at
 
+NO_MARKERS = np.zeros((0, 3))
 L_SHAPE = np.array([[0, 0], [5, 0], [5, 2.5], [2.5, 2.5], [2.5, 5], [0, 5.0]])
 TABLE = Obstacle(rectangle(0.8, 0.6, (1.0, 1.2)), 0.6, 0.7)
 PILLAR = Obstacle(np.array([[3.2, 0.8], [3.6, 0.8], [3.4, 1.3]]), 0.0, 2.6)
@@ -61,7 +62,7 @@ def inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def test_paths_keep_away_from_walls_and_obstacles() -> None:
     rng = np.random.default_rng(1)
-    path = RoomPath(rng, ROOM, 120.0, 0.4)
+    path = RoomPath(rng, ROOM, 120.0, 0.4, NO_MARKERS)
     time_s = np.arange(0, 120.0, 0.02)
     position = path.position(time_s)
     speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / 0.02
@@ -85,12 +86,12 @@ def test_paths_keep_away_from_walls_and_obstacles() -> None:
 def test_no_place_for_a_robot_is_an_error() -> None:
     full = replace(ROOM, robots=RobotSize(1, 2.4, 0.3))
     with pytest.raises(InputError, match="no free place"):
-        RoomPath(np.random.default_rng(0), full, 10.0, 0.4)
+        RoomPath(np.random.default_rng(0), full, 10.0, 0.4, NO_MARKERS)
 
 
 def test_light_is_blocked_as_by_stepping_along_the_ray() -> None:
     rng = np.random.default_rng(2)
-    paths = [RoomPath(rng, ROOM, 40.0, 0.4) for _ in range(3)]
+    paths = [RoomPath(rng, ROOM, 40.0, 0.4, NO_MARKERS) for _ in range(3)]
     light = RoomLight(ROOM, paths)
     stations = np.array([[0.02, 0.02, 2.4], [4.98, 2.48, 2.4], [0.02, 4.9, 1.0], [2.4, 2.4, 0.2]])
     wrong, blocked_count = 0, 0
@@ -142,7 +143,8 @@ def test_a_session_in_a_room_contains_the_design_and_is_solved_in_its_frame() ->
     design = scene_of(flat, L_SHAPE[[0, 1, 4]])
     options = SimulationOptions(robots=2, duration_s=25.0, room=design, noise_rad=1e-4, seed=3)
     session = simulate(options)
-    assert session.scene is design
+    assert session.scene.stations is design.stations
+    assert session.scene.markers == ()
     assert {t.frame for t in session.truth} == {"room"}
     assert [s.channel for s in session.true_scene.stations] == [1, 2, 3]
     assert not np.allclose(session.true_scene.stations[0].position, design.stations[0].position)
@@ -156,6 +158,29 @@ def test_a_session_in_a_room_contains_the_design_and_is_solved_in_its_frame() ->
     assert 0.01 < sigma_m < 0.06
     assert np.linalg.norm(error.mean(axis=0)) < 3 * sigma_m
     assert np.linalg.norm(np.std(error, axis=0)) < 0.03
+
+
+def test_the_first_robot_visits_the_markers_of_a_room_and_they_fix_the_frame() -> None:
+    flat = replace(ROOM, photodiode_z_m=(0.1, 0.1))
+    places = [[0.4, 0.4, 0.1], [4.6, 0.4, 0.1], [2.1, 2.1, 0.1], [0.4, 4.6, 0.1]]
+    markers = tuple(Marker(f"m{k}", np.array(place)) for k, place in enumerate(places))
+    design = replace(scene_of(flat, L_SHAPE[[0, 1, 4]]), markers=markers)
+    options = SimulationOptions(robots=2, duration_s=30.0, room=design, noise_rad=1e-4, seed=3)
+    session = simulate(options)
+    truth = session.truth[0]
+    for marker, place in zip(session.scene.markers, places, strict=True):
+        (visit,) = marker.visits
+        is_there = (truth.time_ns > visit.start_ns) & (truth.time_ns < visit.end_ns)
+        assert visit.device == "robot-1"
+        assert np.count_nonzero(is_there) > 50
+        assert np.abs(truth.position[is_there] - place).max() < 1e-9
+    solution = solve(session.sweeps, session.scene)
+    assert solution.artifact.scale == "markers"
+    for track, path in zip(solution.trajectories, session.truth, strict=True):
+        true = [np.interp(track.time_ns, path.time_ns, x) for x in path.position.T]
+        error = np.linalg.norm(track.position - np.stack(true, axis=1), axis=1)
+        # Without markers, the mounting errors of the stations move the frame by centimetres.
+        assert np.quantile(error, 0.95) < 0.012
 
 
 @pytest.mark.parametrize(
