@@ -198,7 +198,7 @@ def _plan_page(scene: Scene, room: Room, title: str, paper_mm: Point) -> Unnumbe
         marks.append(Polygon(tuple(corners), width_mm=0.25))
         marks += _hatching(corners)
     for station in scene.stations:
-        marks += _station_marks(station, at)
+        marks += _station_marks(station, at, 0.5 * (low + high))
     foot = (
         *axes((left + 1.0, bottom + 1.0), 9.0, "+x", "+y"),
         *scale_bar((left + 28.0, bottom + 2.0), scale, 60.0),
@@ -239,7 +239,7 @@ def _hatching(corners: Sequence[Point]) -> list[Mark]:
     return [Line(corners[0], corners[2], 0.1), Line(corners[1], corners[3], 0.1)]
 
 
-def _station_marks(station: Station, at: Callable[[Array], Point]) -> list[Mark]:
+def _station_marks(station: Station, at: Callable[[Array], Point], centre_m: Array) -> list[Mark]:
     x, y = at(station.position)
     marks: list[Mark] = [
         Polygon(
@@ -259,12 +259,14 @@ def _station_marks(station: Station, at: Callable[[Array], Point]) -> list[Mark]
         marks += arrow((x, y), (x + float(view[0]), y + float(view[1])), 2.0, 0.3)
     else:
         marks.append(Circle((x, y), 2.0 * STATION_MM))
-    # The number is to the left of the arrow: behind the station there may be a wall.
-    left = np.array([-view[1], view[0]]) / length if length > 1e-6 else np.array([1.0, 0.0])
+    # The number is beside the arrow, inside the room: behind the station there may be a wall.
+    side = np.array([-view[1], view[0]]) / length if length > 1e-6 else np.array([1.0, 0.0])
+    if side @ (centre_m - station.position[:2]) < 0:
+        side = -side
     height = capital_height(9.0)
     position = (
-        x + LABEL_DISTANCE_MM * float(left[0]),
-        y + LABEL_DISTANCE_MM * float(left[1]) - height / 2,
+        x + LABEL_DISTANCE_MM * float(side[0]),
+        y + LABEL_DISTANCE_MM * float(side[1]) - height / 2,
     )
     marks.append(Text(str(station.channel), position, 9.0, "middle", bold=True))
     return marks
