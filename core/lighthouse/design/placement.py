@@ -318,7 +318,13 @@ def _mount_positions(room: Room) -> tuple[Array, IntArray]:
         for edge, (start, along, length) in enumerate(_wall_frames(room)):
             inset = min(MOUNT_DEPTH_M, 0.5 * length)
             number = max(2, int(np.ceil((length - 2 * inset) / step)) + 1)
-            for distance in np.linspace(inset, length - inset, number):
+            distances = np.linspace(inset, length - inset, number)
+            if length < step:
+                # Of the short walls of a rounded outline, those at multiples of the step.
+                before = lengths[:edge].sum()
+                is_used = before // step != (before + length) // step
+                distances = np.full(int(is_used), 0.5 * length)
+            for distance in distances:
                 x, y = start + distance * along + _depth(room) * np.array([-along[1], along[0]])
                 found += [(np.array([x, y, z]), edge) for z in heights]
     if "ceiling" in room.mounts:

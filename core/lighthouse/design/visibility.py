@@ -32,6 +32,9 @@ all 103 bursts of Bitcraze's recording at 4 m are decoded, and few of that at 6.
 SURFACE_TOLERANCE_M = 1e-6
 """Stations and photodiodes this close to a wall or a face of an obstacle are not inside it [m]."""
 
+MAX_TESTS = 1_000_000
+"""Number of edges that are compared with rays at once: some arrays of 8 MB."""
+
 _OWN_DISC = np.sqrt(3.0) / 2.0 + np.pi / 3.0
 """Mean length, in radii of a robot, of the strip around a ray that lies within two radii of its
 start: the mean of sqrt(4 - y^2) for y from -1 to 1."""
@@ -66,12 +69,20 @@ def in_field_of_view(
 def has_line_of_sight(room: Room, position_m: Array, points_m: Array) -> BoolArray:
     """Return True if neither walls nor obstacles are between stations (s, 3) and points (p, 3)."""
     is_clear = np.ones((len(position_m), len(points_m)), bool)
-    if not _is_convex(room.outline_m):
-        is_clear &= ~_crosses_edges(room.outline_m, position_m[:, None, :2], points_m[None, :, :2])
-    for obstacle in room.obstacles:
-        is_clear &= ~_passes_prism(
-            obstacle.outline_m, obstacle.low_m, obstacle.high_m, position_m, points_m
-        )
+    corners = max(len(outline) for outline in (room.outline_m, *_obstacle_outlines(room)))
+    chunk = max(1, MAX_TESTS // (corners * max(1, len(points_m))))
+    is_convex = _is_convex(room.outline_m)
+    for first in range(0, len(position_m), chunk):
+        part = slice(first, first + chunk)
+        stations = position_m[part]
+        if not is_convex:
+            is_clear[part] &= ~_crosses_edges(
+                room.outline_m, stations[:, None, :2], points_m[None, :, :2]
+            )
+        for obstacle in room.obstacles:
+            is_clear[part] &= ~_passes_prism(
+                obstacle.outline_m, obstacle.low_m, obstacle.high_m, stations, points_m
+            )
     return is_clear
 
 
@@ -141,6 +152,10 @@ def in_obstacle(room: Room, points_m: Array) -> BoolArray:
         is_level = (points_m[:, 2] >= obstacle.low_m) & (points_m[:, 2] <= obstacle.high_m)
         inside |= is_level & is_inside(obstacle.outline_m, points_m[:, :2])
     return inside
+
+
+def _obstacle_outlines(room: Room) -> tuple[Array, ...]:
+    return tuple(obstacle.outline_m for obstacle in room.obstacles)
 
 
 def _is_convex(outline_m: Array) -> bool:

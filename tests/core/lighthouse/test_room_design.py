@@ -368,3 +368,18 @@ def test_bill_names_every_part_and_prices_those_that_are_published() -> None:
     assert "ceiling mount" not in items
     assert items["photodiode"].count == items["front end"].count == 5
     assert items["photodiode"].amount == pytest.approx(11.5)
+
+
+def test_a_few_places_in_view_of_two_stations_are_predicted() -> None:
+    """They do not determine the frame of the scene, which has more motions than they have."""
+    hall = Room(rectangle(30.0, 30.0), 8.0, (1.0, 1.0))
+    stations = facing_down((5.0, 5.0), (6.0, 5.0))
+    room = replace(hall, photodiode_z_m=(0.0, 2.0))
+    for places in ([[5.5, 5.0, 1.0]], [[5.5, 5.0, 1.0], [5.5, 5.5, 1.0]]):
+        report = report_room(
+            stations, room, RoomRequest(max_range_m=2.8), points_m=np.array(places)
+        )
+        assert np.all(report.stations_seen == 2)
+        assert np.all(np.isfinite(report.sigma_m))
+    everywhere = design_room(Room(rectangle(60.0, 60.0), 8.0, (0.0, 1.5)), RoomRequest(6))
+    assert 0.0 < everywhere.report.covered_fraction < 0.5
