@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
+from locatk.cli.price_options import price_options
 from locatk.cli.room.options import (
     TRIPOD,
     maps_option,
@@ -22,6 +24,7 @@ from locatk.cli.room.options import (
 if TYPE_CHECKING:
     from locatk.core.lighthouse.design import RoomDesign, RoomRequest
     from locatk.core.lighthouse.room import Room
+    from locatk.core.materials import BillItem
 
 
 @click.command(cls=Command)
@@ -83,6 +86,13 @@ if TYPE_CHECKING:
         help="Paper of the mounting sheet: A0 to A5, Letter, Tabloid, or a size as in 600x900mm.",
     ),
 )
+@section(
+    "Costs",
+    options.output_option(
+        "--bom", endings=(".csv",), metavar="FILE", help="Also write the bill of materials (.csv)."
+    ),
+    price_options,
+)
 @options.overwrite
 @options.as_json
 @options.verbosity
@@ -97,6 +107,8 @@ def command(
     maps: Path | None,
     sheet: Path | None,
     paper_name: str,
+    bom: Path | None,
+    prices: Path | None,
     overwrite: bool,
     as_json: bool,
     **more: Any,
@@ -119,12 +131,16 @@ def command(
       locatk room design 4x3x2.5 --robots 20 --robot-size 60x80 -o room.toml
       locatk room design lab.dxf --height 2800 -o room.toml --maps room.png --sheet room.pdf
     """
-    from locatk.core.lighthouse.design import design_room
+    from locatk.core.lighthouse.design import bill_of_materials, design_room
+    from locatk.core.materials import with_prices
+    from locatk.formats.artifacts.prices import read_prices
     from locatk.formats.artifacts.scene import write_scene
+    from locatk.formats.exporters.bill_of_materials import write_bill
 
-    for path in (output, maps, sheet):
+    for path in (output, maps, sheet, bom):
         if path is not None:
             options.guard_output(path, overwrite=overwrite, inputs=[Path(room)])
+    part_prices = read_prices(prices)
     device = more["device"]
     request_keys = ("seen", "facing", "range_mm", "field_of_view", "calibration", "device")
     if stations is None and accuracy is None:
@@ -148,8 +164,17 @@ def command(
     if sheet is not None:
         _write_sheet(sheet, design, output.stem, paper_name, overwrite)
         written.append(sheet)
+    items = bill_of_materials(
+        design.mounts,
+        robots=1 if plan.robots is None else plan.robots.count,
+        photodiodes=4 if device == "deck" else 1,
+    )
+    items = with_prices(items, part_prices)
+    if bom is not None:
+        write_bill(bom, items, overwrite=overwrite)
+        written.append(bom)
     console.result(f"Wrote {', '.join(map(str, written))}\n")
-    _print_design(design, plan, request, device, as_json, written)
+    _print_design(design, plan, request, device, items, as_json, written)
 
 
 def _write_sheet(
@@ -172,21 +197,16 @@ def _print_design(
     room: Room,
     request: RoomRequest,
     device: str,
+    items: Sequence[BillItem],
     as_json: bool,
     written: list[Path],
 ) -> None:
     from locatk.cli.room import room_text
-    from locatk.core.lighthouse.design import bill_of_materials
     from locatk.core.lighthouse.design.report import deck_heading_sigma
 
     heading = None
     if device == "deck":
         heading = deck_heading_sigma(design.scene, design.report, room, request)
-    items = bill_of_materials(
-        design.mounts,
-        robots=1 if room.robots is None else room.robots.count,
-        photodiodes=4 if device == "deck" else 1,
-    )
     rows = room_text.station_rows(design.scene.stations, design.poses.kinds)
     console.result(
         console.labelled(

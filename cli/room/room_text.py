@@ -125,7 +125,9 @@ def materials_text(items: Sequence[BillItem]) -> str:
     ]
     sources = sorted({f"{i.price.source}, {i.price.date}" for i in items if i.price is not None})
     header = ("material", "count", "each", f"sum {total.currency}".strip(), "")
-    text = f"{total.text[0].upper()}{total.text[1:]}. Prices: {'; '.join(sources)}."
+    text = f"{total.text[0].upper()}{total.text[1:]}."
+    if sources:
+        text += f" Prices: {'; '.join(sources)}."
     return f"{console.table(header, rows)}\n\n{console.wrapped(text, indent=0)}"
 
 

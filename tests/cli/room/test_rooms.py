@@ -177,3 +177,20 @@ def test_a_floor_plan_is_a_room(locatk, tmp_path: Path) -> None:
     assert room is not None
     assert room.outline_m.max(axis=0).tolist() == [5.0, 4.0]
     assert room.obstacles[0].high_m == 0.9
+
+
+def test_the_bill_has_the_prices_that_are_given(locatk, tmp_path: Path) -> None:
+    prices, bill = tmp_path / "prices.toml", tmp_path / "parts.csv"
+    prices.write_text(
+        locatk("room", "design", "--print-prices").stdout.replace("price = 200.0", "price = 150.0")
+    )
+    result = locatk(
+        "room", "design", "5x4x2.8", "--stations", 2, "--floor", 50, "--robots", 3, "--prices",
+        prices, "--bom", bill, "-o", tmp_path / "room.toml",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.stderr
+    rows = [line.split(",") for line in bill.read_text().splitlines()]
+    assert rows[1][:2] == ["base station", "2"]
+    assert "300.0" in rows[1]
+    assert ["photodiode", "3"] in [row[:2] for row in rows]
+    assert "Total 310.50 USD" in result.stdout
