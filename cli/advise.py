@@ -31,7 +31,12 @@ QUESTIONS = (
 
 
 @combine(
-    click.command("advise", cls=SimulationCommand, module="locatk.formats.advice.task_settings"),
+    click.command(
+        "advise",
+        cls=SimulationCommand,
+        module="locatk.formats.advice.task_settings",
+        short_help="Compare the four systems for a task before buying.",
+    ),
     options.input_option(
         "--task",
         CONFIG_FILE,
@@ -74,7 +79,7 @@ def command(
       locatk advise
       locatk advise --area 10x8 --robots 20 --accuracy 10
       locatk advise --area 4x4 --accuracy 1 --heading 1 --no-ceiling --floor print
-      locatk advise --route aisle.csv --accuracy 5 --iron reinforced --report plan.html
+      locatk advise --route aisle.csv --iron reinforced --report plan.html
       locatk advise --print-task > task.toml
       locatk advise --task task.toml --prices prices.toml --json
     """

@@ -18,6 +18,7 @@ BENCHES = {
     "landmarks": "locatk.formats.benchmarks.landmarks.suite:figures",
     "capture": "locatk.formats.benchmarks.capture:figures",
     "live": "locatk.formats.benchmarks.live:figures",
+    "plan": "locatk.formats.benchmarks.plan.suite:figures",
     "look": "locatk.formats.benchmarks.look:figures",
     "infrared": "locatk.formats.benchmarks.infrared:figures",
 }
@@ -49,6 +50,7 @@ def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
       infrared    sweeps and factory data from raw infrared light
       capture     recording from ports, recovery of damaged files, decoding speed
       live        latency of live poses, agreement with solve, memory
+      plan        predictions of the design commands against simulations
       look        eval compared with evo, reports, demo and batches
 
     Targets of durations are scaled by the machine factor: the duration of a fixed workload on this
@@ -63,6 +65,7 @@ def command(system: str, data: Path | None, full: bool, as_json: bool) -> None:
       locatk bench landmarks
       locatk bench capture
       locatk bench live
+      locatk bench plan
       locatk bench look
       locatk bench infrared
       locatk bench lighthouse --full

@@ -161,7 +161,13 @@ def _print_cameras(ctx: click.Context, parameter: click.Parameter, value: bool) 
         metavar="N",
         help="Frames to render and decode; 0 for none.  [default: as many as take about 3 s]",
     ),
-    number("--seed", default=0, type=click.IntRange(min=0), metavar="N", help="Of these frames."),
+    number(
+        "--seed",
+        default=0,
+        type=click.IntRange(min=0),
+        metavar="N",
+        help="Seed of all random numbers.",
+    ),
     options.output_option(
         "--holder",
         help="Drawing of camera and paper at true size (.pdf).",
@@ -208,8 +214,8 @@ def command(
     \b
     Examples:
       locatk camera design --speed 0.3
-      locatk camera design --sensor ov9281 --focal-length 3.6 --distance 20 --speed 0.3
-      locatk camera design --sensor mt9v034-binned --distance 16 --exposure 130 --frames 100
+      locatk camera design --sensor ov9281 --focal-length 3.6 --distance 20
+      locatk camera design --sensor mt9v034-binned --exposure 130 --frames 100
       locatk camera design --print-cameras > cameras.toml
       locatk camera design --cameras cameras.toml --speed 1 --holder holder.pdf
     """

@@ -129,7 +129,7 @@ def command(
       locatk room design 10x10x3 --stations 4 --volume 0-1500 -o room.toml
       locatk room design 6x5x2.8 --floor 80 --accuracy 2 --mount wall -o room.toml
       locatk room design 4x3x2.5 --robots 20 --robot-size 60x80 -o room.toml
-      locatk room design lab.dxf --height 2800 -o room.toml --maps room.png --sheet room.pdf
+      locatk room design lab.dxf --height 2800 -o room.toml --sheet room.pdf
     """
     from locatk.core.lighthouse.design import bill_of_materials, design_room
     from locatk.core.materials import with_prices

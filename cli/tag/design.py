@@ -170,7 +170,7 @@ def command(
       locatk tag design -o mini.toml --order 2 --magnets 3 --clearance 4
       locatk tag design -o tag.toml --spacing 16 --osr 2 --rate 100 --speed 0.3
       locatk tag design --search --count 50 --accuracy 1,0.5 -o tag.toml
-      locatk tag design --search --count 9 --clearance 8 --max-clearance 15 -o tag.toml
+      locatk tag design --search --count 9 --max-clearance 15 -o tag.toml
     """
     from locatk.core.materials import with_prices
     from locatk.core.polaris.codec import families
