@@ -220,6 +220,9 @@ def _print_design(
     )
     console.result("\n" + console.table(room_text.STATION_HEADER, rows))
     console.result("\n" + console.wrapped(note, indent=0))
+    if design.scene.markers:
+        text = room_text.marker_text(design.scene.markers)
+        console.result("\n" + console.wrapped(text, indent=0))
     console.result("\n" + room_text.materials_text(items))
     for text in design.report.notes:
         console.result("\n" + console.wrapped(f"Note: {text}.", indent=0))

@@ -11,7 +11,7 @@ from locatk.cli import console
 if TYPE_CHECKING:
     from locatk.core.lighthouse.design import Addition, RoomDesign, RoomReport
     from locatk.core.lighthouse.room import Room
-    from locatk.core.lighthouse.scene import Station
+    from locatk.core.lighthouse.scene import Marker, Station
     from locatk.core.materials import BillItem
 
 
@@ -83,6 +83,17 @@ def station_rows(stations: Sequence[Station], mounts: Sequence[str]) -> list[tup
 
 
 STATION_HEADER = ("channel", "mount", "x mm", "y mm", "z mm", "yaw deg", "tilt deg")
+
+
+def marker_text(markers: Sequence[Marker]) -> str:
+    """Return the places of the markers and their purpose in words."""
+    places = ", ".join(
+        "{:.0f} {:.0f}".format(*(1e3 * marker.position[:2]).tolist()) for marker in markers
+    )
+    return (
+        f"Markers, x y in mm: {places}. A device that rests on each of them fixes frame and scale "
+        "to the accuracy of these places."
+    )
 
 
 def place_text(report: RoomReport, index: int) -> str:
@@ -187,6 +198,10 @@ def design_entry(design: RoomDesign) -> dict[str, Any]:
     """Return a design for ``--json``."""
     return {
         "stations": station_entries(design.scene.stations, design.poses.kinds),
+        "markers": [
+            {"name": marker.name, "position_m": marker.position.tolist()}
+            for marker in design.scene.markers
+        ],
         "reached": design.is_reached,
         "report": report_entry(design.report),
         "mounted_p95_sigma_m": finite(design.mounted_report.p95_sigma_m),

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from locatk.core.errors import InputError
+from locatk.core.lighthouse.design.markers import propose_markers
 from locatk.core.lighthouse.design.placement import (
     SOLVED_EVALUATIONS,
     PlacementProblem,
@@ -43,7 +44,7 @@ class RoomDesign:
     Attributes
     ----------
     scene : Scene
-        With the room. Its stations have the covariance of their mounting.
+        With the room and markers. Its stations have the covariance of their mounting.
     poses : StationPoses
         The stations in the order of the scene, with their mounts.
     report : RoomReport
@@ -170,6 +171,8 @@ def _design(room: Room, request: RoomRequest, poses: StationPoses) -> RoomDesign
         room=room,
     )
     report = report_room(scene, room, request)
+    markers = propose_markers(room, report.points_m[report.is_covered])
+    scene = replace(scene, markers=markers)
     mounted = report_room(scene, room, request, given_errors=True, points_m=report.points_m)
     is_reached = request.accuracy_m is None or report.p95_sigma_m <= request.accuracy_m
     return RoomDesign(scene, poses, report, mounted, is_reached, report.warnings)
@@ -216,6 +219,6 @@ def _unreached(design: RoomDesign, accuracy_m: float, is_largest: bool) -> str:
     if is_largest:
         remedy = "a smaller working volume, more mounts, or factory calibrations of the stations"
     return (
-        f"{1e3 * accuracy_m:g} mm are not reached with {len(design.poses)} stations: {possible}. "
+        f"{1e3 * accuracy_m:.3g} mm are not reached with {len(design.poses)} stations: {possible}. "
         f"It takes {remedy}"
     )

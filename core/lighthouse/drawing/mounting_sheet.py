@@ -57,6 +57,9 @@ FOOT_MM = 14.0
 STATION_MM = 1.6
 """Radius of the symbol of a station."""
 
+MARKER_MM = 2.0
+"""Length of the arms of the cross of a marker."""
+
 VIEW_MM = 11.0
 """Length of the arrow along the direction of view, if it is horizontal."""
 
@@ -108,6 +111,7 @@ def draw_mounting_sheet(
     pages = [
         _plan_page(scene, room, title, paper_mm),
         *_list_pages(scene, room, mounts, title, paper_mm),
+        *_marker_pages(scene, room, title, paper_mm),
         _gauge_page(scene, title, paper_mm),
     ]
     return number_pages(pages)
@@ -164,7 +168,8 @@ def _plan_page(scene: Scene, room: Room, title: str, paper_mm: Point) -> Unnumbe
         text = (
             f"Plan at 1 : {scale:g}, seen from above; lengths in mm. W1, W2 ... are the walls. "
             "Arrows show where stations look, shorter if they look down; a ring is a station that "
-            "looks almost straight down. Bold numbers are channels."
+            "looks almost straight down. Bold numbers are channels. Crosses M1, M2 ... are markers "
+            "on the floor."
         )
         if room.area_m is not None:
             text += " Dashed: working area."
@@ -197,6 +202,10 @@ def _plan_page(scene: Scene, room: Room, title: str, paper_mm: Point) -> Unnumbe
         corners = [at(corner) for corner in obstacle.outline_m]
         marks.append(Polygon(tuple(corners), width_mm=0.25))
         marks += _hatching(corners)
+    for number, marker in enumerate(scene.markers, 1):
+        x, y = at(marker.position)
+        marks += cross((x, y), MARKER_MM)
+        marks.append(Text(f"M{number}", (x, y + MARKER_MM + 0.5), TEXT_POINTS, "middle"))
     for station in scene.stations:
         marks += _station_marks(station, at, 0.5 * (low + high))
     foot = (
@@ -316,6 +325,46 @@ def _list_pages(
     page_mm = tuple(sorted(paper_mm))
     frame = PageFrame(
         (page_mm[0], page_mm[1]), MARGIN_MM, f"{title}: drilling list", notes, has_rulers=False
+    )
+    return table_pages(rows, columns, frame)
+
+
+def _marker_pages(scene: Scene, room: Room, title: str, paper_mm: Point) -> list[UnnumberedPage]:
+    """List the markers with their distances from two walls."""
+    if not scene.markers:
+        return []
+    rows = []
+    for number, marker in enumerate(scene.markers, 1):
+        (first, first_m), (second, second_m) = wall_distances(room, marker.position)
+        x_mm, y_mm, z_mm = (1e3 * marker.position).tolist()
+        rows.append(
+            (
+                f"M{number}",
+                marker.name,
+                f"W{first + 1}: {1e3 * first_m:.0f}",
+                f"W{second + 1}: {1e3 * second_m:.0f}",
+                f"{x_mm:.0f}, {y_mm:.0f}",
+                f"{z_mm:.0f}",
+                "[  ]",
+            )
+        )
+    columns = (
+        TableColumn("marker", 14.0),
+        TableColumn("name", 28.0),
+        TableColumn("from wall", 24.0),
+        TableColumn("and from wall", 24.0),
+        TableColumn("x, y", 28.0),
+        TableColumn("photodiode height", 32.0),
+        TableColumn("done", 10.0),
+    )
+    notes = (
+        "Mark these places on the floor, in mm from the walls. A device that rests with its "
+        "photodiode above each of them fixes frame and scale of the scene. If you measure a mark "
+        "elsewhere, correct its position in the scene.",
+    )
+    page_mm = tuple(sorted(paper_mm))
+    frame = PageFrame(
+        (page_mm[0], page_mm[1]), MARGIN_MM, f"{title}: markers", notes, has_rulers=False
     )
     return table_pages(rows, columns, frame)
 
