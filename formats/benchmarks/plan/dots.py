@@ -33,6 +33,7 @@ from locatk.core.dots.design.camera_measurement import CameraMeasurement, measur
 from locatk.core.dots.localization.frames import dot_correspondences, localize_frames
 from locatk.core.errors import MissingDataError
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
+from locatk.formats.benchmarks.plan.ratios import TAIL_RATIO, ratio_figures
 
 Array = NDArray[np.float64]
 
@@ -48,19 +49,6 @@ SENSORS = (
     Sensor("OV7251, 2 x 2", (320, 240), 6e-6, 100.0),
 )
 """Binned sensors: frames of full size take a second each to render."""
-
-MEDIAN_RATIO, TAIL_RATIO = (0.8, 1.25), (0.5, 2.0)
-"""Goals: predicted over reached standard deviation, in the median and for nine of ten tasks."""
-
-PAPER = CameraSetup(
-    Sensor("MT9V034", (752, 480), 6e-6, 60.0, dynamic_range_db=55.0),
-    Lens(5.5e-3, distortion=0.045),
-    distance_m=5.5e-3 * (1 + 0.046 / 0.024),
-    exposure_s=1 / 7684,
-    binning=4,
-)
-"""The paper's camera (Hostettler et al. 2016, III-A): 0.046 mm on the paper are a pixel of 0.024 mm
-on the sensor."""
 
 PUBLISHED_PITCH_PX = 20.2
 """Pitch of the dots in frame.bmp, the image a.bmp of cellulo-localization, 320 x 241 px."""
@@ -154,9 +142,8 @@ def figures(data: Path) -> list[Figure]:
     """Return the figures; ``data`` is the folder of the published recordings."""
     results = [run_task(number) for number in range(TASKS)]
     return [
-        *ratio_figures(results),
+        *task_figures(results),
         *read_rate_figures(),
-        *paper_figures(),
         *measure_or_explain(
             lambda: published_frame_figures(data / "dots" / "frame.bmp"),
             Figure("dots: frame.bmp: scatter of a dot, predicted / residuals", None, "", ""),
@@ -165,21 +152,14 @@ def figures(data: Path) -> list[Figure]:
     ]
 
 
-def ratio_figures(results: list[TaskResult]) -> Iterable[Figure]:
+def task_figures(results: list[TaskResult]) -> Iterable[Figure]:
     """Yield the ratios of predicted to reached accuracy, and read rates."""
     how = f"{len(results)} tasks of {FRAMES} rendered frames, error against the rendered pose"
     for name, ratios in (
         ("position", [result.position_ratio for result in results]),
         ("heading", [result.heading_ratio for result in results]),
     ):
-        known = np.array([ratio for ratio in ratios if math.isfinite(ratio)])
-        label = f"dots: {name}, predicted / reached"
-        low, middle, high = np.percentile(known, [5, 50, 95])
-        distance = max(middle, 1 / middle)
-        yield Figure(f"{label}: median", middle, "", f"{how}; goal 0.8 to 1.25")
-        yield Figure(f"{label}: median, or its inverse", distance, "", how, target=MEDIAN_RATIO[1])
-        yield Figure(f"{label}: 5 %", low, "", how, target=TAIL_RATIO[0], better="higher")
-        yield Figure(f"{label}: 95 %", high, "", how, target=TAIL_RATIO[1])
+        yield from ratio_figures(f"dots: predicted over reached, {name}", ratios, how)
     predicted = [100 * result.report.read_rate for result in results]
     reached = [100 * result.measured.read_rate for result in results]
     worst = float(np.abs(np.subtract(predicted, reached)).max())
@@ -199,43 +179,6 @@ def read_rate_figures() -> Iterable[Figure]:
     yield Figure("dots: frames read near the limits, reached", float(rates[:, 1].mean()), "%", how)
     difference = float(np.abs(rates[:, 0] - rates[:, 1]).mean())
     yield Figure("dots: frames read near the limits, mean difference", difference, "%", how)
-
-
-def paper_figures() -> Iterable[Figure]:
-    """Yield the sums of the paper, computed by the design."""
-    report = design_camera(PAPER)
-    paper = "Hostettler et al. 2016"
-    for name, value, unit, published, how in (
-        (
-            "diagonal of 8 x 8 dots",
-            1e3 * window_diagonal_m(8, PAPER.pitch_m),
-            "mm",
-            5.39,
-            "III-A.3: sqrt(2) 0.508 mm (7 + 3/6)",
-        ),
-        (
-            "speed that blurs one pixel",
-            1e3 * report.one_pixel_speed_mps,
-            "mm/s",
-            353.0,
-            "III-A.2: 0.046 mm in 1/7684 s",
-        ),
-        (
-            "rotation that blurs one pixel",
-            report.one_pixel_yaw_rate_rps * 30 / math.pi,
-            "rpm",
-            785.0,
-            "III-A.2: the middle of the farthest of 188 px is 93.5 px, 4.30 mm, from the centre",
-        ),
-        (
-            "exposure for one pixel at 353 mm/s",
-            7684 * report.metres_per_px / 0.353,
-            "/ 7684 s",
-            1.0,
-            "III-A.2",
-        ),
-    ):
-        yield Figure(f"dots: paper: {name}", value, unit, how, peer=paper, peer_value=published)
 
 
 # ---- the published frame
@@ -314,7 +257,7 @@ def published_frame_figures(path: Path) -> Iterable[Figure]:
         ),
     ):
         label = f"dots: frame.bmp: {name}"
-        yield Figure(label, value, "", f"{how}; goal 0.5 to 2", TAIL_RATIO[0], "higher")
+        yield Figure(label, value, "", f"{how}; goal 0.5 to 2", 1 / TAIL_RATIO, "higher")
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ from locatk.core.streaming.planar_filter import OdometryNoise
 from locatk.core.streaming.tracker import DEFAULT_SETTINGS
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure
+from locatk.formats.benchmarks.plan.ratios import ratio_figures
 
 Array = NDArray[np.float64]
 
@@ -45,10 +46,6 @@ TASKS, DRIVES = 20, 4
 """Tasks, and simulated drives of each, on floors with different errors."""
 
 FIRST_SEED = 25_000
-
-MEDIAN_RATIO, TAIL_RATIO = 1.25, 2.0
-"""Goals: largest ratio of predicted and reached standard deviation, or its inverse, in the median
-and for 90 % of the tasks."""
 
 GRAZING_DRIVES, GRAZING_OFFSETS_M = 36, (0.06, 0.07, 0.08)
 """Drives past four landmarks each, and their distances from the centres [m]."""
@@ -200,26 +197,8 @@ def figures(data: Path) -> list[Figure]:
     )
     measured = []
     for kind, ratio in zip(KINDS, ratios.T, strict=True):
-        measured += _ratio_figures(f"landmarks: predicted over reached, {kind}", ratio, how)
+        measured += ratio_figures(f"landmarks: predicted over reached, {kind}", ratio, how)
     return [*measured, *_coverage_figures(results, tasks), misread_figure()]
-
-
-def _ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
-    """Return median and tails of ratios; a target of the median is for ratio or inverse."""
-    ratio = ratio[np.isfinite(ratio)]
-    low, middle, high = np.percentile(ratio, [5, 50, 95])
-    return [
-        Figure(f"{name}: median", float(middle), "", f"{how}; goal 0.8 to 1.25"),
-        Figure(
-            f"{name}: median, larger of ratio and inverse",
-            float(max(middle, 1 / middle)),
-            "",
-            how,
-            MEDIAN_RATIO,
-        ),
-        Figure(f"{name}: 5th percentile", float(low), "", how, 1 / TAIL_RATIO, "higher"),
-        Figure(f"{name}: 95th percentile", float(high), "", how, TAIL_RATIO),
-    ]
 
 
 def _coverage_figures(results: list[TaskErrors], tasks: list[PlanningTask]) -> Iterator[Figure]:

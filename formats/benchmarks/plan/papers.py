@@ -14,7 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.dots.codec.pattern import MAIN_SEQUENCE, codec
-from locatk.core.dots.design.camera import CameraSetup, Lens, window_diagonal_m
+from locatk.core.dots.design.camera import (
+    CameraSetup,
+    Lens,
+    design_camera,
+    window_diagonal_m,
+)
 from locatk.core.dots.design.camera_materials import PAPER_FOCAL_M, camera_materials
 from locatk.core.dots.design.camera_sensors import SENSORS
 from locatk.core.dots.published.localization import correlate
@@ -45,8 +50,8 @@ LIGHTHOUSE = "Alvarado-Marin et al., RA-L 2024, DOI 10.1109/LRA.2024.3405345"
 PITCH_M = 0.508e-3
 """Pitch of the paper's dots (II.A)."""
 
-PAPER_PIXEL_M, PAPER_EXPOSURE_S, PAPER_CORNER_M = 0.046e-3, 1 / 7684, 4.29e-3
-"""Pixel on the ground, exposure, and distance of the farthest pixel from the centre (III.A.2)."""
+PAPER_PIXEL_M, PAPER_EXPOSURE_S = 0.046e-3, 1 / 7684
+"""Pixel on the ground, and exposure (III.A.2)."""
 
 EARTH_M2 = 5.101e14
 """Surface of the Earth."""
@@ -126,14 +131,14 @@ def _add_dots(to: _Calculations) -> None:
         Lens(PAPER_FOCAL_M),
         distance_m=PAPER_FOCAL_M * (1 + 1 / magnification),
         exposure_s=PAPER_EXPOSURE_S,
-        speed_mps=1.0,
     )
-    pixel_mps = setup.metres_per_px / setup.motion_m
+    report = design_camera(setup)
+    speed_mm_s = 1e3 * report.one_pixel_speed_mps
     how = "III.A.2, from 0.046 mm and 1/7684 s"
-    to.add("dots, speed of one pixel of blur", 1e3 * pixel_mps, 353, "mm/s", how, DOTS)
-    rpm = pixel_mps / PAPER_CORNER_M * 60 / math.tau
-    how = "III.A.2, from the speed and 4.29 mm; the paper's inputs are rounded"
-    to.add("dots, rotation of one pixel of blur", rpm, 785, "rpm", how, DOTS, digits=785 * 0.011)
+    to.add("dots, speed of one pixel of blur", speed_mm_s, 353, "mm/s", how, DOTS)
+    rpm = report.one_pixel_yaw_rate_rps * 60 / math.tau
+    how = "III.A.2: the middle of the farthest of 188 px is 93.5 px, 4.30 mm, from the centre"
+    to.add("dots, rotation of one pixel of blur", rpm, 785, "rpm", how, DOTS)
 
     section = math.prod(len(digits) for digits in codec("anoto").digits)
     to.add("dots, positions of a section", section, 410_815_348, "", "II.A", DOTS)

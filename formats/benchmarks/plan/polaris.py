@@ -46,6 +46,7 @@ from locatk.core.streaming.planar_filter import OdometryNoise
 from locatk.core.streaming.tracker import DEFAULT_SETTINGS
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
+from locatk.formats.benchmarks.plan.ratios import TAIL_RATIO, ratio_figures
 from locatk.formats.benchmarks.polaris.suite import (
     SAMPLE_RATE_HZ,
     SET_IDS,
@@ -72,10 +73,6 @@ is known."""
 
 MAX_DISCS_M = ((2e-3, 0.5e-3, 1.45), (2e-3, 1e-3, 1.3), (3e-3, 1e-3, 1.3))
 """Diameter, height and remanence [T] of the magnets."""
-
-MEDIAN_RATIO, TAIL_RATIO = 1.25, 2.0
-"""Goals: predicted over reached standard deviation, or its inverse, in the median and for nine of
-ten tasks."""
 
 RUN_UP_M = 0.2
 """Distance before the first tag and after the last one."""
@@ -392,26 +389,6 @@ def simulated_figures(tasks: int = TASKS, drives: int = DRIVES) -> list[Figure]:
             f"polaris: predicted over reached, {kind}", ratio, f"{how}; {solver}"
         )
     return figures
-
-
-def ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
-    """Return the median and the tails of ratios as figures.
-
-    A target for the median is one of the larger of the ratio and its inverse.
-    """
-    low, middle, high = np.percentile(ratio, [5, 50, 95])
-    return [
-        Figure(f"{name}: median", float(middle), "", f"{how}; goal 0.8 to 1.25"),
-        Figure(
-            f"{name}: median, larger of ratio and inverse",
-            float(max(middle, 1 / middle)),
-            "",
-            how,
-            MEDIAN_RATIO,
-        ),
-        Figure(f"{name}: 5th percentile", float(low), "", how, 1 / TAIL_RATIO, "higher"),
-        Figure(f"{name}: 95th percentile", float(high), "", how, TAIL_RATIO),
-    ]
 
 
 # ---- the published recordings

@@ -17,11 +17,6 @@ def test_tasks_differ_and_are_repeatable() -> None:
     assert len({(task.distance_m, task.noise_levels) for task in tasks}) == dots.TASKS
 
 
-def test_the_sums_of_the_paper() -> None:
-    for figure in dots.paper_figures():
-        assert figure.value == pytest.approx(figure.peer_value, rel=0.002), figure.name
-
-
 def test_a_task_is_predicted_within_its_goal() -> None:
     result = dots.run_task(0, frames=24)
     assert 0.6 < result.position_ratio < 1.7
