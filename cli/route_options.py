@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from locatk.core.units import metres
+from locatk.core.units import length_text, metres
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,6 +58,18 @@ slip_option = click.option(
     metavar="PERCENT",
     help="Error of distances by odometry (standard deviation).  [default: 1.5]",
 )
+
+
+def accuracy_text(position_m: float, heading_rad: float | None) -> str:
+    """Format an accuracy; a heading that is None or infinite is left out.
+
+    >>> accuracy_text(0.02, 0.0349), accuracy_text(0.02, None)
+    ('20 mm and 2 deg', '20 mm')
+    """
+    text = length_text(position_m)
+    if heading_rad is None or not math.isfinite(heading_rad):
+        return text
+    return f"{text} and {math.degrees(heading_rad):.2g} deg"
 
 
 def odometry_noise(drift: float | None, slip: float | None) -> OdometryNoise:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console, failures
+from locatk.cli.materials_text import materials_text
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def text(
         console.table(
             ("sensor", "fits", "lens mm", "distance", "sigma um", "why not"), list(_sensors(fits))
         ),
-        _materials_text(report),
+        materials_text(report.materials),
     ]
     return "\n\n".join(parts)
 
@@ -71,27 +72,25 @@ def entry(
     return {
         "version": 1,
         "holder": holder,
-        "setup": _finite(setup),
-        "figures": _finite(figures),
+        "setup": setup,
+        "figures": figures,
         "rendered": None
         if measured is None
-        else _finite(
-            {
-                "frames": measured.frames,
-                "read": measured.read,
-                "read_rate": measured.read_rate,
-                "position_rms_m": measured.position_rms_m,
-                "heading_rms_rad": measured.heading_rms_rad,
-                "stated_sigma_m": measured.stated_sigma_m,
-            }
-        ),
+        else {
+            "frames": measured.frames,
+            "read": measured.read,
+            "read_rate": measured.read_rate,
+            "position_rms_m": measured.position_rms_m,
+            "heading_rms_rad": measured.heading_rms_rad,
+            "stated_sigma_m": measured.stated_sigma_m,
+        },
         "sensors": [
             {
                 "name": fit.sensor.name,
                 "fits": fit.fits,
                 "focal_m": fit.report.setup.lens.focal_m,
                 "distance_m": fit.report.setup.distance_m,
-                "position_sigma_m": _number(fit.report.position_sigma_m),
+                "position_sigma_m": fit.report.position_sigma_m,
                 "read_rate": fit.report.read_rate,
                 "reasons": fit.reasons,
             }
@@ -101,15 +100,6 @@ def entry(
         "materials_total": total_entry(report.materials),
         "warnings": report.warnings,
     }
-
-
-def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: _number(value) for key, value in values.items()}
-
-
-def _number(value: Any) -> Any:
-    """Return None for numbers that JSON does not have."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _head(report: CameraReport) -> Iterator[tuple[str, str]]:
@@ -239,26 +229,6 @@ def _sensors(fits: Sequence[CameraFit]) -> Iterator[tuple[str, ...]]:
             f"{fit.report.position_sigma_m * 1e6:.2g}",
             fit.reasons[0].partition(":")[0] if fit.reasons else "",
         )
-
-
-def _materials_text(report: CameraReport) -> str:
-    """Format the bill of materials and its total."""
-    from locatk.core.materials import total_of
-
-    total = total_of(report.materials)
-    rows = [
-        (
-            item.part,
-            item.count,
-            "" if item.amount is None else f"{item.amount:.2f}",
-            item.detail,
-        )
-        for item in report.materials
-    ]
-    table = console.table(("material", "count", total.currency, "detail"), rows)
-    sources = sorted({f"{i.price.source}, {i.price.date}" for i in report.materials if i.price})
-    lines = [f"{total.text[0].upper()}{total.text[1:]}.", *sources]
-    return "\n".join([table, "", *(console.wrapped(line) for line in lines)])
 
 
 def _mm(value_m: float) -> str:

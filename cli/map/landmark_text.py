@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console
+from locatk.cli.route_options import accuracy_text
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
@@ -225,7 +226,7 @@ def _span(values: list[str]) -> str:
 
 
 def _number(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else _clean(value, digits)
+    return _clean(value, digits) if math.isfinite(value) else "-"
 
 
 def _clean(value: float, digits: int) -> str:
@@ -267,9 +268,6 @@ def search_warnings(
     """Return what is possible, and what would have to change, if no bars suffice."""
     if any(option.is_feasible for option in options):
         return []
-    wish = length_text(wanted[0])
-    if wanted[1] is not None:
-        wish += f" and {math.degrees(wanted[1]):.2g} deg"
     separate = [option for option in options if option.analysis.min_pitch_m <= pitch_m]
     if not separate:
         smallest_m = min(option.analysis.min_pitch_m for option in options)
@@ -278,26 +276,22 @@ def search_warnings(
             f"pitch is {length_text(smallest_m)}"
         ]
     best = min(separate, key=lambda option: option.forecast.position_p95_m)
+    best_errors = best.forecast.position_p95_m, best.forecast.heading_p95_rad
     return [
-        f"{wish} (95 %) is impossible at a pitch of {length_text(pitch_m)}: the best bars, "
-        f"{_size(best.analysis.geometry)}, give {length_text(best.forecast.position_p95_m)} and "
-        f"{math.degrees(best.forecast.heading_p95_rad):.2g} deg; make the pitch smaller, calibrate "
-        "the odometry, or measure the landmarks (locatk calibrate map)"
+        f"{accuracy_text(*wanted)} (95 %) is impossible at a pitch of {length_text(pitch_m)}: the "
+        f"best bars, {_size(best.analysis.geometry)}, give {accuracy_text(*best_errors)}; make the pitch "
+        "smaller, calibrate the odometry, or measure the landmarks (locatk calibrate map)"
     ]
 
 
 def search_entry(option: BarOption) -> dict[str, Any]:
-    """Return bars that were tried for ``--json``; unknown errors are null."""
-    forecast = {
-        key: value if math.isfinite(value) else None
-        for key, value in asdict(option.forecast).items()
-    }
+    """Return bars that were tried for ``--json``."""
     return {
         "geometry": asdict(option.analysis.geometry),
-        "heights_m": list(option.heights_m),
+        "heights_m": option.heights_m,
         "min_pitch_m": option.analysis.min_pitch_m,
         "range_t": option.analysis.range_t,
-        "forecast": forecast,
+        "forecast": asdict(option.forecast),
         "reason": option.reason,
     }
 

@@ -12,7 +12,13 @@ import click
 from locatk.cli import console, options
 from locatk.cli.command import section
 from locatk.cli.options import number
-from locatk.cli.route_options import LengthAndAngle, odometry_noise, read_routes
+from locatk.cli.route_options import (
+    LengthAndAngle,
+    drift_option,
+    odometry_noise,
+    read_routes,
+    slip_option,
+)
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
@@ -45,18 +51,8 @@ route_options = section(
         metavar="M/S",
         help="Speed of the robot.",
     ),
-    click.option(
-        "--drift",
-        type=click.FloatRange(0, 90),
-        metavar="DEG/M",
-        help="Drift of the heading of the odometry (standard deviation).  [default: 2.9]",
-    ),
-    click.option(
-        "--slip",
-        type=click.FloatRange(0, 50),
-        metavar="PERCENT",
-        help="Error of distances by odometry (standard deviation).  [default: 1.5]",
-    ),
+    drift_option,
+    slip_option,
     number(
         "--installation",
         default="1.5,0.7",
@@ -175,7 +171,7 @@ def route_explanation(*, is_offline: bool) -> str:
 
 
 def route_entry(check: RouteCheck) -> dict[str, Any]:
-    """Return a route for ``--json``; what is unknown is null."""
+    """Return a route for ``--json``."""
     return {
         "name": check.route.name,
         "length_m": check.route.length_m,
@@ -188,10 +184,10 @@ def route_entry(check: RouteCheck) -> dict[str, Any]:
         "longest_without_fix_m": check.longest_without_fix_m,
         "longest_from_m": check.longest_m[0],
         "covered_fraction": check.covered_fraction,
-        "worst_position_sigma_m": _finite(check.position_sigma_m),
-        "worst_heading_sigma_rad": _finite(check.heading_sigma_rad),
-        "position_p95_m": _finite(check.position_p95_m),
-        "heading_p95_rad": _finite(check.heading_p95_rad),
+        "worst_position_sigma_m": check.position_sigma_m,
+        "worst_heading_sigma_rad": check.heading_sigma_rad,
+        "position_p95_m": check.position_p95_m,
+        "heading_p95_rad": check.heading_p95_rad,
         "visits": [_visit_entry(visit) for visit in check.visits],
         "warnings": list(check.warnings),
         "notes": list(check.notes),
@@ -220,7 +216,3 @@ def _distance(value: float | None) -> str:
 
 def _number(value: float) -> str:
     return f"{value:.2g}" if math.isfinite(value) else "-"
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -279,7 +279,8 @@ def room_of(
 
 
 def _base_room(text: str, height: float | None, drawing: dict[str, Any]) -> Room:
-    from locatk.core.lighthouse.room import Room, rectangle
+    from locatk.core.lighthouse.room import Room
+    from locatk.core.polygons import rectangle
 
     ending = Path(text).suffix.lower()
     given = [name for name, value in drawing.items() if value is not None]
@@ -382,7 +383,8 @@ def changed_room(
         raise click.UsageError("--robot-size is the size of --robots: add it.")
     import numpy as np
 
-    from locatk.core.lighthouse.room import Obstacle, RobotSize, rectangle
+    from locatk.core.lighthouse.room import Obstacle, RobotSize
+    from locatk.core.polygons import rectangle
 
     changes: dict[str, Any] = {}
     if floor is not None:

@@ -16,7 +16,6 @@ from locatk.cli.route_options import LengthAndAngle, odometry_noise, read_routes
 from locatk.cli.site.forecast import (
     laying_of,
     odometry_options,
-    plan_entry,
     plan_text,
     plan_warnings,
 )
@@ -197,7 +196,7 @@ def command(
         if not placed_at:
             console.result(plan_text(plan))
             if as_json:
-                console.emit_json({"version": 1, "output": None, "spacing": plan_entry(plan)})
+                console.emit_json({"version": 1, "output": None, "spacing": asdict(plan)})
             failures.finish_with_warnings(impossible)
         with error_context(route):
             site = place_tags(tags, placed_at, min_distance)
@@ -208,7 +207,7 @@ def command(
             )
         write_tags(output, site, overwrite=overwrite)
         console.result(f"{written_text(output, site)}\n\n{plan_text(plan)}\n")
-        more = {"output": output, "site": site_entry(site), "spacing": plan_entry(plan)}
+        more = {"output": output, "site": site_entry(site), "spacing": asdict(plan)}
         report_check(report, more, as_json, forecast=forecast, warnings=impossible)
         return
     placed_at = _points(tags, grid, points, route, spacing, origin, heading, columns, units)

@@ -9,7 +9,7 @@ import click
 
 from locatk.cli import console
 from locatk.cli.command import section
-from locatk.cli.route_options import LengthAndAngle, drift_option, slip_option
+from locatk.cli.route_options import LengthAndAngle, accuracy_text, drift_option, slip_option
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
@@ -65,11 +65,11 @@ def forecast_text(forecast: SiteForecast) -> str:
         rows += [
             (
                 "error on the route",
-                f"{_errors(forecast.position_p95_m, forecast.heading_p95_rad)} (95 %, live)",
+                f"{accuracy_text(forecast.position_p95_m, forecast.heading_p95_rad)} (95 %, live)",
             ),
             (
                 "error at a tag",
-                f"{_errors(forecast.fix_position_p95_m, forecast.fix_heading_p95_rad)} "
+                f"{accuracy_text(forecast.fix_position_p95_m, forecast.fix_heading_p95_rad)} "
                 "(95 %, one pass)",
             ),
             (
@@ -82,7 +82,7 @@ def forecast_text(forecast: SiteForecast) -> str:
 
 
 def forecast_entry(forecast: SiteForecast) -> dict[str, Any]:
-    """Return a forecast for ``--json``; unknown errors are null."""
+    """Return a forecast for ``--json``."""
     return {
         "length_m": forecast.length_m,
         "tags": forecast.tags,
@@ -128,20 +128,11 @@ def plan_text(plan: SpacingPlan) -> str:
     return console.labelled(rows)
 
 
-def plan_entry(plan: SpacingPlan) -> dict[str, Any]:
-    """Return the plan of a spacing for ``--json``."""
-    from dataclasses import asdict
-
-    return asdict(plan)
-
-
 def plan_warnings(plan: SpacingPlan, wanted: tuple[float, float]) -> list[str]:
     """Return what is possible, and what would have to change, if the wanted accuracy is not."""
     if plan.is_feasible:
         return []
-    wish = length_text(wanted[0])
-    if math.isfinite(wanted[1]):
-        wish += f" and {math.degrees(wanted[1]):.2g} deg"
+    wish = accuracy_text(*wanted)
     reasons = {
         "field": "no pass over a tag is detected",
         "length": "no tag is passed straight",
@@ -151,16 +142,12 @@ def plan_warnings(plan: SpacingPlan, wanted: tuple[float, float]) -> list[str]:
         return [f"{wish} is impossible: {reasons[plan.limited_by]}", *plan.remedies]
     if not math.isfinite(plan.position_p95_m):
         return [f"{wish} is impossible: no tag passes wholly below the array", *plan.remedies]
-    possible = _errors(plan.position_p95_m, plan.heading_p95_rad)
+    possible = accuracy_text(plan.position_p95_m, plan.heading_p95_rad)
     return [
         f"{wish} (95 %) is impossible on this route: tags {length_text(plan.spacing_m)} apart give "
         f"{possible}",
         *plan.remedies,
     ]
-
-
-def _errors(position_m: float, heading_rad: float) -> str:
-    return f"{length_text(position_m)}, {math.degrees(heading_rad):.2g} deg"
 
 
 def _count(number: int, noun: str) -> str:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from locatk.cli import console, failures
+from locatk.cli.materials_text import materials_text
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def text(report: DesignReport) -> str:
             "As placed: with errors of the magnets in the tag of "
             f"{length_text(report.build_m)} and {math.degrees(report.placement_rad):.2g} deg; the\n"
             "others are bounds by noise and environment.",
-            _materials_text(report),
+            materials_text(report.materials),
         )
     )
 
@@ -246,38 +247,6 @@ def _environment(environment: Environment) -> Iterator[tuple[str, str, str, str]
             "all sensors" if environment.is_common else f"in {length_text(environment.length_m)}"
         )
         yield "environment", _ut(environment.field_t), extent, environment.name
-
-
-def _materials_text(report: DesignReport) -> str:
-    """Format the bill of materials, its total, and the sources of its prices."""
-    from locatk.core.materials import total_of
-
-    total = total_of(report.materials)
-    head = ("material", "count", "", "each", f"sum {total.currency}".strip())
-    sources = {
-        f"{item.part}: {item.price.source}, {item.price.date}"
-        for item in report.materials
-        if item.price is not None
-    }
-    lines = [f"{total.text[0].upper()}{total.text[1:]}.", *sorted(sources)]
-    return "\n".join([console.table(head, list(_materials(report))), "", *_wrapped(lines)])
-
-
-def _wrapped(lines: list[str]) -> Iterator[str]:
-    for line in lines:
-        yield from textwrap.wrap(line, console.TEXT_COLUMNS)
-
-
-def _materials(report: DesignReport) -> Iterator[tuple[object, ...]]:
-    """Yield the rows of the bill of materials; long details take several rows."""
-    for item in report.materials:
-        first, *more = textwrap.wrap(item.detail, MAX_DETAIL_CHARACTERS) or [""]
-        prices = ("", "")
-        if item.price is not None:
-            prices = (f"{item.price.amount:g}", f"{item.amount:.2f}")
-        yield item.part, item.count, first, *prices
-        for line in more:
-            yield "", "", line, "", ""
 
 
 def _accuracy(name: str, bound: AccuracyBound, pose: bool) -> tuple[str, ...]:

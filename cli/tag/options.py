@@ -23,7 +23,6 @@ LENGTH_MM = options.PositiveNumber(1e-3, 1e5)
 
 CODECS = ("mosk", "redundant", "polaris-released")
 
-
 code_options = section(
     "Code",
     number(

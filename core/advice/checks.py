@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from locatk.core.advice.answer import AccuracyMap, Certainty, Check
 from locatk.core.advice.task import Task
-from locatk.core.lighthouse.design.visibility import is_inside
+from locatk.core.polygons import is_inside
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from locatk.core.advice.work import work_steps
 from locatk.core.dots.design.camera import PRINT_SIGMA_M, CameraReport, compare_sensors
 from locatk.core.dots.design.camera_sensors import SENSORS
 from locatk.core.error_quantiles import error_quantile
-from locatk.core.lighthouse.design.visibility import is_inside
 from locatk.core.materials import BillItem
 from locatk.core.paper_sizes import PAPER_SIZES_MM
 from locatk.core.polaris.design.routes import LAYING_SIGMA_M
+from locatk.core.polygons import is_inside
 
 PAPER_NAME = "A0"
 """Paper of large floors."""

@@ -26,8 +26,8 @@ from locatk.core.landmarks.design.routes import FloorForecast, forecast_floor
 from locatk.core.landmarks.design.visit_accuracy import VisitErrors
 from locatk.core.landmarks.landmark import Geometry
 from locatk.core.landmarks.map.floor import HOLE_CODE, FloorMap
-from locatk.core.lighthouse.design.visibility import is_inside
 from locatk.core.materials import BillItem
+from locatk.core.polygons import is_inside
 
 SMALLEST_PITCH_M, LARGEST_PITCH_M = 0.2, 1.0
 """Range of the distance between landmarks that is searched [m]: that of the paper's floor, and one

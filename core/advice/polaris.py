@@ -19,7 +19,6 @@ from locatk.core.advice.checks import (
 )
 from locatk.core.advice.task import Task
 from locatk.core.advice.work import work_steps
-from locatk.core.lighthouse.design.visibility import is_inside
 from locatk.core.polaris import codec
 from locatk.core.polaris.design.environment import MOTORS, QUIET, REINFORCED, Environment
 from locatk.core.polaris.design.planning import ReadingConditions, evaluate_design
@@ -27,6 +26,7 @@ from locatk.core.polaris.design.routes import SpacingPlan, plan_route, spacing_f
 from locatk.core.polaris.design.search import SearchSpace, search_designs
 from locatk.core.polaris.design.site import SitePoint, pass_separation
 from locatk.core.polaris.tag import Tags
+from locatk.core.polygons import is_inside
 from locatk.core.routes import Route
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.lighthouse.room import checked_outline, rectangle, signed_area
+from locatk.core.polygons import checked_outline, rectangle, signed_area
 from locatk.core.routes import Route
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from locatk.core.advice.task import FLOOR_WORK, INFRARED, IRON, Task
 from locatk.core.errors import error_context
-from locatk.core.lighthouse.room import rectangle
+from locatk.core.polygons import rectangle
 from locatk.core.routes import Route
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,

@@ -14,17 +14,10 @@ from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import MODELS, PARAMETERS, Calibration
-from locatk.core.lighthouse.room import (
-    MAX_CORNERS,
-    MAX_LENGTH_M,
-    MAX_ROBOTS,
-    MOUNTS,
-    Obstacle,
-    RobotSize,
-    Room,
-)
+from locatk.core.lighthouse.room import MAX_ROBOTS, MOUNTS, Obstacle, RobotSize, Room
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.core.lighthouse.scene.model import FRAME_SOURCES, JOINT_PARAMETERS
+from locatk.core.polygons import MAX_CORNERS, MAX_LENGTH_M
 from locatk.formats.artifacts.kinds import (
     ANY_NUMBER,
     MAX_VARIANCE,

@@ -31,10 +31,10 @@ from locatk.core.lighthouse.design.visibility import (
     has_line_of_sight,
     in_field_of_view,
     in_obstacle,
-    is_inside,
 )
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
-from locatk.core.lighthouse.room import Room, signed_area
+from locatk.core.lighthouse.room import Room
+from locatk.core.polygons import is_inside, signed_area
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]

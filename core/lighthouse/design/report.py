@@ -36,15 +36,10 @@ from locatk.core.lighthouse.design.visibility import (
 )
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.receiver import DECK
-from locatk.core.lighthouse.room import (
-    MOUNTING_POSITION_SIGMA_M,
-    MOUNTING_ROTATION_SIGMA_RAD,
-    Room,
-    rectangle,
-    signed_area,
-)
+from locatk.core.lighthouse.room import MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD, Room
 from locatk.core.lighthouse.scene import Scene, Station
 from locatk.core.lighthouse.scene.scene_errors import SceneErrors
+from locatk.core.polygons import rectangle, signed_area
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

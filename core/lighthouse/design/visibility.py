@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.lighthouse.room import RobotSize, Room
+from locatk.core.polygons import is_inside
 
 Array = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -132,17 +133,6 @@ def blocked_fraction(
     free_m2 = max(area_m2 - 4 * np.pi * radius**2, 4 * np.pi * radius**2)
     blocked = 1.0 - (1.0 - np.minimum(strip / free_m2, 1.0)) ** (robots.count - 1)
     return np.asarray(blocked)
-
-
-def is_inside(outline_m: Array, points_m: Array) -> BoolArray:
-    """Return True for the points (..., 2) inside a polygon (n, 2); either value on its edges."""
-    x, y = points_m[..., None, 0], points_m[..., None, 1]
-    x1, y1 = outline_m.T
-    x2, y2 = np.roll(outline_m, -1, axis=0).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossing_x = x1 + (y - y1) * (x2 - x1) / (y2 - y1)
-    is_right = ((y1 > y) != (y2 > y)) & (x < crossing_x)
-    return np.asarray(np.count_nonzero(is_right, axis=-1) % 2 == 1)
 
 
 def in_obstacle(room: Room, points_m: Array) -> BoolArray:

@@ -45,13 +45,13 @@ from locatk.core.lighthouse.room import (
     Obstacle,
     RobotSize,
     Room,
-    rectangle,
 )
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.lighthouse.scene.model import stack_stations
 from locatk.core.lighthouse.scene.standstills import find_standstills
 from locatk.core.lighthouse.simulation import SimulatedSession, SimulationOptions, simulate
 from locatk.core.lighthouse.solver import SolveOptions, solve
+from locatk.core.polygons import rectangle
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain

@@ -17,7 +17,8 @@ from locatk.core.lighthouse.design.placement import (
     refine,
     working_points,
 )
-from locatk.core.lighthouse.room import Obstacle, Room, rectangle
+from locatk.core.lighthouse.room import Obstacle, Room
+from locatk.core.polygons import rectangle
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
 from locatk.formats.benchmarks.timing import time_call
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import FormatError, InputError
-from locatk.core.lighthouse.room import checked_outline, signed_area
+from locatk.core.polygons import checked_outline, signed_area
 from locatk.formats.files import read_bytes
 from locatk.formats.importers.floors.dxf import UNIT_M, DxfReader
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
-from locatk.core.lighthouse.room import Obstacle, RobotSize, Room, rectangle
+from locatk.core.lighthouse.room import Obstacle, RobotSize, Room
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.polygons import rectangle
 from locatk.formats.artifacts.scene import loads_scene, read_scene, write_scene
 from locatk.formats.sessions import observations
 from locatk.formats.sessions.reader import Session

@@ -17,8 +17,9 @@ from locatk.core.lighthouse.drawing.mounting_sheet import (
     view_angles,
     wall_distances,
 )
-from locatk.core.lighthouse.room import Obstacle, Room, rectangle
+from locatk.core.lighthouse.room import Obstacle, Room
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.polygons import rectangle
 
 ROOM = Room(
     np.array([[0, 0], [7, 0], [7, 3], [3, 3], [3, 6], [0, 6]]),

@@ -11,15 +11,9 @@ from hypothesis import strategies as st
 
 from locatk.core.errors import InputError
 from locatk.core.geometry import Similarity, rotation_exp
-from locatk.core.lighthouse.room import (
-    Obstacle,
-    RobotSize,
-    Room,
-    checked_outline,
-    rectangle,
-    signed_area,
-)
+from locatk.core.lighthouse.room import Obstacle, RobotSize, Room
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.polygons import checked_outline, rectangle, signed_area
 
 L_SHAPE = np.array([[0, 0], [4, 0], [4, 1], [1, 1], [1, 3], [0, 3]], float)
 

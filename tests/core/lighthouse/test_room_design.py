@@ -37,9 +37,10 @@ from locatk.core.lighthouse.design.placement import (
     working_points,
 )
 from locatk.core.lighthouse.design.report import report_room, station_of
-from locatk.core.lighthouse.room import Obstacle, RobotSize, Room, rectangle
+from locatk.core.lighthouse.room import Obstacle, RobotSize, Room
 from locatk.core.lighthouse.scene import Scene
 from locatk.core.lighthouse.scene.model import JOINT_PARAMETERS
+from locatk.core.polygons import rectangle
 
 FLOOR = Room(rectangle(5.0, 4.0), 2.8, (0.1, 0.1))
 SPACE = Room(rectangle(5.0, 4.0), 2.8, (0.0, 1.2))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from locatk.core.lighthouse.design.markers import WALL_DISTANCE_M, propose_markers
-from locatk.core.lighthouse.room import Obstacle, Room, rectangle
+from locatk.core.lighthouse.room import Obstacle, Room
+from locatk.core.polygons import rectangle
 
 L_SHAPE = np.array([[0, 0], [6, 0], [6, 2], [2, 2], [2, 5], [0, 5.0]])
 

@@ -13,9 +13,9 @@ from locatk.core.lighthouse.design.visibility import (
     faces,
     has_line_of_sight,
     in_field_of_view,
-    is_inside,
 )
-from locatk.core.lighthouse.room import Obstacle, RobotSize, Room, rectangle, signed_area
+from locatk.core.lighthouse.room import Obstacle, RobotSize, Room
+from locatk.core.polygons import is_inside, rectangle, signed_area
 
 SAMPLES = 1001
 

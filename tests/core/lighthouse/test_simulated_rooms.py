@@ -9,11 +9,12 @@ import pytest
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
-from locatk.core.lighthouse.room import Obstacle, RobotSize, Room, rectangle
+from locatk.core.lighthouse.room import Obstacle, RobotSize, Room
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.lighthouse.simulation import SimulationOptions, simulate
 from locatk.core.lighthouse.simulation.rooms import RoomLight, RoomPath, mounted_stations
 from locatk.core.lighthouse.solver import solve
+from locatk.core.polygons import rectangle
 from tests.core.lighthouse.rooms import looking_at
 
 NO_MARKERS = np.zeros((0, 3))

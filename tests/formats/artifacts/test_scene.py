@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from locatk.core.errors import ArtifactError
 from locatk.core.geometry import rotation_exp
 from locatk.core.lighthouse.calibration import MODELS, Calibration
-from locatk.core.lighthouse.room import MOUNTS, Obstacle, RobotSize, Room, rectangle
+from locatk.core.lighthouse.room import MOUNTS, Obstacle, RobotSize, Room
 from locatk.core.lighthouse.scene import Distance, Marker, MarkerVisit, Scene, Station
 from locatk.core.lighthouse.scene.model import FRAME_SOURCES, JOINT_PARAMETERS
+from locatk.core.polygons import rectangle
 from locatk.formats.artifacts import scene as artifacts
 from locatk.formats.artifacts.scene import dumps_scene, format_time, loads_scene, parse_time
 

@@ -12,8 +12,9 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse.design import check_room
 from locatk.core.lighthouse.design.placement import view_rotation
 from locatk.core.lighthouse.design.report import station_of
-from locatk.core.lighthouse.room import Obstacle, Room, rectangle
+from locatk.core.lighthouse.room import Obstacle, Room
 from locatk.core.lighthouse.scene import Scene
+from locatk.core.polygons import rectangle
 from locatk.formats.plots.rooms import draw_room_maps, write_room_maps
 
 ROOM = Room(
