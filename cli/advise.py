@@ -12,7 +12,7 @@ import click
 from locatk.cli import console, failures, options
 from locatk.cli.command import combine
 from locatk.cli.price_options import price_options
-from locatk.cli.simulate.options import CONFIG_FILE, PRINT_CONFIG, SimulationCommand
+from locatk.cli.settings_command import CONFIG_FILE, PRINT_CONFIG, SettingsCommand
 
 QUESTIONS = (
     ("area.size_m", "Area in metres, as in 10x8"),
@@ -33,7 +33,7 @@ QUESTIONS = (
 @combine(
     click.command(
         "advise",
-        cls=SimulationCommand,
+        cls=SettingsCommand,
         module="locatk.formats.advice.task_settings",
         short_help="Compare the four systems for a task before buying.",
     ),

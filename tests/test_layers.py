@@ -221,7 +221,7 @@ def test_commands_import_little_at_import_time(root: Path) -> None:
         "locatk.core.printable",
         "locatk.core.units",
         "locatk.formats.artifacts.kinds",
-        "locatk.formats.simulation.settings",
+        "locatk.formats.settings.setting",
     }
     light = {"click", "locatk.cli", *light_modules} | set(sys.stdlib_module_names)
     for module in light_modules:

@@ -29,8 +29,8 @@ from locatk.formats.artifacts.kinds import (
     Unit,
 )
 from locatk.formats.importers.floors.site_csv import read_site_points
-from locatk.formats.simulation.config import SimulationConfig, with_values
-from locatk.formats.simulation.settings import Setting
+from locatk.formats.settings.config import SettingsConfig, with_values
+from locatk.formats.settings.setting import Setting
 
 UNTOUCHED = "none"
 """Work on a floor that must not be touched."""
@@ -61,7 +61,7 @@ class Rectangle:
         return [float(side) for side in value]
 
 
-CONFIG = SimulationConfig(
+CONFIG = SettingsConfig(
     "advise",
     (
         Setting(

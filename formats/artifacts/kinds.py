@@ -1,7 +1,7 @@
 """Kinds of values in TOML files: types, ranges, units and their descriptions.
 
 Artifacts (:mod:`locatk.formats.artifacts.schema`) and settings of the simulators
-(:mod:`locatk.formats.simulation.settings`) declare their keys with these kinds. A kind validates a
+(:mod:`locatk.formats.settings.setting`) declare their keys with these kinds. A kind validates a
 value as the TOML parser returns it (``parse``) or as text of the command line (``parse_text``),
 converts it to the types of TOML (``to_toml``), and describes itself for error messages and
 documentation (``expected``, ``plural``).

@@ -28,8 +28,8 @@ from locatk.formats.artifacts.kinds import (
     Text,
 )
 from locatk.formats.sessions.frames import Shot, write_shots
-from locatk.formats.simulation.config import SettingsError, SimulationConfig
-from locatk.formats.simulation.settings import Requirement, Setting
+from locatk.formats.settings.config import SettingsConfig, SettingsError
+from locatk.formats.settings.setting import Requirement, Setting
 
 CODECS = ("anoto", "libdots", "microdots")
 
@@ -43,7 +43,7 @@ CAMERA_FILE, IS_CALIBRATED = "camera.file", "camera.calibrated"
 DISTORTION = "camera.distortion_percent"
 PITCH, ROLL = "camera.pitch_deg", "camera.roll_deg"
 
-CONFIG = SimulationConfig(
+CONFIG = SettingsConfig(
     "dots",
     (
         Setting(

@@ -34,8 +34,8 @@ from locatk.formats.artifacts.kinds import (
     Text,
 )
 from locatk.formats.sessions import field_samples
-from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
-from locatk.formats.simulation.settings import Requirement, Setting
+from locatk.formats.settings.config import SettingsConfig, SettingsError, with_values
+from locatk.formats.settings.setting import Requirement, Setting
 from locatk.formats.tables.delimited import read_table
 
 STRATEGY = "robot.strategy"
@@ -432,7 +432,7 @@ _FAULTS = (
     ),
 )
 
-CONFIG = SimulationConfig(
+CONFIG = SettingsConfig(
     "landmarks",
     (
         *_ROBOT,

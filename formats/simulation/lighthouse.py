@@ -22,8 +22,8 @@ from locatk.formats.artifacts.kinds import (
 from locatk.formats.artifacts.receiver import read_receiver
 from locatk.formats.artifacts.scene import read_scene
 from locatk.formats.sessions import observations
-from locatk.formats.simulation.config import SimulationConfig
-from locatk.formats.simulation.settings import Setting
+from locatk.formats.settings.config import SettingsConfig
+from locatk.formats.settings.setting import Setting
 
 DECK_NAME = "deck"
 """Name of Bitcraze's Lighthouse deck as a receiver."""
@@ -37,7 +37,7 @@ EVERY_SWEEP_HZ = 120.0
 NOISE_UDEG = 300.0
 """Jitter of the rotor (paper IV.A) [microdegrees]."""
 
-CONFIG = SimulationConfig(
+CONFIG = SettingsConfig(
     "lighthouse",
     (
         Setting("robots.count", Integer(1), "Number of robots", "robots", "--robots"),

@@ -31,8 +31,8 @@ from locatk.formats.artifacts.kinds import (
 )
 from locatk.formats.artifacts.tags import read_array, read_tags
 from locatk.formats.sessions import field_samples
-from locatk.formats.simulation.config import SimulationConfig
-from locatk.formats.simulation.settings import Setting
+from locatk.formats.settings.config import SettingsConfig
+from locatk.formats.settings.setting import Setting
 
 DEFAULT_CAR = "robot"
 
@@ -371,7 +371,7 @@ _ODOMETRY = (
     ),
 )
 
-CONFIG = SimulationConfig(
+CONFIG = SettingsConfig(
     "polaris",
     (
         *_ROBOT,

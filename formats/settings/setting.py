@@ -1,4 +1,4 @@
-"""Declaration of the settings of a simulation: keys, kinds, meanings, defaults and flags.
+"""Declaration of the settings of a simulation or a task: keys, kinds, meanings, defaults and flags.
 
 The kinds of values are those of all TOML files (:mod:`locatk.formats.artifacts.kinds`). A kind is
 parsed from TOML and, if the setting has a flag, from the command line. Values stay in the units of
@@ -21,7 +21,7 @@ NO_DEFAULT: Any = object()
 
 @dataclass(frozen=True)
 class Setting:
-    """One option of a simulation.
+    """One option of a simulation or a task.
 
     Attributes
     ----------

@@ -1,13 +1,13 @@
-"""Configuration file of a simulation: TOML with a comment for every key.
+"""Configuration file of a simulation or a task: TOML with a comment for every key.
 
 Each simulator declares its settings once, as :class:`Setting`: key, type and range, meaning,
-default, and possibly a flag. The TOML file (:meth:`SimulationConfig.dumps`,
-:meth:`SimulationConfig.read`) and the options of the command line
-(:mod:`locatk.cli.simulate.options`) are made of that declaration.
+default, and possibly a flag. The TOML file (:meth:`SettingsConfig.dumps`,
+:meth:`SettingsConfig.read`) and the options of the command line
+(:mod:`locatk.cli.settings_command`) are made of that declaration.
 
 Settings are kept as a mapping from key to value, in the units of the file, which holds only what
-was set. Values of the command line override those of the file (:meth:`SimulationConfig.merge`);
-:meth:`SimulationConfig.in_si` converts them to the units of the simulators.
+was set. Values of the command line override those of the file (:meth:`SettingsConfig.merge`);
+:meth:`SettingsConfig.in_si` converts them to the units of the simulators.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from locatk.formats.artifacts import toml
 from locatk.formats.artifacts.kinds import FilePath, ListOf, Number
 from locatk.formats.artifacts.schema import Key, Table, header, parse_document
 from locatk.formats.artifacts.toml import Inline
-from locatk.formats.simulation.settings import NO_DEFAULT, Requirement, Setting
+from locatk.formats.settings.setting import NO_DEFAULT, Requirement, Setting
 
 FORMAT_VERSION = 1
 """Version of the configuration files of all simulators."""
@@ -41,8 +41,8 @@ class SettingsError(InputError):
 
 
 @dataclass(frozen=True)
-class SimulationConfig:
-    """Settings of one simulator.
+class SettingsConfig:
+    """Settings of one simulator, or of a task.
 
     Attributes
     ----------

@@ -21,20 +21,20 @@ from locatk.formats.artifacts.kinds import (
     Record,
     Row,
 )
+from locatk.formats.settings.config import SettingsConfig, SettingsError, with_values
 from locatk.formats.simulation import dots, landmarks, lighthouse, polaris
-from locatk.formats.simulation.config import SettingsError, SimulationConfig, with_values
 
 CONFIGS = [module.CONFIG for module in (dots, landmarks, lighthouse, polaris)]
 IDS = [config.system for config in CONFIGS]
 FLIPPED = "[faults]\nflipped_bars"
 
 
-def text_of(config: SimulationConfig, body: str) -> str:
+def text_of(config: SettingsConfig, body: str) -> str:
     """A configuration file with these tables."""
     return f'format = "locatk-simulation-{config.system}"\nformat_version = 1\n{body}\n'
 
 
-def other_value(config: SimulationConfig, key: str) -> Any:
+def other_value(config: SettingsConfig, key: str) -> Any:
     """A valid value of a setting that is not its default."""
     setting = config.setting(key)
     default = config.default(setting)
@@ -51,7 +51,7 @@ def other_value(config: SimulationConfig, key: str) -> Any:
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=IDS)
-def test_the_file_sets_nothing_and_explains_every_key(config: SimulationConfig) -> None:
+def test_the_file_sets_nothing_and_explains_every_key(config: SettingsConfig) -> None:
     text = config.dumps()
     assert config.loads(text) == {}
     for setting in config.settings:
@@ -63,7 +63,7 @@ def test_the_file_sets_nothing_and_explains_every_key(config: SimulationConfig) 
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=IDS)
-def test_the_defaults_of_the_file_are_those_of_the_simulator(config: SimulationConfig) -> None:
+def test_the_defaults_of_the_file_are_those_of_the_simulator(config: SettingsConfig) -> None:
     """To the last bit: uncommenting a default changes nothing."""
     with_default = {
         setting.key: config.default(setting)
@@ -87,7 +87,7 @@ def test_the_defaults_of_the_file_are_those_of_the_simulator(config: SimulationC
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=IDS)
-def test_every_setting_comes_back_from_the_file(config: SimulationConfig) -> None:
+def test_every_setting_comes_back_from_the_file(config: SettingsConfig) -> None:
     settings = {setting.key: other_value(config, setting.key) for setting in config.settings}
     for setting in config.settings:
         assert settings[setting.key] != config.default(setting)
@@ -99,7 +99,7 @@ def test_every_setting_comes_back_from_the_file(config: SimulationConfig) -> Non
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=IDS)
-def test_keys_fields_and_options_are_unique(config: SimulationConfig) -> None:
+def test_keys_fields_and_options_are_unique(config: SettingsConfig) -> None:
     keys = [setting.key for setting in config.settings]
     fields = [setting.field for setting in config.settings if setting.field]
     flags = [name for setting in config.settings for name in setting.flag.split("/") if name]
@@ -231,7 +231,7 @@ def test_a_switch_that_is_off_excludes_nothing() -> None:
     ],
 )
 def test_settings_that_contradict_each_other(
-    config: SimulationConfig, file: dict[str, Any], flags: dict[str, Any], expected: str
+    config: SettingsConfig, file: dict[str, Any], flags: dict[str, Any], expected: str
 ) -> None:
     with pytest.raises(SettingsError, match=re.escape(expected)):
         config.merge(file, flags)
