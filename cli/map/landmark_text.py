@@ -279,8 +279,8 @@ def search_warnings(
     best_errors = best.forecast.position_p95_m, best.forecast.heading_p95_rad
     return [
         f"{accuracy_text(*wanted)} (95 %) is impossible at a pitch of {length_text(pitch_m)}: the "
-        f"best bars, {_size(best.analysis.geometry)}, give {accuracy_text(*best_errors)}; make the pitch "
-        "smaller, calibrate the odometry, or measure the landmarks (locatk calibrate map)"
+        f"best bars, {_size(best.analysis.geometry)}, give {accuracy_text(*best_errors)}; make "
+        "the pitch smaller, calibrate the odometry, or measure the landmarks (locatk calibrate map)"
     ]
 
 

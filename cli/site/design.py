@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -178,46 +179,46 @@ def command(
     options.guard_output(output, overwrite=overwrite, inputs=inputs)
     tags = read_tags(tag)
     use = reading_conditions(**conditions)
-    if accuracy is not None and route is not None:
-        waypoints, _ = read_site_points(route, columns, units or ())
-        wanted = accuracy[0], math.inf if accuracy[1] is None else accuracy[1]
-        noise, laid = odometry_noise(drift, slip), laying_of(laying, tags)
+    table_options = columns, units or ()
+    noise, laid = odometry_noise(drift, slip), laying_of(laying, tags)
+    if accuracy is None or route is None:
+        plan, warnings = None, list[str]()
+        placed_at = _points(tags, grid, points, route, spacing, origin, heading, *table_options)
+    else:
+        waypoints, _ = read_site_points(route, *table_options)
+        wanted = accuracy[0], accuracy[1] or math.inf
         with console.working("Planning"), error_context(route):
             placed_at, plan = plan_route(tags, waypoints, use, noise, *wanted, laying=laid)
-        impossible = plan_warnings(plan, wanted)
+        warnings = plan_warnings(plan, wanted)
         ids = capacity(tags) if tags.ids is None else len(tags.ids)
         if len(placed_at) > ids:
-            impossible = [
-                f"{len(placed_at)} tags are needed, but there are {ids} ids: design more (`locatk "
-                f"tag design --search --count {len(placed_at)}`), or take a lower accuracy",
-                *impossible,
-            ]
+            needed = len(placed_at)
+            warnings.insert(
+                0,
+                f"{needed} tags are needed, but there are {ids} ids: design more (`locatk tag "
+                f"design --search --count {needed}`), or take a lower accuracy",
+            )
             placed_at = []
         if not placed_at:
             console.result(plan_text(plan))
             if as_json:
                 console.emit_json({"version": 1, "output": None, "spacing": asdict(plan)})
-            failures.finish_with_warnings(impossible)
-        with error_context(route):
-            site = place_tags(tags, placed_at, min_distance)
-        with console.working("Checking"):
-            report = check_site(site, use)
-            forecast = forecast_routes(
-                site, read_routes([route], columns, units), use, noise, laying=laid
-            )
-        write_tags(output, site, overwrite=overwrite)
-        console.result(f"{written_text(output, site)}\n\n{plan_text(plan)}\n")
-        more = {"output": output, "site": site_entry(site), "spacing": asdict(plan)}
-        report_check(report, more, as_json, forecast=forecast, warnings=impossible)
-        return
-    placed_at = _points(tags, grid, points, route, spacing, origin, heading, columns, units)
+            failures.finish_with_warnings(warnings)
     with error_context(table or tag):
         site = place_tags(tags, placed_at, min_distance)
+    forecast = None
     with console.working("Checking"):
         report = check_site(site, use)
+        if plan is not None and route is not None:
+            paths = read_routes([route], *table_options)
+            forecast = forecast_routes(site, paths, use, noise, laying=laid)
     write_tags(output, site, overwrite=overwrite)
+    more: dict[str, Any] = {"output": output, "site": site_entry(site)}
     console.result(written_text(output, site) + "\n")
-    report_check(report, {"output": output, "site": site_entry(site)}, as_json)
+    if plan is not None:
+        more["spacing"] = asdict(plan)
+        console.result(plan_text(plan) + "\n")
+    report_check(report, more, as_json, forecast=forecast, warnings=warnings)
 
 
 def _points(
@@ -229,11 +230,9 @@ def _points(
     origin: tuple[float, float],
     heading: float,
     columns: dict[str, str] | None,
-    units: tuple[str, ...] | None,
+    units: tuple[str, ...],
 ) -> list[SitePoint]:
     """Return the points for tags."""
-    from dataclasses import replace
-
     from locatk.core.errors import error_context
     from locatk.core.polaris.design.site import grid_points, route_points
     from locatk.formats.importers.floors.site_csv import read_site_points
@@ -242,13 +241,13 @@ def _points(
         x, y = origin
         return grid_points(*grid, metres(spacing), (metres(x), metres(y)), math.radians(heading))
     if points is not None:
-        found, has_heading = read_site_points(points, columns, units or ())
+        found, has_heading = read_site_points(points, columns, units)
         if has_heading:
             return found
         return [replace(point, heading_rad=math.radians(heading)) for point in found]
     if route is None or spacing is None:
         raise AssertionError("no source of points")
-    waypoints, _ = read_site_points(route, columns, units or ())
+    waypoints, _ = read_site_points(route, columns, units)
     with error_context(route):
         found, left_out = route_points(waypoints, metres(spacing), tags.order * tags.spacing_m)
     if left_out:

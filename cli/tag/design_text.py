@@ -23,10 +23,6 @@ MAX_ID_LIST_CHARACTERS = 36
 """Longest list of the ids of a family."""
 
 
-MAX_DETAIL_CHARACTERS = 36
-"""Longest line of the detail of a material."""
-
-
 def report_evaluation(
     report: DesignReport, warnings: list[str], more: dict[str, Any], as_json: bool
 ) -> None:
