@@ -68,6 +68,12 @@ MIN_SAMPLES_PER_PEAK = 5.0
 MAX_EARTH_FIELD_T = 65e-6
 """Strongest magnetic field of the Earth on its surface (near the poles)."""
 
+PROBABILITY = 0.95
+"""Probability of the errors that a forecast or a search states."""
+
+NORMAL_QUANTILE = 1.96
+"""Error of one component in standard deviations that is not exceeded with it."""
+
 SAMPLED_LAYOUTS = 8
 """Number of layouts of a family over which the accuracy is averaged."""
 
@@ -102,6 +108,16 @@ class ReadingConditions:
     speed_mps: float = 0.1
     placement_rad: float | None = None
     environment: Environment = QUIET
+
+    @property
+    def array_m(self) -> float:
+        """Distance between the outermost sensors."""
+        return (self.sensors - 1) * self.sensor_spacing_m
+
+    @property
+    def step_m(self) -> float:
+        """Distance between two samples."""
+        return self.speed_mps / min(self.rate_hz or math.inf, self.settings.max_rate_hz)
 
 
 @dataclass(frozen=True)
@@ -313,8 +329,7 @@ def evaluate_design(
         )
 
     array, noise_from = sensor_array(use)
-    varying_t = 0.0 if use.environment.is_common else use.environment.field_t
-    horizontal_noise = float(np.sqrt(np.mean(array.noise_t[:2] ** 2) + varying_t**2))
+    horizontal_noise = horizontal_noise_t(array, use.environment)
     midway = use.sensor_spacing_m / 2 if use.sensors > 1 else 0.0
     peak = _field_strength(magnet, [0, 0, clearance])
     between = min(
@@ -323,8 +338,8 @@ def evaluate_design(
     )
     separate_spacing = field_width(magnet, clearance, SEPARATION_FIELD_FRACTION)
     half_across = field_width(magnet, clearance, 0.5, across=True)
-    rate = min(use.rate_hz or math.inf, part.max_rate_hz)
-    step = use.speed_mps / rate
+    step = use.step_m
+    rate = use.speed_mps / step
     layouts = sample_layouts(tags, SAMPLED_LAYOUTS)
     environment = use.environment
     placement = _placement_sigma(tags) if use.placement_rad is None else use.placement_rad
@@ -335,7 +350,7 @@ def evaluate_design(
     half_step_sigmas = math.pi / tags.orientations / angle_sigma
     neighbour_angle, neighbour_shift = neighbour_error(tags.spacing_m, clearance)
     tag_width = (tags.order - 1) * tags.spacing_m
-    array_width = (use.sensors - 1) * use.sensor_spacing_m
+    array_width = use.array_m
     report = DesignReport(
         tags=tags,
         use=use,
@@ -380,6 +395,17 @@ def sample_layouts(tags: Tags, count: int) -> list[TagLayout]:
     total = codec.capacity(tags) if tags.ids is None else len(tags.ids)
     numbers = [generator.randrange(total) for _ in range(count)]
     return [codec.layout_of(tags, n if tags.ids is None else tags.ids[n]) for n in numbers]
+
+
+def horizontal_noise_t(array: SensorArray, environment: Environment) -> float:
+    """Return the noise of x and y, with the fields of the environment that sensors do not share."""
+    varying_t = 0.0 if environment.is_common else environment.field_t
+    return float(np.sqrt(np.mean(array.noise_t[:2] ** 2) + varying_t**2))
+
+
+def errors_text(position_m: float, heading_rad: float) -> str:
+    """Format errors of position and heading."""
+    return f"{length_text(position_m)} and {math.degrees(heading_rad):.2g} deg"
 
 
 def _accuracy(

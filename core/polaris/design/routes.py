@@ -19,7 +19,14 @@ from locatk.core.error_quantiles import error_quantile
 from locatk.core.errors import InputError
 from locatk.core.polaris import codec
 from locatk.core.polaris.design.accuracy_bound import magnet_covariance, rotate
-from locatk.core.polaris.design.planning import ReadingConditions, sample_layouts, sensor_array
+from locatk.core.polaris.design.planning import (
+    NORMAL_QUANTILE,
+    PROBABILITY,
+    ReadingConditions,
+    errors_text,
+    sample_layouts,
+    sensor_array,
+)
 from locatk.core.polaris.design.site import (
     MAX_SITE_TAGS,
     SitePoint,
@@ -73,20 +80,12 @@ STEPS_PER_SPACING = 8
 """Points per spacing at which the accuracy is computed while a spacing is searched."""
 
 STRAIGHT_ODOMETRY_ERRORS = (
-    "scale",
-    "drift_rad_per_m",
-    "distance_m",
-    "heading_rad",
-    "slip_m",
-    "slip_rad",
-)
-"""Errors of odometry on a straight route."""
+    "scale", "drift_rad_per_m", "distance_m", "heading_rad", "slip_m", "slip_rad",
+)  # fmt: skip
+"""Errors of odometry on a straight route, fields of ``OdometryNoise``."""
 
 TOLERANCE_M = 1e-8
 """Tolerance of positions [m]: those of a site are rounded to a nanometre."""
-
-PROBABILITY, NORMAL_QUANTILE = 0.95, 1.96
-"""Probability of the errors of a forecast, and those of one component in standard deviations."""
 
 
 # ---- one pass
@@ -142,7 +141,6 @@ def tag_fix_covariance(
     """
     use = use or ReadingConditions()
     array, _ = sensor_array(use)
-    step_m = use.speed_mps / min(use.rate_hz or math.inf, use.settings.max_rate_hz)
     layouts = sample_layouts(tags, SAMPLED_LAYOUTS)
     if tag_id is not None:
         layouts = [codec.layout_of(tags, tag_id)]
@@ -155,7 +153,7 @@ def tag_fix_covariance(
             tags,
             layout,
             array,
-            step_m=step_m,
+            step_m=use.step_m,
             heading_rad=heading_rad,
             offset_m=offset_m,
             nuisance="strength" if has_odometry else "steps",
@@ -171,16 +169,10 @@ def tag_fix_covariance(
     jacobian = np.diag([-1.0, -1.0, -1.0])
     jacobian[0, 2] = -offset_m
     covariance = jacobian @ np.mean(matches, axis=0) @ jacobian.T
-    x_m, y_m, tag_rad = _laying(tags, tag_id, laying)
-    # Site axes are turned into those of the array only if both axes differ.
     by_tag = np.eye(3)
     by_tag[0, 2] = offset_m
-    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    turn = np.array([[cos, -sin], [sin, cos]])
-    laid = np.zeros((3, 3))
-    laid[:2, :2] = turn @ np.diag([x_m**2, y_m**2]) @ turn.T
-    laid[2, 2] = tag_rad**2
-    return np.asarray(covariance + by_tag @ laid @ by_tag.T)
+    laid = by_tag @ _laying_covariance(tags, tag_id, heading_rad, laying) @ by_tag.T
+    return np.asarray(covariance + laid)
 
 
 def path_covariance(along_m: Array, noise: OdometryNoise, *, has_scale: bool) -> Array:
@@ -232,16 +224,18 @@ def laying_sigma(tags: Tags) -> tuple[float, float]:
     return LAYING_SIGMA_M, math.sqrt(2) * EDGE_SIGMA_M / edge_m
 
 
-def _laying(
-    tags: Tags, tag_id: int | None, laying: tuple[float, float] | None
-) -> tuple[float, float, float]:
-    """Return the standard deviations of x, y and heading of a tag on the floor."""
-    if laying is not None:
-        return laying[0], laying[0], laying[1]
-    if tag_id is not None and tag_id in tags.site_sigma:
-        return tags.site_sigma[tag_id]
-    position_m, heading_rad = laying_sigma(tags)
-    return position_m, position_m, heading_rad
+def _laying_covariance(
+    tags: Tags, tag_id: int | None, heading_rad: float, laying: tuple[float, float] | None
+) -> Array:
+    """Return the covariance (3, 3) of a tag on the floor, in the axes of the array."""
+    if laying is not None or tag_id is None or tag_id not in tags.site_sigma:
+        position_m, angle_rad = laying or laying_sigma(tags)
+        return np.diag(np.square([position_m, position_m, angle_rad]))
+    # Standard deviations of a site are along its axes.
+    site_rad = heading_rad - tags.site[tag_id].heading_rad
+    rotation = np.eye(3)
+    rotation[:2, :2] = rotate(np.eye(2), site_rad).T
+    return np.asarray(rotation @ np.diag(np.square(tags.site_sigma[tag_id])) @ rotation.T)
 
 
 def _match_covariance(
@@ -306,7 +300,7 @@ def find_tag_passes(
     :data:`MAX_TURN_RAD` in between.
     """
     use = use or ReadingConditions()
-    half_array_m = (use.sensors - 1) * use.sensor_spacing_m / 2
+    half_array_m = use.array_m / 2
     start_m = np.concatenate([[0.0], np.cumsum(route.segment_m)])
     is_sharp = _sharp_turns(route)
     half_m = (tags.order - 1) / 2 * tags.spacing_m
@@ -324,13 +318,13 @@ def find_tag_passes(
             pose = tags.site[tag_id]
             along_m, left_m = local_m[number].tolist()
             relative = math.remainder(pose.heading_rad - heading, math.tau)
-            turned = rotate(corners, relative)
-            reach_m = float(turned[:, 0].max())
-            first_m = reach_m if is_sharp[k] else -reach_m
-            last_m = length_m + (-reach_m if is_sharp[k + 1] else reach_m)
+            corners_m = rotate(corners, relative)
+            half_length_m = float(corners_m[:, 0].max())
+            first_m = half_length_m if is_sharp[k] else -half_length_m
+            last_m = length_m + (-half_length_m if is_sharp[k + 1] else half_length_m)
             if not first_m - TOLERANCE_M <= along_m <= last_m + TOLERANCE_M:
                 continue
-            play_m = half_array_m - abs(left_m) - float(turned[:, 1].max())
+            play_m = half_array_m - abs(left_m) - float(corners_m[:, 1].max())
             if play_m >= -TOLERANCE_M:
                 distance_m = float(start_m[k] + min(max(along_m, 0.0), length_m))
                 passes.append(TagPass(tag_id, distance_m, left_m, relative, max(play_m, 0.0)))
@@ -541,10 +535,10 @@ def _route_warnings(tags: Tags, use: ReadingConditions, forecast: RouteForecast)
     """Describe where a robot may miss the tags of a route."""
     name, passes = forecast.route.name, forecast.passes
     if not passes:
-        width_m, tag_m = (use.sensors - 1) * use.sensor_spacing_m, (tags.order - 1) * tags.spacing_m
+        tag_m = (tags.order - 1) * tags.spacing_m
         return [
-            f"on route {name}, no tag passes wholly below the array of {length_text(width_m)}; a "
-            f"tag is {length_text(tag_m)} wide, and a robot that turns over it cannot read it"
+            f"on route {name}, no tag passes wholly below the array of {length_text(use.array_m)}; "
+            f"a tag is {length_text(tag_m)} wide, and a robot that turns over it cannot read it"
         ]
     missed = forecast.missed
     if not missed:
@@ -650,15 +644,15 @@ def spacing_for_accuracy(
         unknown = math.inf, math.inf
         return SpacingPlan(False, math.nan, *unknown, *unknown, "field", (remedy,))
     single = _quantiles(fix[None], np.ones(1))
-    play_m = ((use.sensors - 1) * use.sensor_spacing_m - (tags.order - 1) * tags.spacing_m) / 2
+    play_m = (use.array_m - (tags.order - 1) * tags.spacing_m) / 2
 
     def limits(spacing_m: float) -> tuple[tuple[float, float, float], tuple[str, ...]]:
         """Return the errors of position, heading, and across before a tag, and exceeded limits."""
         route = Route(np.array([[0.0, 0.0], [PLANNED_GAPS * spacing_m, 0.0]]))
-        places_m = spacing_m * np.arange(PLANNED_GAPS + 1)
+        tags_m = np.minimum(spacing_m * np.arange(PLANNED_GAPS + 1), route.length_m).tolist()
         accuracy = predict_accuracy(
             route,
-            [RouteFix(float(min(place, route.length_m)), fix) for place in places_m],
+            [RouteFix(distance_m, fix) for distance_m in tags_m],
             noise,
             use.speed_mps,
             step_m=spacing_m / STEPS_PER_SPACING,
@@ -666,7 +660,7 @@ def spacing_for_accuracy(
         errors = (
             accuracy.position_quantile_m(),
             accuracy.heading_quantile_rad(),
-            max(lateral_p95_m(accuracy, place) for place in places_m[1:].tolist()),
+            max(lateral_p95_m(accuracy, distance_m) for distance_m in tags_m[1:]),
         )
         exceeded = {
             "position": errors[0] > position_m,
@@ -711,11 +705,11 @@ def _remedies(
 
         def after(build_m: float | None) -> str:
             exact = tag_fix_covariance(tags, use, laying=(0.0, 0.0), build_m=build_m, noise=noise)
-            return _errors_text(*_quantiles(exact[None], np.ones(1)))
+            return errors_text(*_quantiles(exact[None], np.ones(1)))
 
         return (
-            f"a single pass has errors of {_errors_text(*single)} (95 %): the tags are laid to "
-            f"{_errors_text(*(laying or laying_sigma(tags)))} and their magnets to "
+            f"a single pass has errors of {errors_text(*single)} (95 %): the tags are laid to "
+            f"{errors_text(*(laying or laying_sigma(tags)))} and their magnets to "
             f"{length_text(HAND_BUILT_SIGMA_M)} rms",
             f"survey the tags (`locatk site survey`): up to {after(None)}",
             "also measure the magnets as built (`locatk calibrate tag`): up to "
@@ -724,20 +718,7 @@ def _remedies(
     if excess_m > 0:
         needed = use.sensors + math.ceil(2 * excess_m / use.sensor_spacing_m)
         return (f"the robot misses tags: take a wider array, of {needed} sensors or more",)
-    better = replace(
-        noise,
-        **{
-            name: getattr(noise, name) / 2
-            for name in (
-                "scale",
-                "drift_rad_per_m",
-                "distance_m",
-                "heading_rad",
-                "slip_m",
-                "slip_rad",
-            )
-        },
-    )
+    better = replace(noise, **{name: getattr(noise, name) / 2 for name in STRAIGHT_ODOMETRY_ERRORS})
     plan = spacing_for_accuracy(tags, use, better, *wanted, laying=laying)
     if plan.is_feasible:
         return (
@@ -747,11 +728,7 @@ def _remedies(
     return ("take odometry with less than half of these errors",)
 
 
-def _errors_text(position_m: float, heading_rad: float) -> str:
-    return f"{length_text(position_m)} and {math.degrees(heading_rad):.2g} deg"
-
-
-def route_points(
+def points_along_route(
     tags: Tags, waypoints: Sequence[SitePoint], spacing_m: float, min_spacing_m: float = 0.0
 ) -> tuple[Route, list[SitePoint]]:
     """Return a route, and points for tags along it that are passed straight.
@@ -780,7 +757,7 @@ def route_points(
     margin_m = half_m + RUN_UP_CLEARANCES * tags.clearance_m
     start_m = np.concatenate([[0.0], np.cumsum(route.segment_m)])
     ends_m = start_m[_sharp_turns(route)]
-    places: list[float] = []
+    distances_m: list[float] = []
 
     def gaps(length_m: float) -> int:
         most = math.floor(length_m / min_spacing_m + 1e-9) if min_spacing_m > 0 else MAX_SITE_TAGS
@@ -798,9 +775,9 @@ def route_points(
             count = max(1, gaps(last_m - first_m))
             along = first_m + margin_m + (last_m - first_m) / count * np.arange(count)
             along = along[along <= last_m - margin_m + TOLERANCE_M]
-        check_tag_count(len(places) + count)
-        places += along.tolist()
-    position_m, heading = route.at(np.array(places))
+        check_tag_count(len(distances_m) + count)
+        distances_m += along.tolist()
+    position_m, heading = route.at(np.array(distances_m))
     headings = np.append(route.heading_rad, route.heading_rad[-1]).tolist()
     points = [
         replace(point, heading_rad=angle)
@@ -809,12 +786,14 @@ def route_points(
     ]
     size_m = tags.order * tags.spacing_m
     taken = [complex(point.x_m, point.y_m) for point in points]
-    for place, (x_m, y_m), angle in zip(places, position_m.tolist(), heading.tolist(), strict=True):
+    for distance_m, (x_m, y_m), angle in zip(
+        distances_m, position_m.tolist(), heading.tolist(), strict=True
+    ):
         position = complex(x_m, y_m)
         if taken and np.abs(np.array(taken) - position).min() < size_m - TOLERANCE_M:
             continue
         taken.append(position)
-        points.append(SitePoint(x_m, y_m, angle, name=f"{place:.3g} m along the route"))
+        points.append(SitePoint(x_m, y_m, angle, name=f"{distance_m:.3g} m along the route"))
     return route, points
 
 
@@ -834,7 +813,8 @@ def plan_route(
     route (turns, tags that are not passed) has the accuracy, too. If that is impossible, the
     points are those of the smallest spacing.
 
-    The parameters and errors are those of :func:`spacing_for_accuracy` and :func:`route_points`.
+    The parameters and errors are those of :func:`spacing_for_accuracy` and
+    :func:`points_along_route`.
     """
     plan = spacing_for_accuracy(tags, use, noise, position_m, heading_rad, laying=laying)
     smallest_m = pass_separation(tags, use)
@@ -842,7 +822,7 @@ def plan_route(
         return [], plan
 
     def forecast(spacing_m: float) -> tuple[list[SitePoint], SiteForecast]:
-        route, points = route_points(tags, waypoints, spacing_m, smallest_m)
+        route, points = points_along_route(tags, waypoints, spacing_m, smallest_m)
         site = {k: PlanarPose(p.x_m, p.y_m, p.heading_rad) for k, p in enumerate(points)}
         trial = replace(tags, site=site, built={}, site_sigma={}, ids=None)
         return points, forecast_routes(trial, [route], use, noise, laying=laying)

@@ -25,12 +25,16 @@ from locatk.core.polaris.design.planning import (
     MAX_EARTH_FIELD_T,
     MERGED_PEAK_SPACING_CLEARANCES,
     MIN_SIGNAL_TO_NOISE,
+    NORMAL_QUANTILE,
     ORIENTATION_MARGIN_SIGMAS,
     PLACEMENT_SIGMA_RAD,
+    PROBABILITY,
     ReadingConditions,
     compact_spacing,
     disc_field,
+    errors_text,
     evaluate_design,
+    horizontal_noise_t,
     sample_layouts,
     sensor_array,
 )
@@ -76,11 +80,9 @@ MAX_EVALUATIONS = 60
 NOTHING_FITS = "no tag with so many ids fits below the array"
 """Reason if no magnet is to blame."""
 
-PROBABILITY = 0.95
-"""Probability of the errors of a design."""
-
-CIRCLE_QUANTILE, NORMAL_QUANTILE = math.sqrt(-2 * math.log(1 - PROBABILITY)), 1.96
-"""Errors in standard deviations that are not exceeded with 95 %, in two dimensions and in one."""
+CIRCLE_QUANTILE = math.sqrt(-2 * math.log(1 - PROBABILITY))
+"""Length of errors with two equal components, in standard deviations, that is not exceeded with
+:data:`.planning.PROBABILITY`."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,11 @@ class TagDesign:
     def side_m(self) -> float:
         """Side of the sheet: a spacing more than the grid."""
         return self.tags.order * self.tags.spacing_m
+
+    @property
+    def errors_text(self) -> str:
+        """Errors of position and heading in words."""
+        return errors_text(self.position_p95_m, self.heading_p95_rad)
 
 
 @dataclass(frozen=True)
@@ -213,7 +220,7 @@ def search_designs(
         built = _evaluated(nearest.tags, use, AS_BUILT_SIGMA_M)[0]
         reason = (
             f"no design is that accurate with magnets placed to {length_text(HAND_BUILT_SIGMA_M)}; "
-            f"the nearest reaches {_errors_text(nearest)}, and {_errors_text(built)} if its "
+            f"the nearest reaches {nearest.errors_text}, and {built.errors_text} if its "
             "magnets are measured as built (`locatk calibrate tag`)"
         )
         return DesignSearch((), nearest, reason)
@@ -289,7 +296,7 @@ def _best_of_magnet(
             continue
         for spacing_m, code in itertools.product(_spacings(magnet, clearance_m, space), codes.tags):
             tags = replace(code, magnet=magnet, clearance_m=clearance_m, spacing_m=spacing_m)
-            if (tags.order - 1) * spacing_m <= (use.sensors - 1) * use.sensor_spacing_m + 1e-9:
+            if (tags.order - 1) * spacing_m <= use.array_m + 1e-9:
                 candidates.append(TagDesign(tags, math.inf, math.inf))
     if not candidates:
         return None, None
@@ -352,16 +359,9 @@ def _unreadable(magnet: Magnet, clearance_m: float, use: ReadingConditions) -> s
     peak_t, *between_t = np.linalg.norm(disc_field(magnet, points), axis=1).tolist()
     if peak_t + MAX_EARTH_FIELD_T > array.range_t.min():
         return "the sensors saturate"
-    varying_t = 0.0 if use.environment.is_common else use.environment.field_t
-    noise_t = math.hypot(float(np.sqrt(np.mean(array.noise_t[:2] ** 2))), varying_t)
-    if min(between_t) < MIN_SIGNAL_TO_NOISE * noise_t:
+    if min(between_t) < MIN_SIGNAL_TO_NOISE * horizontal_noise_t(array, use.environment):
         return "the field of the magnets is too weak for this clearance"
     return ""
-
-
-def _errors_text(design: TagDesign) -> str:
-    angle_deg = math.degrees(design.heading_p95_rad)
-    return f"{length_text(design.position_p95_m)} and {angle_deg:.2g} deg"
 
 
 def _evaluated(
@@ -369,13 +369,12 @@ def _evaluated(
 ) -> tuple[TagDesign, float]:
     """Return a design with its errors, and the standard deviation of a magnet's angle [rad]."""
     array, _ = sensor_array(use)
-    step_m = use.speed_mps / min(use.rate_hz or math.inf, use.settings.max_rate_hz)
     try:
         bound = accuracy_bound(
             tags,
             sample_layouts(tags, SEARCHED_LAYOUTS),
             array,
-            step_m=step_m,
+            step_m=use.step_m,
             environment=use.environment,
             build_m=build_m,
         )

@@ -494,7 +494,7 @@ def pass_separation(tags: Tags, use: ReadingConditions | None = None) -> float:
 def _count_passes(tags: Tags, use: ReadingConditions, distance_m: float | None) -> int:
     """Return the number of passes over two tags at a distance, or over one tag."""
     array, _ = sensor_array(use)
-    step_m = use.speed_mps / min(use.rate_hz or math.inf, use.settings.max_rate_hz)
+    step_m = use.step_m
     tag_id = next(iter(tags.site), (tags.ids or (0,))[0])
     layout = codec.layout_of(tags, tag_id)
     position_m = cell_positions(tags, layout.cells)

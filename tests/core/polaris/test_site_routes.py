@@ -19,7 +19,7 @@ from locatk.core.polaris.design.routes import (
     laying_sigma,
     path_covariance,
     plan_route,
-    route_points,
+    points_along_route,
     spacing_for_accuracy,
     tag_fix_covariance,
 )
@@ -127,6 +127,21 @@ def test_what_is_known_of_a_tag_is_used() -> None:
     one_sensor = ReadingConditions(sensors=1, speed_mps=1e4)
     with pytest.raises(InputError, match="do not determine"):
         tag_fix_covariance(tags, one_sensor)
+
+
+@pytest.mark.parametrize("tag_rad", [0.0, math.pi / 2, 2.5])
+def test_errors_of_a_site_are_along_its_axes(tag_rad: float) -> None:
+    """Along x of the site, whatever the heading of the tag; along y, the tag is exact."""
+    tags = Tags(site={7: PlanarPose(0, 0, tag_rad)}, site_sigma={7: (0.02, 0.0, 0.0)})
+    exact = replace(tags, site_sigma={7: (0.0, 0.0, 0.0)})
+    for route_rad in (0.0, math.pi / 2):
+        relative = tag_rad - route_rad
+        with_errors, without = (
+            tag_fix_covariance(each, tag_id=7, heading_rad=relative) for each in (tags, exact)
+        )
+        forward, left = math.cos(route_rad), -math.sin(route_rad)
+        expected = 0.02**2 * np.outer([forward, left], [forward, left])
+        assert (with_errors - without)[:2, :2] == pytest.approx(expected, abs=1e-9)
 
 
 # ---- passes
@@ -275,7 +290,7 @@ CORNER = [SitePoint(0, 0), SitePoint(3, 0), SitePoint(3, 2), SitePoint(5, 2.2)]
 
 
 def test_points_along_a_route_are_passed_straight() -> None:
-    route, points = route_points(Tags(), CORNER, 0.7, 0.25)
+    route, points = points_along_route(Tags(), CORNER, 0.7, 0.25)
     site = {k: PlanarPose(p.x_m, p.y_m, p.heading_rad) for k, p in enumerate(points)}
     passes = find_tag_passes(Tags(site=site), route)
     assert [each.tag_id for each in passes] == list(range(len(points)))
@@ -292,13 +307,13 @@ def test_stations_keep_their_ids_and_tags_are_shared_by_the_way_back() -> None:
         SitePoint(4, 0),
         SitePoint(0, 0),
     ]
-    _, points = route_points(Tags(), way, 0.8, 0.25)
+    _, points = points_along_route(Tags(), way, 0.8, 0.25)
     assert [p.tag_id for p in points if p.tag_id is not None] == [5]
     place = np.array([[p.x_m, p.y_m] for p in points])
     distance = np.hypot(*(place[:, None] - place).T) + np.eye(len(place))
     assert distance.min() >= 0.12 - 1e-9
     with pytest.raises(InputError):
-        route_points(Tags(), [SitePoint(0, 0), SitePoint(0, 0)], 1.0)
+        points_along_route(Tags(), [SitePoint(0, 0), SitePoint(0, 0)], 1.0)
 
 
 @pytest.mark.slow
