@@ -114,7 +114,6 @@ def search_bars(
     """
     if not (pitch_m > 0 and wanted_position_m > 0):
         raise InputError("a pitch or an accuracy of 0 or less", hint="Give numbers above 0")
-    errors = errors or VisitErrors()
     options = []
     for length, width, thickness in bars_m:
         tried = []
@@ -139,12 +138,12 @@ def search_bars(
                 routes=SEARCH_ROUTES,
             )
             tried.append((analyse_landmark(geometry), forecast))
-        options.append(_judge(tried, pitch_m, wanted_position_m, wanted_heading_rad))
+        options.append(_option_of(tried, pitch_m, wanted_position_m, wanted_heading_rad))
         progress()
     return tuple(sorted(options, key=lambda option: not option.is_feasible))
 
 
-def _judge(
+def _option_of(
     tried: Sequence[tuple[LandmarkAnalysis, FloorForecast]],
     pitch_m: float,
     wanted_position_m: float,

@@ -4,7 +4,7 @@ A robot that follows a route passes some landmarks. Each pass is a fix, whose co
 bound of :mod:`.visit_accuracy` plus the errors of the landmark's installation; odometry carries the
 pose between fixes (:mod:`locatk.core.routes`). A pose on the map is known once no other place and
 heading of the map would have read the same landmarks along the same route
-(:func:`count_landmarks_until_unique`), and final once the cell filter of the solver is certain
+(:func:`count_places`), and final once the cell filter of the solver is certain
 (:mod:`.final_poses`).
 
 Nothing here is simulated or measured. Landmarks count as they were built, as far as that is known.
@@ -33,10 +33,10 @@ from locatk.core.landmarks.design.visit_accuracy import (
     VisitErrors,
     installation_covariance,
     predict_visit,
+    sensor_arms,
     straight_path,
     visit_reach,
 )
-from locatk.core.landmarks.design.visit_accuracy import visit_covariance as visit_covariance
 from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.halls import circle
 from locatk.core.landmarks.landmark import CODE_COUNT, PATTERNS, Geometry, code_of, signs
@@ -59,10 +59,6 @@ from locatk.core.streaming.planar_filter import OdometryNoise
 from locatk.core.trajectory import PROVISIONAL_PROBABILITY
 
 Array = NDArray[np.float64]
-
-MAX_MISREAD_PROBABILITY = SolveOptions.misread
-"""Probability of another code up to which a visit counts as read: that of landmarks which differ
-from the map, which the solver assumes anyway."""
 
 MAX_LINK_SIGMAS = 3.0
 """Standard deviations of the dead reckoning that must be below half a pitch, so that the cell of
@@ -125,9 +121,7 @@ class RouteVisit:
     @property
     def is_read(self) -> bool:
         """True if the visit gives a pose, and the code beyond reasonable doubt."""
-        return (
-            self.accuracy.is_usable and self.accuracy.misread_probability <= MAX_MISREAD_PROBABILITY
-        )
+        return self.accuracy.is_read
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +295,8 @@ def find_visits(
             continue
         index = np.asarray(indices, np.int64)
         local = _in_landmark_frame(poses[index], landmark)
-        field = np.abs(basis(floor.geometry, _sensor_points(local, sensors)) @ strength)
+        points = local[:, None, :2] + sensor_arms(local, sensors)
+        field = np.abs(basis(floor.geometry, points) @ strength)
         strongest = field.max(axis=1)
         inside = np.flatnonzero(strongest >= field_t)
         # Sensors on both sides of the centre may leave the field during a pass.
@@ -394,13 +389,6 @@ def _in_landmark_frame(poses: Array, landmark: Array) -> Array:
     return np.column_stack([c * x + s * y, c * y - s * x, poses[:, 2] - landmark[2]])
 
 
-def _sensor_points(poses: Array, sensors: Array) -> Array:
-    """Return the positions (n, N, 2) of sensors (N, 2) of a robot at poses (n, 3)."""
-    c, s = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
-    arm_x, arm_y = c * sensors[:, 0] - s * sensors[:, 1], s * sensors[:, 0] + c * sensors[:, 1]
-    return np.asarray(poses[:, None, :2] + np.stack([arm_x, arm_y], -1))
-
-
 def _rotated(covariance: Array, angle_rad: float) -> Array:
     """Return the covariance (3, 3) of a pose in axes rotated by minus an angle."""
     c, s = math.cos(angle_rad), math.sin(angle_rad)
@@ -449,13 +437,7 @@ def count_places(floor: FloorMap, cells: Sequence[Cell]) -> NDArray[np.int64]:
     return np.array(counts, np.int64)
 
 
-def count_landmarks_until_unique(floor: FloorMap, cells: Sequence[Cell]) -> int | None:
-    """Return after how many of ``cells`` only one place is left; None if there are more at last."""
-    unique = np.flatnonzero(count_places(floor, cells) == 1)
-    return int(unique[0]) + 1 if len(unique) else None
-
-
-def _localization(
+def _connected_visits(
     floor: FloorMap, visits: Sequence[RouteVisit], accuracy: RouteAccuracy
 ) -> list[list[RouteVisit]]:
     """Return the chains of read visits that odometry connects beyond doubt, without repetitions."""
@@ -489,17 +471,18 @@ def _check_route(
     usable = [visit for visit in visits if visit.accuracy.is_usable]
     fixes = [visit.fix for visit in usable]
     accuracy = predict_accuracy(route, fixes, noise, speed_mps)
-    chains = _localization(floor, visits, accuracy)
+    chains = _connected_visits(floor, visits, accuracy)
     built = replace(floor, codes=as_built_codes(floor))
     localized_after = localized_m = final_after = final_m = None
     ambiguous = 4 * len(floor.cells())
     for chain in chains:
         cells = [visit.cell for visit in chain]
         places = count_places(built, cells)
-        ambiguous = min(ambiguous, int(places[-1]) if len(places) else ambiguous)
-        unique = count_landmarks_until_unique(built, cells)
-        if localized_after is None and unique is not None:
-            localized_after, localized_m = unique, chain[unique - 1].fix.distance_m
+        ambiguous = min([ambiguous, *places.tolist()])
+        unique = np.flatnonzero(places == 1)
+        if localized_after is None and len(unique):
+            localized_after = int(unique[0]) + 1
+            localized_m = chain[unique[0]].fix.distance_m
         if final_after is None and evidence is not None:
             for count, probability in enumerate(evidence.posteriors(cells), 1):
                 if probability >= PROVISIONAL_PROBABILITY:
@@ -662,13 +645,9 @@ def max_pass_offset(
             predict_visit(geometry, path, signs(code_of(letters)), noise=noise, errors=errors)
             for letters in PATTERNS
         )
-        if all(map(_is_read, visits)):
+        if all(visit.is_read for visit in visits):
             return float(offset)
     return 0.0
-
-
-def _is_read(accuracy: VisitAccuracy) -> bool:
-    return accuracy.is_usable and accuracy.misread_probability <= MAX_MISREAD_PROBABILITY
 
 
 @dataclass(frozen=True)

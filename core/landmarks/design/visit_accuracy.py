@@ -33,9 +33,10 @@ from scipy.special import ndtr
 from locatk.core.errors import InputError
 from locatk.core.landmarks.field import basis_gradient
 from locatk.core.landmarks.halls import circle
-from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, code_of, signs
+from locatk.core.landmarks.landmark import CODE_COUNT, Geometry, signs
 from locatk.core.landmarks.map.floor import MISSING_BAR_STRENGTH
 from locatk.core.landmarks.preprocessing import MARGIN_M
+from locatk.core.landmarks.solver import SolveOptions
 from locatk.core.streaming.planar_filter import OdometryNoise
 
 Array = NDArray[np.float64]
@@ -54,14 +55,15 @@ MAX_POSITION_SIGMA_M = 6e-3
 MAX_HEADING_SIGMA_RAD = math.radians(8)
 """Standard deviations of a pose up to which the solver uses a visit (``too_weak`` otherwise)."""
 
+MAX_MISREAD_PROBABILITY = SolveOptions.misread
+"""Probability of another code up to which a visit counts as read: that of landmarks which differ
+from the map, which the solver assumes anyway."""
+
 WALK_UNITS = 6
 """Pieces of a visit in which the random walk of odometry is constant."""
 
 DIFFUSE_SIGMA = 1.0
 """Prior of the pose [m, rad]: so wide that it adds no information."""
-
-NNNS = code_of("NNNS")
-"""Landmark 3 of the paper, of which its accuracy figures are."""
 
 
 @dataclass(frozen=True)
@@ -141,50 +143,10 @@ class VisitAccuracy:
         x, y, heading = np.sqrt(np.diag(self.covariance))
         return bool(max(x, y) <= MAX_POSITION_SIGMA_M and heading <= MAX_HEADING_SIGMA_RAD)
 
-
-def visit_covariance(
-    geometry: Geometry,
-    *,
-    code: int = NNNS,
-    offset_m: float = 0.0,
-    heading_rad: float = 0.0,
-    speed_mps: float = 0.1,
-    noise: OdometryNoise | None = None,
-    errors: VisitErrors | None = None,
-    on_map: bool = True,
-) -> Array:
-    """Return the covariance (3, 3) of the pose after a straight pass over a landmark.
-
-    Parameters
-    ----------
-    geometry : Geometry
-    code : int
-        Code of the landmark, 0 to 15.
-    offset_m : float
-        Distance by which the robot passes left of the landmark's centre (negative: right).
-    heading_rad : float
-        In the axes of the landmark.
-    speed_mps : float
-    noise : OdometryNoise, optional
-    errors : VisitErrors, optional
-    on_map : bool
-        Include the errors of the landmark's installation: the covariance is that on the map, else
-        relative to the landmark.
-
-    Returns
-    -------
-    (3, 3) ndarray
-        Of x, y in metres and heading in radians, in the axes of the landmark, at the point next to
-        its centre.
-    """
-    errors = errors or VisitErrors()
-    path = straight_path(geometry, offset_m, heading_rad)
-    accuracy = predict_visit(
-        geometry, path, signs(code), speed_mps=speed_mps, noise=noise, errors=errors
-    )
-    if not on_map:
-        return accuracy.covariance
-    return accuracy.covariance + installation_covariance(path[len(path) // 2], errors)
+    @property
+    def is_read(self) -> bool:
+        """True if the visit gives a pose, and the code beyond reasonable doubt."""
+        return self.is_usable and self.misread_probability <= MAX_MISREAD_PROBABILITY
 
 
 def straight_path(geometry: Geometry, offset_m: float, heading_rad: float) -> Array:
@@ -195,6 +157,13 @@ def straight_path(geometry: Geometry, offset_m: float, heading_rad: float) -> Ar
     c, s = math.cos(heading_rad), math.sin(heading_rad)
     x, y = c * along - s * offset_m, s * along + c * offset_m
     return np.column_stack([x, y, np.full(len(along), heading_rad)])
+
+
+def sensor_arms(poses: Array, sensors_m: Array) -> Array:
+    """Return the vectors (n, N, 2) from a robot at poses (n, 3) to its sensors (N, 2)."""
+    cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+    x, y = sensors_m.T
+    return np.stack([cos * x - sin * y, sin * x + cos * y], -1)
 
 
 def visit_reach(geometry: Geometry) -> float:
@@ -248,9 +217,7 @@ def predict_visit(
     if reference is None:
         reference = len(path) // 2
     sensors = circle(geometry.circle_m) if sensors_m is None else sensors_m
-    cos, sin = np.cos(path[:, 2, None]), np.sin(path[:, 2, None])
-    arm = np.stack([cos * sensors[:, 0] - sin * sensors[:, 1],
-                    sin * sensors[:, 0] + cos * sensors[:, 1]], -1)  # fmt: skip
+    arm = sensor_arms(path, sensors)
     position = path[:, None, :2] + arm
     field, by_position = basis_gradient(geometry, position)
     total = field @ strength

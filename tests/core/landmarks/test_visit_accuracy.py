@@ -19,7 +19,6 @@ from locatk.core.landmarks.design.visit_accuracy import (
     installation_covariance,
     predict_visit,
     straight_path,
-    visit_covariance,
 )
 from locatk.core.landmarks.landmark import Geometry, code_of, signs
 from locatk.core.streaming.planar_filter import OdometryNoise
@@ -218,12 +217,12 @@ def test_iron_costs_accuracy_and_certainty() -> None:
 )
 def test_no_error_makes_a_visit_better(offset_m: float, heading_rad: float, name: str) -> None:
     better, worse = (
-        visit_covariance(
+        predict_visit(
             GEOMETRY,
-            offset_m=offset_m,
-            heading_rad=heading_rad,
+            straight_path(GEOMETRY, offset_m, heading_rad),
+            signs(code_of("NNNS")),
             errors=VisitErrors(**{name: factor * getattr(VisitErrors(), name)}),
-        )
+        ).covariance
         for factor in (1.0, 2.0)
     )
     assert np.linalg.eigvalsh(worse - better).min() > -1e-12
@@ -231,9 +230,11 @@ def test_no_error_makes_a_visit_better(offset_m: float, heading_rad: float, name
 
 def test_pass_turned_with_its_landmark_is_the_same() -> None:
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    first = visit_covariance(GEOMETRY, code=code_of("NNSS"), offset_m=0.03, heading_rad=0.4)
-    turned = visit_covariance(
-        GEOMETRY, code=code_of("SNNS"), offset_m=0.03, heading_rad=0.4 + math.pi / 2
+    first, turned = (
+        predict_visit(
+            GEOMETRY, straight_path(GEOMETRY, 0.03, heading_rad), signs(code_of(letters))
+        ).covariance
+        for letters, heading_rad in (("NNSS", 0.4), ("SNNS", 0.4 + math.pi / 2))
     )
     np.testing.assert_allclose(turned, quarter @ first @ quarter.T, rtol=1e-6, atol=1e-14)
 
