@@ -13,7 +13,7 @@ from locatk.cli.materials_text import materials_text
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
-    from locatk.core.dots.design.camera import CameraFit, CameraReport
+    from locatk.core.dots.design.camera import SensorFit, CameraReport
     from locatk.core.dots.design.camera_measurement import CameraMeasurement
 
 
@@ -21,7 +21,7 @@ def print_design(
     report: CameraReport,
     measured: CameraMeasurement | None,
     reason: str,
-    fits: Sequence[CameraFit],
+    fits: Sequence[SensorFit],
     holder: Path | None,
     as_json: bool,
 ) -> None:
@@ -40,7 +40,7 @@ def print_design(
 
 
 def text(
-    report: CameraReport, measured: CameraMeasurement | None, fits: Sequence[CameraFit]
+    report: CameraReport, measured: CameraMeasurement | None, fits: Sequence[SensorFit]
 ) -> str:
     """Format report, measurement and table of sensors in 80 columns."""
     parts = [
@@ -58,7 +58,7 @@ def text(
 def entry(
     report: CameraReport,
     measured: CameraMeasurement | None,
-    fits: Sequence[CameraFit],
+    fits: Sequence[SensorFit],
     holder: Path | None,
 ) -> dict[str, Any]:
     """Return the object for ``--json``, in SI units as each key says."""
@@ -218,7 +218,7 @@ def _poses(report: CameraReport, measured: CameraMeasurement | None) -> list[tup
     ]
 
 
-def _sensors(fits: Sequence[CameraFit]) -> Iterator[tuple[str, ...]]:
+def _sensors(fits: Sequence[SensorFit]) -> Iterator[tuple[str, ...]]:
     for fit in fits:
         setup = fit.report.setup
         yield (

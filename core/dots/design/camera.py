@@ -59,10 +59,10 @@ MAX_PX_PER_PITCH = 40.0
 """Pixels per pitch of a searched image beyond which it shows too few dots, whatever its size: the
 decoder halves images until their shorter side is about 120 px."""
 
-HOPELESS_MOTION_PITCHES, HOPELESS_BLUR_PITCHES = 2.0, 0.5
+UNREADABLE_MOTION_PITCHES, UNREADABLE_BLUR_PITCHES = 2.0, 0.5
 """Motion and standard deviation of blur beyond which no dot is left in a frame."""
 
-HOPELESS_LIMIT = (
+UNREADABLE_LIMIT = (
     "no dot is left by blur, motion or the size of its image: blur less, by the f-number, focus "
     "and exposure, or change the distance"
 )
@@ -319,9 +319,14 @@ class CameraSetup:
         return math.hypot(*self.field_m) / 2
 
     @property
+    def corner_speed_mps(self) -> float:
+        """Largest speed of the corner of the frame over the paper."""
+        return self.speed_mps + self.yaw_rate_rps * self.corner_m
+
+    @property
     def motion_m(self) -> float:
         """Motion of the corner on the paper during the exposure, at most."""
-        return self.exposure_s * (self.speed_mps + self.yaw_rate_rps * self.corner_m)
+        return self.exposure_s * self.corner_speed_mps
 
 
 @dataclass(frozen=True)
@@ -444,7 +449,7 @@ def design_camera(setup: CameraSetup) -> CameraReport:
     speed_px = setup.exposure_s * setup.speed_mps / mpp
     rotation_px = setup.exposure_s * setup.yaw_rate_rps * corner_m / mpp
     tolerated_m = MAX_MOTION_PITCHES * setup.pitch_m
-    speed_of_corner = setup.speed_mps + setup.yaw_rate_rps * corner_m
+    corner_mps = setup.corner_speed_mps
     fps = frame_rate(setup)
     decoding_s = DECODING_S_PER_PX * math.prod(setup.size_px) / 4**quality.level
     report = CameraReport(
@@ -471,7 +476,7 @@ def design_camera(setup: CameraSetup) -> CameraReport:
         rotation_px=rotation_px,
         one_pixel_speed_mps=mpp / setup.exposure_s,
         one_pixel_yaw_rate_rps=1 / (setup.exposure_s * (max(setup.size_px) - 1) / 2),
-        max_exposure_s=math.inf if speed_of_corner == 0 else tolerated_m / speed_of_corner,
+        max_exposure_s=math.inf if corner_mps == 0 else tolerated_m / corner_mps,
         max_speed_mps=tolerated_m / setup.exposure_s,
         max_yaw_rate_rps=tolerated_m / (setup.exposure_s * corner_m),
         needed_illuminance_lx=needed_illuminance_lx(setup),
@@ -501,13 +506,15 @@ def design_camera(setup: CameraSetup) -> CameraReport:
 # ---- optics
 
 
-def window_diagonal_m(dots: int, pitch_m: float, dot_pitches: float = DOT_OFFSET_PITCHES) -> float:
+def window_diagonal_m(dots: int, pitch_m: float) -> float:
     """Return the diagonal of a square of dots that are displaced outwards (paper, III-A.3).
+
+    The nominal diameter of a dot is its displacement, 1/6 of the pitch.
 
     >>> round(window_diagonal_m(8, 0.508e-3) * 1e3, 2)
     5.39
     """
-    return math.sqrt(2) * pitch_m * (dots - 1 + 2 * DOT_OFFSET_PITCHES + dot_pitches)
+    return math.sqrt(2) * pitch_m * (dots - 1 + 3 * DOT_OFFSET_PITCHES)
 
 
 def window_in_view(side_m: float, pitch_m: float) -> int:
@@ -675,18 +682,18 @@ def _quality_at_level(
     motion_px = setup.exposure_s * setup.speed_mps / mpp
     # A rotation blurs the dots of a frame in all directions, in the mean square like this.
     radius_px = math.hypot(*size) / math.sqrt(12)
-    turn_px = setup.exposure_s * setup.yaw_rate_rps * radius_px
+    rotation_px = setup.exposure_s * setup.yaw_rate_rps * radius_px
     if (
         pitch_px > MAX_PX_PER_PITCH
-        or motion_px > HOPELESS_MOTION_PITCHES * pitch_px
-        or math.hypot(blur_px / factor, turn_px) > HOPELESS_BLUR_PITCHES * pitch_px
+        or motion_px > UNREADABLE_MOTION_PITCHES * pitch_px
+        or math.hypot(blur_px / factor, rotation_px) > UNREADABLE_BLUR_PITCHES * pitch_px
     ):
-        nothing = PoseAccuracy(math.inf, math.inf, 0.0)
-        return _FrameQuality(level, 0.0, math.inf, nothing, HOPELESS_LIMIT)
+        no_pose = PoseAccuracy(math.inf, math.inf, 0.0)
+        return _FrameQuality(level, 0.0, math.inf, no_pose, UNREADABLE_LIMIT)
     image = DotImage(
         pitch_px=pitch_px,
         diameter_px=setup.dot_pitches * pitch_px,
-        blur_px=math.hypot(blur_px / factor, turn_px / math.sqrt(24)),
+        blur_px=math.hypot(blur_px / factor, rotation_px / math.sqrt(24)),
         motion_px=motion_px,
         noise=math.sqrt(variance) / PAPER_LEVEL,
         contrast=setup.contrast,
@@ -880,7 +887,7 @@ def _standard_lens(
 
 def _chosen_exposure(setup: CameraSetup) -> float:
     """Return the exposure for the speeds, the frame rate and the light of a setup."""
-    corner_mps = setup.speed_mps + setup.yaw_rate_rps * setup.corner_m
+    corner_mps = setup.corner_speed_mps
     by_rate = 0.5 / max(setup.wanted_rate_hz, setup.sensor.max_fps)
     if corner_mps == 0:
         return by_rate
@@ -893,7 +900,7 @@ def _chosen_exposure(setup: CameraSetup) -> float:
 
 
 @dataclass(frozen=True)
-class CameraFit:
+class SensorFit:
     """Sensor for a task: the setup chosen for it, its figures, and why it does not fit."""
 
     sensor: Sensor
@@ -906,7 +913,7 @@ class CameraFit:
         return not self.reasons
 
 
-def compare_sensors(sensors: Iterable[Sensor], **wanted: Any) -> tuple[CameraFit, ...]:
+def compare_sensors(sensors: Iterable[Sensor], **wanted: Any) -> tuple[SensorFit, ...]:
     """Choose a setup for each sensor, with the arguments of :func:`suggest_camera`.
 
     Sensors that fit come first, then in the order given.
@@ -914,7 +921,7 @@ def compare_sensors(sensors: Iterable[Sensor], **wanted: Any) -> tuple[CameraFit
     fits = []
     for sensor in sensors:
         report = design_camera(suggest_camera(sensor, **wanted))
-        fits.append(CameraFit(sensor, report, report.warnings))
+        fits.append(SensorFit(sensor, report, report.warnings))
     return tuple(sorted(fits, key=lambda fit: not fit.fits))
 
 

@@ -133,14 +133,14 @@ def measure_camera(setup: CameraSetup, frames: int = 20, seed: int = 0) -> Camer
     trajectory = solution.trajectories[0]
     index = np.searchsorted(session.truth.time_ns, trajectory.time_ns)
     error = trajectory.position[:, :2] - session.truth.position[index, :2]
-    turn = heading_from_quaternion(trajectory.quaternion) - heading[index]
+    heading_error = heading_from_quaternion(trajectory.quaternion) - heading[index]
     stated = trajectory.covariance
     variance = np.trace(stated[:, :2, :2], axis1=1, axis2=2) / 2 if stated is not None else []
     return CameraMeasurement(
         frames=frames,
         read=len(index),
         position_error_m=error,
-        heading_error_rad=np.angle(np.exp(1j * turn)),
+        heading_error_rad=np.angle(np.exp(1j * heading_error)),
         stated_sigma_m=math.sqrt(np.mean(variance)) if len(variance) else math.nan,
     )
 

@@ -103,8 +103,7 @@ def make_task(number: int) -> CameraSetup:
         is_calibrated=bool(rng.integers(2)),
     )
     motion_pitches = float(rng.uniform(0.02, 0.4))
-    corner_mps = speed_mps + setup.yaw_rate_rps * setup.corner_m
-    return replace(setup, exposure_s=motion_pitches * setup.pitch_m / corner_mps)
+    return replace(setup, exposure_s=motion_pitches * setup.pitch_m / setup.corner_speed_mps)
 
 
 def run_task(number: int, frames: int = FRAMES) -> TaskResult:
