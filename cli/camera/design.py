@@ -16,8 +16,8 @@ from locatk.core.errors import InputError
 from locatk.core.units import metres
 
 if TYPE_CHECKING:
-    from locatk.core.dots.design.camera import CameraSetup, Sensor
     from locatk.core.dots.design.camera_measurement import CameraMeasurement
+    from locatk.core.dots.design.camera_setup import CameraSetup, Sensor
 
 RENDERING_S_PER_PX = 0.8e-6
 """Time to render a pixel of a frame and to decode it, on a slow PC."""

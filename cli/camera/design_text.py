@@ -13,7 +13,7 @@ from locatk.cli.materials_text import materials_text
 from locatk.core.units import length_text
 
 if TYPE_CHECKING:
-    from locatk.core.dots.design.camera import SensorFit, CameraReport
+    from locatk.core.dots.design.camera import CameraReport, SensorFit
     from locatk.core.dots.design.camera_measurement import CameraMeasurement
 
 
@@ -103,7 +103,7 @@ def entry(
 
 
 def _head(report: CameraReport) -> Iterator[tuple[str, str]]:
-    from locatk.core.dots.design.camera import illuminance_text
+    from locatk.core.dots.design.camera_optics import illuminance_text
 
     setup = report.setup
     width, height = setup.size_px
@@ -139,7 +139,8 @@ def _head(report: CameraReport) -> Iterator[tuple[str, str]]:
 
 def _limits(report: CameraReport) -> Iterator[tuple[str, str, str, str]]:
     """Yield name, value, limit and origin of the limit of each figure."""
-    from locatk.core.dots.design.camera import GOOD_WINDOW_DOTS, MIN_WINDOW_DOTS, frame_rate
+    from locatk.core.dots.design.camera import GOOD_WINDOW_DOTS, MIN_WINDOW_DOTS
+    from locatk.core.dots.design.camera_optics import frame_rate
     from locatk.core.dots.design.read_rate import MAX_MOTION_PITCHES, MIN_PX_PER_PITCH
 
     setup = report.setup

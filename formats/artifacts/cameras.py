@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 
-from locatk.core.dots.design.camera import Sensor
 from locatk.core.dots.design.camera_sensors import SENSORS
+from locatk.core.dots.design.camera_setup import Sensor
 from locatk.core.errors import InputError
 from locatk.formats.artifacts.kinds import Boolean, Integer, InvalidValueError, Number, Row, Text
 from locatk.formats.artifacts.schema import Artifact, Key, Table, Tables, Values, refuse_repeated

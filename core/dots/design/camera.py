@@ -1,7 +1,7 @@
 """Design of a camera over printed dots: optics, exposure, read rate and accuracy before buying.
 
-All figures are closed forms of the setup; no frame is rendered. The lens is thin: an object at the
-distance s is in focus at v = 1 / (1 / f - 1 / s) behind it, magnified by v / s.
+All figures are closed forms of the setup (:mod:`.camera_setup`, :mod:`.camera_optics`,
+:mod:`.dot_noise`); no frame is rendered.
 :func:`~locatk.core.dots.design.camera_measurement.measure_camera` renders frames of the same setup
 and decodes them.
 """
@@ -14,6 +14,21 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from locatk.core.dots.design.camera_materials import camera_materials
+from locatk.core.dots.design.camera_optics import (
+    diffraction_disc_m,
+    distance_for_field,
+    focus_range,
+    frame_rate,
+    full_illuminance_lx,
+    illuminance_text,
+    needed_illuminance_lx,
+    noise_levels,
+    static_blur_px,
+    tolerated_confusion_m,
+    window_diagonal_m,
+    window_in_view,
+)
+from locatk.core.dots.design.camera_setup import MAX_LEVEL, CameraSetup, Lens, Sensor
 from locatk.core.dots.design.dot_noise import (
     PAPER_LEVEL,
     ROUNDING_VARIANCE,
@@ -22,7 +37,6 @@ from locatk.core.dots.design.dot_noise import (
 )
 from locatk.core.dots.design.pose_accuracy import PoseAccuracy, pose_accuracy
 from locatk.core.dots.design.read_rate import (
-    MAX_BLUR_PITCHES,
     MAX_MOTION_PITCHES,
     MAX_SHEAR,
     MIN_PX_PER_PITCH,
@@ -30,7 +44,6 @@ from locatk.core.dots.design.read_rate import (
     reading_limit,
     searched_levels,
 )
-from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 from locatk.core.errors import InputError
 from locatk.core.materials import BillItem
 from locatk.core.units import length_text
@@ -40,13 +53,6 @@ MIN_WINDOW_DOTS = 8
 
 GOOD_WINDOW_DOTS = 12
 """Columns and rows with which missing and wrong dots do no harm."""
-
-MAX_LEVEL = 255.0
-
-GOOD_NOISE_LEVELS = 4.0
-"""Noise of a pixel of a searched image of paper, in grey values, from which more light hardly
-helps: other errors of a dot are larger."""
-
 
 EXPOSURE_MOTION_PITCHES = 1 / 11
 """Motion during a chosen exposure: one pixel of the paper's camera, whose pitch is 11 px."""
@@ -77,20 +83,6 @@ NEGLIGIBLE_FRACTION = 0.01
 MAX_LIGHT_DEFICIT = 4.0
 """Ratio of the light that is needed to the least that passes without a warning."""
 
-LUMEN_PHOTONS_PER_S = 4.09e15
-"""Photons of one lumen at 555 nm: 1 / 683 W over the energy of a photon, 3.58e-19 J (SI: candela).
-"""
-
-QUANTUM_EFFICIENCY = 0.5
-"""Electrons per photon at the peak of common CMOS sensors, if the data sheet does not give it."""
-
-PAPER_REFLECTANCE = 0.8
-LENS_TRANSMITTANCE = 0.9
-
-AIRY_DIAMETER, AIRY_SIGMA = 2.44, 0.42
-"""Diameter of the first dark ring, and standard deviation of the Gaussian that fits the middle of
-the diffraction pattern, in wavelength times working f-number (Hecht, Optics, 10.2.5)."""
-
 DECODING_S_PER_PX = 0.29e-3 / (188 * 120)
 """Time to decode a frame per pixel of the image that is searched: 0.29 ms for a frame of the paper
 on a core of a PC (`locatk bench dots`)."""
@@ -108,225 +100,6 @@ STANDARD_FOCAL_LENGTHS_M = (
 
 PREFERRED_DISTANCE_M = 0.020
 """Distance from lens to paper if it can be chosen: a robot of low height, and room for the LEDs."""
-
-MAX_SIDE_M = 10.0
-"""Larger distances are probably in another unit."""
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """Image sensor.
-
-    Attributes
-    ----------
-    name : str
-    size_px : (width, height)
-    pixel_m : float
-        Width of a pixel.
-    max_fps : float
-        Frame rate at full size.
-    shutter : {"global", "rolling"}
-    is_colour : bool
-    max_snr_db : float
-        Signal to noise ratio at saturation, 10 log10 of the full well in electrons: 38 dB are 6300.
-    dynamic_range_db : float
-        20 log10 of the full well over the read noise.
-    min_exposure_s : float
-    source : str
-        Data sheet.
-    """
-
-    name: str
-    size_px: tuple[int, int]
-    pixel_m: float
-    max_fps: float
-    shutter: str = "global"
-    is_colour: bool = False
-    max_snr_db: float = 38.0
-    dynamic_range_db: float = 60.0
-    min_exposure_s: float = 20e-6
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        if min(self.size_px) < 1:
-            raise InputError(f"a sensor of {self.size_px[0]} x {self.size_px[1]} px")
-        if self.shutter not in ("global", "rolling"):
-            raise InputError(f"no shutter {self.shutter!r}", hint="Known: global, rolling")
-        _require(self, 0, 100e-6, "pixel_m", unit="um", scale=1e6)
-        _require(self, 0, 1e5, "max_fps")
-        _require(self, 0, 80, "max_snr_db", "dynamic_range_db")
-        _require(self, 0, 10, "min_exposure_s")
-
-    @property
-    def full_well_e(self) -> float:
-        """Electrons of a saturated pixel."""
-        return float(10 ** (self.max_snr_db / 10))
-
-    @property
-    def read_noise_e(self) -> float:
-        """Noise of a dark pixel in electrons."""
-        return float(self.full_well_e / 10 ** (self.dynamic_range_db / 20))
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Lens; ``distortion`` displaces a corner of the frame towards the centre, relative."""
-
-    focal_m: float
-    f_number: float = 2.4
-    distortion: float = 0.02
-
-    def __post_init__(self) -> None:
-        _require(self, 0, 1, "focal_m", unit="mm", scale=1e3)
-        _require(self, 0.5, 64, "f_number")
-        if not -0.35 <= self.distortion <= 0.35:
-            raise InputError(
-                f"a distortion of {self.distortion:g}", hint="Give a fraction from -0.35 to 0.35"
-            )
-
-
-@dataclass(frozen=True)
-class CameraSetup:
-    """Camera over a printed sheet.
-
-    Attributes
-    ----------
-    sensor : Sensor
-    lens : Lens
-    distance_m : float
-        From the lens (its principal plane) to the paper; the lens is focused there.
-    exposure_s : float
-    binning : int
-        Pixels of the sensor along each side of one pixel of the frame.
-    pitch_m : float
-        Distance of two positions of the printed grid.
-    dot_pitches : float
-        Diameter of a printed dot; the nominal 1/6 grows in print.
-    contrast : float
-        Contrast of the ink; 1 is black.
-    illuminance_lx : float or None
-        On the paper, at 555 nm; None: as much as the exposure needs.
-    noise_levels : float or None
-        Standard deviation of a pixel of paper in grey values, instead of that by the light.
-    lens_blur_m : float
-        Standard deviation of the blur by aberrations, on the sensor.
-    focus_error_m : float
-        Error of the distance: tolerances of the holder and waves of the paper.
-    tilt_rad : float
-        Angle between the optical axis and the vertical.
-    jitter_m : float
-        Standard deviation of the position of a printed dot, per axis.
-    wavelength_m : float
-    speed_mps, yaw_rate_rps : float
-        Largest speeds at which poses are wanted.
-    wanted_rate_hz : float
-        Poses per second.
-    is_calibrated : bool
-        The lens is known (`locatk calibrate camera`); otherwise it is estimated in each frame.
-
-    Raises
-    ------
-    InputError
-        A value is out of its range, or the lens cannot be focused on the paper.
-    """
-
-    sensor: Sensor
-    lens: Lens
-    distance_m: float
-    exposure_s: float
-    binning: int = 1
-    pitch_m: float = 0.508e-3
-    dot_pitches: float = 0.30
-    contrast: float = 0.75
-    illuminance_lx: float | None = None
-    noise_levels: float | None = None
-    lens_blur_m: float = 0.0
-    focus_error_m: float = 0.2e-3
-    tilt_rad: float = 0.0
-    jitter_m: float = 10e-6
-    wavelength_m: float = 850e-9
-    speed_mps: float = 0.0
-    yaw_rate_rps: float = 0.0
-    wanted_rate_hz: float = 30.0
-    is_calibrated: bool = True
-
-    def __post_init__(self) -> None:
-        _require(self, 0, MAX_SIDE_M, "distance_m", unit="mm", scale=1e3)
-        _require(self, 0, 10, "exposure_s")
-        _require(self, 0, 0.1, "pitch_m", unit="mm", scale=1e3)
-        _require(self, 0, 2 / 3, "dot_pitches")
-        _require(self, 0, 1, "contrast")
-        _require(self, 0, 1e-5, "wavelength_m", unit="nm", scale=1e9)
-        _require(self, 0, 1e5, "wanted_rate_hz")
-        for name in ("speed_mps", "yaw_rate_rps", "jitter_m", "lens_blur_m", "focus_error_m"):
-            if not 0 <= getattr(self, name) < 1e4:
-                raise InputError(
-                    f"{name.replace('_', ' ')} is {getattr(self, name):g}", hint="Give at least 0"
-                )
-        if self.illuminance_lx is not None:
-            _require(self, 0, 1e7, "illuminance_lx")
-        if self.noise_levels is not None and not 0 <= self.noise_levels <= MAX_LEVEL:
-            raise InputError(f"a noise of {self.noise_levels:g} grey values", hint="Give 0 to 255")
-        if not 0 <= self.tilt_rad <= math.pi / 4:
-            raise InputError(
-                f"a tilt of {math.degrees(self.tilt_rad):g} degrees", hint="Give 0 to 45 degrees"
-            )
-        if not 1 <= self.binning <= min(self.sensor.size_px):
-            raise InputError(f"a binning of {self.binning}", hint="Give 1, 2 or 4")
-        if self.distance_m <= 1.05 * self.lens.focal_m:
-            raise InputError(
-                f"a lens of {length_text(self.lens.focal_m)} cannot be focused on paper "
-                f"{length_text(self.distance_m)} in front of it",
-                hint=f"Give a distance above {length_text(2 * self.lens.focal_m)}, or a shorter "
-                "focal length",
-            )
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Width and height of a frame."""
-        width, height = self.sensor.size_px
-        return width // self.binning, height // self.binning
-
-    @property
-    def pixel_m(self) -> float:
-        """Width of a pixel of a frame on the sensor."""
-        return self.binning * self.sensor.pixel_m
-
-    @property
-    def image_distance_m(self) -> float:
-        """Distance from the lens to the sensor."""
-        return 1 / (1 / self.lens.focal_m - 1 / self.distance_m)
-
-    @property
-    def magnification(self) -> float:
-        """Size of the image over that of the paper."""
-        return self.image_distance_m / self.distance_m
-
-    @property
-    def metres_per_px(self) -> float:
-        """Width of a pixel on the paper."""
-        return self.pixel_m / self.magnification
-
-    @property
-    def field_m(self) -> tuple[float, float]:
-        """Width and height of the visible paper, without distortion."""
-        width, height = self.size_px
-        return width * self.metres_per_px, height * self.metres_per_px
-
-    @property
-    def corner_m(self) -> float:
-        """Distance on the paper from the centre of the frame to its corner."""
-        return math.hypot(*self.field_m) / 2
-
-    @property
-    def corner_speed_mps(self) -> float:
-        """Largest speed of the corner of the frame over the paper."""
-        return self.speed_mps + self.yaw_rate_rps * self.corner_m
-
-    @property
-    def motion_m(self) -> float:
-        """Motion of the corner on the paper during the exposure, at most."""
-        return self.exposure_s * self.corner_speed_mps
 
 
 @dataclass(frozen=True)
@@ -469,7 +242,7 @@ def design_camera(setup: CameraSetup) -> CameraReport:
         near_m=near_m,
         far_m=far_m,
         circle_of_confusion_m=confusion_m,
-        airy_px=AIRY_DIAMETER * _working_wavelength_m(setup) / setup.pixel_m,
+        airy_px=diffraction_disc_m(setup) / setup.pixel_m,
         blur_px=blur_px,
         distortion_px=abs(setup.lens.distortion) * math.hypot(*setup.size_px) / 2,
         motion_px=speed_px,
@@ -501,138 +274,6 @@ def design_camera(setup: CameraSetup) -> CameraReport:
         ),
     )
     return replace(report, warnings=tuple(_warnings(report, quality.limit)))
-
-
-# ---- optics
-
-
-def window_diagonal_m(dots: int, pitch_m: float) -> float:
-    """Return the diagonal of a square of dots that are displaced outwards (paper, III-A.3).
-
-    The nominal diameter of a dot is its displacement, 1/6 of the pitch.
-
-    >>> round(window_diagonal_m(8, 0.508e-3) * 1e3, 2)
-    5.39
-    """
-    return math.sqrt(2) * pitch_m * (dots - 1 + 3 * DOT_OFFSET_PITCHES)
-
-
-def window_in_view(side_m: float, pitch_m: float) -> int:
-    """Return the columns and rows of the largest square of dots whose diagonal fits ``side_m``."""
-    rest = side_m / (math.sqrt(2) * pitch_m) - 3 * DOT_OFFSET_PITCHES
-    return max(0, 1 + math.floor(rest + 1e-9))
-
-
-def _working_wavelength_m(setup: CameraSetup) -> float:
-    """Return the wavelength times the f-number on the side of the sensor."""
-    return setup.wavelength_m * setup.lens.f_number * (1 + setup.magnification)
-
-
-def blur_circle_m(setup: CameraSetup, distance_m: float) -> float:
-    """Return the diameter on the sensor of the image of a point at another distance."""
-    aperture = setup.lens.focal_m / setup.lens.f_number
-    return aperture * setup.image_distance_m * abs(1 / setup.distance_m - 1 / distance_m)
-
-
-def focus_range(setup: CameraSetup, confusion_m: float) -> tuple[float, float]:
-    """Return the nearest and farthest distance whose blur circle is ``confusion_m``."""
-    aperture = setup.lens.focal_m / setup.lens.f_number
-    step = confusion_m / (aperture * setup.image_distance_m)
-    inverse = 1 / setup.distance_m
-    return 1 / (inverse + step), math.inf if step >= inverse else 1 / (inverse - step)
-
-
-def tolerated_confusion_m(setup: CameraSetup) -> float:
-    """Return the largest blur circle with which dots are decoded.
-
-    A uniform disc of diameter c has a standard deviation of c / 4 per axis. Diffraction and
-    aberrations take their part of the blur that the decoder tolerates.
-    """
-    limit = MAX_BLUR_PITCHES * setup.pitch_m * setup.magnification
-    rest = limit**2 - _diffraction_sigma_m(setup) ** 2 - setup.lens_blur_m**2
-    return 4 * math.sqrt(max(rest, 0.0))
-
-
-def _diffraction_sigma_m(setup: CameraSetup) -> float:
-    return AIRY_SIGMA * _working_wavelength_m(setup)
-
-
-def static_blur_px(setup: CameraSetup) -> float:
-    """Return the standard deviation of the blur by focus, diffraction and aberrations in pixels."""
-    defocus = max(
-        blur_circle_m(setup, setup.distance_m + sign * setup.focus_error_m)
-        for sign in (-1, 1)
-        if setup.distance_m + sign * setup.focus_error_m > 0
-    )
-    sigma = math.hypot(defocus / 4, _diffraction_sigma_m(setup), setup.lens_blur_m)
-    return sigma / setup.pixel_m
-
-
-def frame_rate(setup: CameraSetup) -> float:
-    """Return the largest frame rate with this exposure."""
-    return min(setup.sensor.max_fps, 1 / setup.exposure_s)
-
-
-# ---- light
-
-
-def electrons_of_paper(setup: CameraSetup, illuminance_lx: float) -> float:
-    """Return the electrons of a pixel of paper, without saturation.
-
-    Illuminance of the sensor: E R T / (4 N^2 (1 + m)^2) for a diffuse paper.
-    """
-    working = setup.lens.f_number * (1 + setup.magnification)
-    on_sensor_lx = illuminance_lx * PAPER_REFLECTANCE * LENS_TRANSMITTANCE / (4 * working**2)
-    photons = on_sensor_lx * LUMEN_PHOTONS_PER_S * setup.pixel_m**2 * setup.exposure_s
-    return photons * QUANTUM_EFFICIENCY
-
-
-def full_well_e(setup: CameraSetup) -> float:
-    """Return the electrons of a saturated pixel of a frame; binned pixels add up."""
-    return setup.sensor.full_well_e * setup.binning**2
-
-
-def needed_illuminance_lx(setup: CameraSetup) -> float:
-    """Return the illuminance of the paper from which more light hardly helps.
-
-    The noise of a pixel of the image that is searched is then :data:`GOOD_NOISE_LEVELS`; halving a
-    large frame averages its pixels.
-    """
-    averaged = 4 ** searched_levels(setup.size_px)[0]
-    relative = averaged * (GOOD_NOISE_LEVELS / PAPER_LEVEL) ** 2
-    read_variance = (setup.sensor.read_noise_e * setup.binning) ** 2
-    electrons = (1 + math.sqrt(1 + 4 * relative * read_variance)) / (2 * relative)
-    return electrons / electrons_of_paper(setup, 1.0)
-
-
-def full_illuminance_lx(setup: CameraSetup) -> float:
-    """Return the illuminance with which the paper has :data:`PAPER_LEVEL` without gain."""
-    return PAPER_LEVEL / MAX_LEVEL * full_well_e(setup) / electrons_of_paper(setup, 1.0)
-
-
-def noise_levels(setup: CameraSetup) -> float:
-    """Return the noise of a pixel of paper in grey values: photons and read noise.
-
-    With less light than is needed, the gain of the sensor brings the paper to
-    :data:`PAPER_LEVEL`, and the noise with it.
-    """
-    if setup.noise_levels is not None:
-        return setup.noise_levels
-    electrons = PAPER_LEVEL / MAX_LEVEL * full_well_e(setup)
-    if setup.illuminance_lx is not None:
-        electrons = min(electrons, electrons_of_paper(setup, setup.illuminance_lx))
-    read_noise = setup.sensor.read_noise_e * setup.binning
-    return PAPER_LEVEL * math.sqrt(electrons + read_noise**2) / electrons
-
-
-def illuminance_text(illuminance_lx: float) -> str:
-    """Format an illuminance with three digits.
-
-    >>> illuminance_text(44380.2), illuminance_text(9.4567)
-    ('44400 lx', '9.46 lx')
-    """
-    rounded = float(f"{illuminance_lx:.3g}")
-    return f"{rounded:.0f} lx" if rounded >= 100 else f"{rounded:g} lx"
 
 
 # ---- read rate and accuracy
@@ -803,12 +444,6 @@ def _light_warnings(report: CameraReport) -> Iterator[str]:
 # ---- choices
 
 
-def distance_for_field(setup: CameraSetup, side_m: float) -> float:
-    """Return the distance of the lens at which the shorter side of the field is ``side_m``."""
-    magnification = min(setup.size_px) * setup.pixel_m / side_m
-    return setup.lens.focal_m * (1 + 1 / magnification)
-
-
 def suggest_camera(
     sensor: Sensor,
     *,
@@ -923,23 +558,3 @@ def compare_sensors(sensors: Iterable[Sensor], **wanted: Any) -> tuple[SensorFit
         report = design_camera(suggest_camera(sensor, **wanted))
         fits.append(SensorFit(sensor, report, report.warnings))
     return tuple(sorted(fits, key=lambda fit: not fit.fits))
-
-
-def _require(
-    item: object,
-    low: float,
-    high: float,
-    *names: str,
-    unit: str = "",
-    scale: float = 1.0,
-) -> None:
-    """Raise InputError unless the attributes are above ``low`` and at most ``high``."""
-    for name in names:
-        value = getattr(item, name)
-        if not low < value <= high:
-            shown = f"{value * scale:g} {unit}".strip()
-            limits = f"above {low * scale:g}, at most {high * scale:g} {unit}".strip()
-            quantity = name
-            for ending in ("_m", "_s", "_lx", "_hz"):
-                quantity = quantity.removesuffix(ending)
-            raise InputError(f"{quantity.replace('_', ' ')} is {shown}", hint=f"Give {limits}")

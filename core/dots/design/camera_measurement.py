@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from locatk.core.dots.camera import Camera
 from locatk.core.dots.codec import SECTION_LENGTH
-from locatk.core.dots.design.camera import CameraSetup, noise_levels, static_blur_px
+from locatk.core.dots.design.camera_optics import noise_levels, static_blur_px
+from locatk.core.dots.design.camera_setup import CameraSetup
 from locatk.core.dots.design.dot_noise import PAPER_LEVEL
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES, Manifest, Sheet
 from locatk.core.dots.simulation.paths import CameraPath

@@ -1,12 +1,12 @@
 """Image sensors of common camera modules, from public data sheets and documentation.
 
 Saturation and dynamic range are given only if a source states them; the others have the defaults
-of :class:`~locatk.core.dots.design.camera.Sensor`. Check a data sheet before buying.
+of :class:`~locatk.core.dots.design.camera_setup.Sensor`. Check a data sheet before buying.
 """
 
 from __future__ import annotations
 
-from locatk.core.dots.design.camera import Sensor
+from locatk.core.dots.design.camera_setup import Sensor
 
 SENSORS = (
     Sensor(

@@ -11,7 +11,8 @@ import math
 import numpy as np
 
 from locatk.core.dots.codec import DOT_DIRECTIONS
-from locatk.core.dots.design.camera import MIN_WINDOW_DOTS, CameraReport, illuminance_text
+from locatk.core.dots.design.camera import MIN_WINDOW_DOTS, CameraReport
+from locatk.core.dots.design.camera_optics import illuminance_text
 from locatk.core.dots.sheet import DOT_OFFSET_PITCHES
 from locatk.core.drawing.marks import (
     TRUE_SIZE_INSTRUCTION,

@@ -19,17 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.dots.codec import codec
-from locatk.core.dots.design.camera import (
-    CameraReport,
-    CameraSetup,
-    Lens,
-    Sensor,
-    design_camera,
-    distance_for_field,
-    suggest_camera,
-    window_diagonal_m,
-)
+from locatk.core.dots.design.camera import CameraReport, design_camera, suggest_camera
 from locatk.core.dots.design.camera_measurement import CameraMeasurement, measure_camera
+from locatk.core.dots.design.camera_optics import distance_for_field, window_diagonal_m
+from locatk.core.dots.design.camera_setup import CameraSetup, Lens, Sensor
 from locatk.core.dots.localization.frames import dot_correspondences, localize_frames
 from locatk.core.errors import MissingDataError
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain

@@ -14,14 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.dots.codec.pattern import MAIN_SEQUENCE, codec
-from locatk.core.dots.design.camera import (
-    CameraSetup,
-    Lens,
-    design_camera,
-    window_diagonal_m,
-)
+from locatk.core.dots.design.camera import design_camera
 from locatk.core.dots.design.camera_materials import PAPER_FOCAL_M, camera_materials
+from locatk.core.dots.design.camera_optics import window_diagonal_m
 from locatk.core.dots.design.camera_sensors import SENSORS
+from locatk.core.dots.design.camera_setup import CameraSetup, Lens
 from locatk.core.dots.published.localization import correlate
 from locatk.core.landmarks.design.analysis import analyse_landmark
 from locatk.core.landmarks.design.generation import DesignOptions, design_map

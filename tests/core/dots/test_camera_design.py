@@ -14,22 +14,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from locatk.core.dots.codec import codec
-from locatk.core.dots.design.camera import (
+from locatk.core.dots.design.camera import compare_sensors, design_camera, suggest_camera
+from locatk.core.dots.design.camera_measurement import camera_model, measure_camera
+from locatk.core.dots.design.camera_optics import (
     PAPER_REFLECTANCE,
-    CameraSetup,
-    Lens,
-    Sensor,
-    compare_sensors,
-    design_camera,
     electrons_of_paper,
     focus_range,
     frame_rate,
-    suggest_camera,
     window_diagonal_m,
     window_in_view,
 )
-from locatk.core.dots.design.camera_measurement import camera_model, measure_camera
 from locatk.core.dots.design.camera_sensors import SENSORS, sensor_named
+from locatk.core.dots.design.camera_setup import CameraSetup, Lens, Sensor
 from locatk.core.dots.design.read_rate import (
     MAX_BLUR_PITCHES,
     MAX_MOTION_PITCHES,

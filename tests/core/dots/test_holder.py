@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from locatk.core.dots.design.camera import CameraSetup, Lens, Sensor, design_camera
+from locatk.core.dots.design.camera import design_camera
+from locatk.core.dots.design.camera_setup import CameraSetup, Lens, Sensor
 from locatk.core.dots.drawing.holder import draw_holder
 from locatk.core.drawing.marks import Circle, Line, Page, Polygon, Text
 from locatk.core.errors import InputError
