@@ -206,8 +206,10 @@ def test_prices_are_in_the_pack_and_errors_are_one_line(
     prices, out = tmp_path / "prices.toml", tmp_path / "pack.pdf"
     keys = 'price = 0.4\ncurrency = "EUR"\ndate = "2026-11"\nsource = "shop"\n'
     bars = '[[parts]]\npart = "bar magnet"\n'
-    # A file has one currency: the published prices are in USD.
-    prices.write_text(template.stdout.replace(bars, bars + keys))
+    # A bill has one currency.
+    glue = '[[parts]]\npart = "adhesive"\n'
+    mixed = template.stdout.replace(bars, bars + keys)
+    prices.write_text(mixed.replace(glue, glue + keys.replace("EUR", "USD")))
     words_of = ("print", "landmarks", map_file, "-o", out, "--prices", prices)
     refused = locatk(*words_of)
     assert refused.exit_code == 1
