@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,9 +10,6 @@ import click
 from locatk.core.units import length_text, metres
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from locatk.core.routes import Route
     from locatk.core.streaming.planar_filter import OdometryNoise
 
 MAX_ACCURACY_MM = 1e5
@@ -84,21 +80,3 @@ def odometry_noise(drift: float | None, slip: float | None) -> OdometryNoise:
     if slip is not None:
         noise = replace(noise, scale=slip / 100)
     return noise
-
-
-def read_routes(
-    paths: Sequence[Path], columns: dict[str, str] | None, units: tuple[str, ...] | None
-) -> list[Route]:
-    """Read the waypoints of routes."""
-    import numpy as np
-
-    from locatk.core.errors import error_context
-    from locatk.core.routes import Route
-    from locatk.formats.importers.floors.site_csv import read_site_points
-
-    routes = []
-    for path in paths:
-        points, _ = read_site_points(path, columns, units or ())
-        with error_context(path):
-            routes.append(Route(np.array([[p.x_m, p.y_m] for p in points]), path.stem))
-    return routes

@@ -16,7 +16,6 @@ from locatk.cli.route_options import (
     LengthAndAngle,
     drift_option,
     odometry_noise,
-    read_routes,
     slip_option,
 )
 from locatk.core.units import metres
@@ -112,6 +111,7 @@ class RouteRequest:
 
         from locatk.core.landmarks.design.routes import check_routes
         from locatk.core.landmarks.design.visit_accuracy import VisitErrors
+        from locatk.formats.importers.floors.site_csv import read_route
 
         position_m, heading_rad = self.installation
         errors = VisitErrors(
@@ -124,7 +124,7 @@ class RouteRequest:
         wanted_m, wanted_rad = self.accuracy or (None, None)
         return check_routes(
             floor,
-            read_routes(self.route_paths, None, None),
+            [read_route(path) for path in self.route_paths],
             odometry_noise(self.drift, self.slip),
             errors=errors,
             speed_mps=self.speed,

@@ -9,11 +9,8 @@ import click
 
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
-from locatk.cli.route_options import odometry_noise, read_routes
-from locatk.cli.site.forecast import (
-    laying_of,
-    odometry_options,
-)
+from locatk.cli.route_options import odometry_noise
+from locatk.cli.site.forecast import laying_of, odometry_options
 from locatk.cli.site.site_text import report_check
 from locatk.cli.table_options import site_table_options
 from locatk.cli.tag.options import reading_conditions, reading_options
@@ -95,6 +92,7 @@ def command(
     from locatk.core.polaris.design.routes import forecast_routes
     from locatk.core.polaris.design.site import check_site
     from locatk.formats.artifacts.tags import read_tags
+    from locatk.formats.importers.floors.site_csv import read_route
 
     if not routes and any(each is not None for each in (drift, slip, laying, columns, units)):
         raise click.UsageError(
@@ -107,7 +105,7 @@ def command(
         report = check_site(tags, use, bounds_m)  # type: ignore[arg-type]
     forecast = None
     if routes:
-        paths = read_routes(routes, columns, units)
+        paths = [read_route(path, columns, units or ()) for path in routes]
         with console.working("Forecasting"), error_context(site):
             forecast = forecast_routes(
                 tags, paths, use, odometry_noise(drift, slip), laying=laying_of(laying, tags)

@@ -13,7 +13,7 @@ from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
 from locatk.cli.map.options import Size
 from locatk.cli.options import number
-from locatk.cli.route_options import LengthAndAngle, odometry_noise, read_routes
+from locatk.cli.route_options import LengthAndAngle, odometry_noise
 from locatk.cli.site.forecast import (
     laying_of,
     odometry_options,
@@ -157,7 +157,7 @@ def command(
     from locatk.core.polaris.design.routes import forecast_routes, plan_route
     from locatk.core.polaris.design.site import check_site, place_tags
     from locatk.formats.artifacts.tags import read_tags, write_tags
-    from locatk.formats.importers.floors.site_csv import read_site_points
+    from locatk.formats.importers.floors.site_csv import read_route, read_site_points
 
     sources = [each for each in (grid, points, route) if each is not None]
     if len(sources) != 1:
@@ -210,8 +210,8 @@ def command(
     with console.working("Checking"):
         report = check_site(site, use)
         if plan is not None and route is not None:
-            paths = read_routes([route], *table_options)
-            forecast = forecast_routes(site, paths, use, noise, laying=laid)
+            path = read_route(route, *table_options)
+            forecast = forecast_routes(site, [path], use, noise, laying=laid)
     write_tags(output, site, overwrite=overwrite)
     more: dict[str, Any] = {"output": output, "site": site_entry(site)}
     console.result(written_text(output, site) + "\n")

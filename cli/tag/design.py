@@ -194,39 +194,38 @@ def command(
         raise click.UsageError("--accuracy and --max-clearance are for --search.")
     use = reading_conditions(**conditions)
     part_prices = read_prices(prices)
-    found: DesignSearch | None = None
+    more: dict[str, Any] = {"output": output, "bom": bom}
     if search:
         if count is None:
             raise click.UsageError("--search needs --count, the number of tags.")
         found = _search(count, min_distance, accuracy, max_clearance, use)
         console.result(search_text(found) + "\n")
+        more["search"] = search_entry(found)
         if not found.designs:
             if as_json:
-                console.emit_json({"version": 1, "search": search_entry(found)})
+                console.emit_json({"version": 1, "search": more["search"]})
             failures.finish_with_warnings([found.reason])
-    magnet = _magnet(diameter, height, grade, remanence)
-    tags = Tags(
-        order=order,
-        magnets=magnets,
-        orientations=orientations,
-        spacing_m=compact_spacing(magnet, metres(clearance))
-        if spacing is None
-        else metres(spacing),
-        codec=codec,
-        magnet=magnet,
-        clearance_m=metres(clearance),
-        min_distance=min_distance,
-        ids=ids or None,
-    )
-    if found is not None:
         tags = replace(found.designs[0].tags, min_distance=min_distance)
+    else:
+        magnet = _magnet(diameter, height, grade, remanence)
+        tags = Tags(
+            order=order,
+            magnets=magnets,
+            orientations=orientations,
+            spacing_m=compact_spacing(magnet, metres(clearance))
+            if spacing is None
+            else metres(spacing),
+            codec=codec,
+            magnet=magnet,
+            clearance_m=metres(clearance),
+            min_distance=min_distance,
+            ids=ids or None,
+        )
     if count is not None:
         with console.steps(families.PROGRESS_STEPS, "Generating") as advance:
             ids = families.generate_family(tags, count, min_distance, advance)
-        tags = replace(tags, ids=ids)
-        tags = replace(
-            tags, notes=(f"family of rule {families.FAMILY_RULE_VERSION}, count {count}",)
-        )
+        note = f"family of rule {families.FAMILY_RULE_VERSION}, count {count}"
+        tags = replace(tags, ids=ids, notes=(note,))
     families.check_family(tags)
     with console.working("Planning"):
         report = evaluate_design(tags, use, count=len(tags.ids or (0,)))
@@ -236,9 +235,6 @@ def command(
         write_bill(bom, report.materials, overwrite=overwrite)
     written = [str(path) for path in (output, bom) if path is not None]
     console.result(f"Wrote {' and '.join(written)}\n")
-    more: dict[str, Any] = {"output": output, "bom": bom}
-    if found is not None:
-        more["search"] = search_entry(found)
     report_evaluation(report, list(report.warnings), more, as_json)
 
 
@@ -269,15 +265,15 @@ def _search(
         space = replace(space, counts=(given["magnets"],))
     if "orientations" in given:
         space = replace(space, orientations=(given["orientations"],))
-    if given.get("spacing") is not None:
+    if "spacing" in given:
         space = replace(space, spacing_m=metres(given["spacing"]))
-    if given.keys() & {"diameter", "height", "grade", "remanence"}:
-        names = ("diameter", "height", "grade", "remanence")
-        space = replace(space, magnets=(_magnet(*(context.params[name] for name in names)),))
-    wanted = accuracy or (math.inf, None)
-    heading_rad = math.inf if wanted[1] is None else wanted[1]
+    magnet_options = ("diameter", "height", "grade", "remanence")
+    if any(name in given for name in magnet_options):
+        magnet = _magnet(*(context.params[name] for name in magnet_options))
+        space = replace(space, magnets=(magnet,))
+    position_m, heading_rad = accuracy or (math.inf, None)
     with console.working("Searching"):
-        return search_designs(count, wanted[0], heading_rad, use, space, min_distance)
+        return search_designs(count, position_m, heading_rad or math.inf, use, space, min_distance)
 
 
 def _magnet(diameter: float, height: float, grade: str | None, remanence: float | None) -> Magnet:

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from locatk.core.errors import InputError
+from locatk.core.errors import InputError, error_context
 from locatk.core.polaris.design.site import SitePoint
 from locatk.core.polaris.tag import MAX_MEANING_CHARACTERS
 from locatk.core.printable import text_of_spreadsheet
+from locatk.core.routes import Route
 from locatk.formats.tables.delimited import Table
 from locatk.formats.tables.dialects import read_any_table
 from locatk.formats.tables.quantities import find_columns, split_unit, units_by_quantity
@@ -31,6 +32,19 @@ MAX_COORDINATE_M = 1e4
 
 MAX_ID_DIGITS = 1000
 """Longest id; longer ones are no ids of any code."""
+
+
+def read_route(
+    path: Path, columns: Mapping[str, str] | None = None, units: Sequence[str] = ()
+) -> Route:
+    """Read the waypoints of a route, whose name is that of the file.
+
+    The parameters and errors are those of :func:`read_site_points` and
+    :class:`~locatk.core.routes.Route`.
+    """
+    points, _ = read_site_points(path, columns, units)
+    with error_context(path):
+        return Route(np.array([[point.x_m, point.y_m] for point in points]), path.stem)
 
 
 def read_site_points(
