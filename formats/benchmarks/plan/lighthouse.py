@@ -56,6 +56,7 @@ from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
 from locatk.formats.benchmarks.lighthouse import suite
+from locatk.formats.benchmarks.plan.ratios import ratio_figures
 
 Array = NDArray[np.float64]
 
@@ -158,7 +159,7 @@ def _random_rooms() -> list[Figure]:
         f"{solved} of {TASKS * SESSIONS} sessions solved, each with other stations, after a "
         "similarity"
     )
-    return _ratio_figures(f"{TASKS} random rooms", ratio, how)
+    return ratio_figures(f"{NAME}, {TASKS} random rooms", ratio, how)
 
 
 def _mounted_rooms() -> list[Figure]:
@@ -181,21 +182,7 @@ def _mounted_rooms() -> list[Figure]:
         "the same rooms with the designed poses, beside which the stations are mounted; rms of "
         f"{SESSIONS} mountings, in the frame of the room"
     )
-    return _ratio_figures(f"{TASKS} rooms as mounted", np.array(ratio), how)
-
-
-def _ratio_figures(name: str, ratio: Array, how: str) -> list[Figure]:
-    """Return the median and the tails of ratios."""
-    low, median, high = np.percentile(ratio, [5, 50, 95])
-    name = f"{NAME}, {name}"
-    return [
-        Figure(f"{name}: median", float(median), "", f"{how}; goal 0.8 to 1.25"),
-        Figure(
-            f"{name}: median, larger of ratio and inverse", _deviation(median), "", how, MEDIAN_GOAL
-        ),
-        Figure(f"{name}: 5th percentile", float(low), "", how, 1 / TAIL_GOAL, "higher"),
-        Figure(f"{name}: 95th percentile", float(high), "", how, TAIL_GOAL),
-    ]
+    return ratio_figures(f"{NAME}, {TASKS} rooms as mounted", np.array(ratio), how)
 
 
 def _deviation(ratio: float) -> float:
