@@ -84,7 +84,7 @@ def command(
       locatk advise --task task.toml --prices prices.toml --json
     """
     from locatk.cli import advise_text
-    from locatk.core.advice.comparison import PriceTable, advise
+    from locatk.core.advice.comparison import advise
     from locatk.formats.advice.entries import advice_entry
     from locatk.formats.advice.task_settings import CONFIG, task_of
     from locatk.formats.artifacts.prices import read_price_list
@@ -96,11 +96,8 @@ def command(
         settings = _ask(CONFIG)
     task = task_of(settings)
     price_list = read_price_list(prices)
-    table = PriceTable()
-    if price_list is not None:
-        table = PriceTable(price_list.parts, price_list.work_minutes)
     with console.working("Designing") as show:
-        advice = advise(task, table, lambda system: show(f"Designing {system}", 0, 0))
+        advice = advise(task, price_list, lambda system: show(f"Designing {system}", 0, 0))
     console.result(advise_text.text(task, advice))
     if report is not None:
         from locatk.formats.report.plan import write_plan
@@ -144,26 +141,35 @@ def _has_terminal() -> bool:
 
 def _answer(question: str, key: str, setting: Any, default_text: str) -> dict[str, Any]:
     """Ask until the answer is valid; an empty answer leaves the default."""
-    from locatk.formats.artifacts.kinds import Boolean, InvalidValueError, ListOf
-
+    default = {"true": "yes", "false": "no"}.get(default_text, default_text)
     while True:
-        text = click.prompt(question, default=default_text, err=True).strip()
-        if text == default_text:
+        text = click.prompt(question, default=default, err=True).strip()
+        if text == default:
             return {}
         try:
-            if isinstance(setting.kind, Boolean):
-                words = {"yes": True, "y": True, "true": True, "no": False, "n": False}
-                if text.lower() not in {*words, "false"}:
-                    raise InvalidValueError("expected yes or no")
-                return {key: words.get(text.lower(), False)}
-            if isinstance(setting.kind, ListOf):
-                words_of_list = text.replace(",", " ").replace(" and ", " ").split()
-                return {key: setting.kind.parse(words_of_list)}
-            if hasattr(setting.kind, "parse_text"):
-                return {key: setting.kind.parse_text(text)}
-            return {key: setting.kind.parse(text)}
+            return {key: _parse(setting.kind, text)}
         except ValueError as error:
-            console.say(f"{text!r}: {getattr(error, 'message', error)}.")
+            console.message(f"{text!r}: {getattr(error, 'message', error)}.")
+
+
+def _parse(kind: Any, text: str) -> Any:
+    """Return the value of an answer.
+
+    Raises
+    ------
+    ValueError
+        It is not of this kind.
+    """
+    from locatk.formats.artifacts.kinds import Boolean, ListOf
+
+    if isinstance(kind, Boolean):
+        words = {"yes": True, "y": True, "true": True, "no": False, "n": False, "false": False}
+        if text.lower() not in words:
+            raise ValueError("expected yes or no")
+        return words[text.lower()]
+    if isinstance(kind, ListOf):
+        return kind.parse([word for word in text.replace(",", " ").split() if word != "and"])
+    return kind.parse_text(text) if hasattr(kind, "parse_text") else kind.parse(text)
 
 
 def _command_line(config: Any, answers: Mapping[str, Any]) -> str:

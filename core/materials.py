@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from locatk.core.errors import InputError
 
@@ -112,6 +112,22 @@ def total_of(items: Sequence[BillItem]) -> BillTotal:
     amount = sum(item.amount or 0.0 for item in items)
     missing = dict.fromkeys(priced_part(item) for item in items if item.price is None)
     return BillTotal(round(amount, 4), "".join(currencies), tuple(missing))
+
+
+@dataclass(frozen=True)
+class PriceList:
+    """Prices and working times of a user.
+
+    Attributes
+    ----------
+    parts : mapping of str to Price
+        By part.
+    work_minutes : mapping of str to float
+        Minutes for one piece of each work, as in :data:`locatk.core.advice.work.WORK_MINUTES`.
+    """
+
+    parts: Mapping[str, Price] = field(default_factory=dict)
+    work_minutes: Mapping[str, float] = field(default_factory=dict)
 
 
 def priced_part(item: BillItem) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from locatk.core.advice import dots, landmarks, lighthouse, polaris
 from locatk.core.advice.answer import Advice, Check, Combination, SystemAdvice
 from locatk.core.advice.task import Task
-from locatk.core.materials import Price, with_prices
+from locatk.core.materials import PriceList, with_prices
 
 ADVISERS: dict[str, Callable[[Task, Mapping[str, float]], SystemAdvice]] = {
     "lighthouse": lighthouse.advise,
@@ -27,25 +27,9 @@ GUIDANCE_RATIO = 10.0
 places of a second system."""
 
 
-@dataclass(frozen=True)
-class PriceTable:
-    """Prices and working times of a user.
-
-    Attributes
-    ----------
-    parts : dict of str to Price or None
-        By part; None for the published prices.
-    work_minutes : dict of str to float
-        Minutes by piece of work that replace :data:`~locatk.core.advice.work.WORK_MINUTES`.
-    """
-
-    parts: Mapping[str, Price] | None = None
-    work_minutes: Mapping[str, float] = field(default_factory=dict)
-
-
 def advise(
     task: Task,
-    prices: PriceTable | None = None,
+    prices: PriceList | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Advice:
     """Design the four systems for a task and compare them.
@@ -53,7 +37,8 @@ def advise(
     Parameters
     ----------
     task : Task
-    prices : PriceTable, optional
+    prices : PriceList, optional
+        By default, the published prices and the default minutes.
     progress : callable, optional
         Called with the name of each system before it is designed.
 
@@ -63,22 +48,23 @@ def advise(
         Systems that meet all requirements come first, then those that fail the fewest. Among equal
         ones, less installation work comes first.
     """
-    prices = prices or PriceTable()
+    minutes = {} if prices is None else prices.work_minutes
     systems = []
     for name, adviser in ADVISERS.items():
         if progress is not None:
             progress(name)
-        systems.append(_with_costs(adviser(task, prices.work_minutes), task, prices))
+        systems.append(_with_costs(adviser(task, minutes), task, prices))
     systems.sort(key=lambda system: (len(system.failures), system.hours))
     return Advice(tuple(systems), combine(systems, task))
 
 
-def _with_costs(advice: SystemAdvice, task: Task, prices: PriceTable) -> SystemAdvice:
+def _with_costs(advice: SystemAdvice, task: Task, prices: PriceList | None) -> SystemAdvice:
     """Return the advice with the user's prices, and the checks of budget, work and power."""
+    parts = None if prices is None else prices.parts
     advice = replace(
         advice,
-        infrastructure=with_prices(advice.infrastructure, prices.parts),
-        robot_parts=with_prices(advice.robot_parts, prices.parts),
+        infrastructure=with_prices(advice.infrastructure, parts),
+        robot_parts=with_prices(advice.robot_parts, parts),
     )
     checks = [*advice.checks, _budget_check(advice, task)]
     checks.append(

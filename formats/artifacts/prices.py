@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
 from locatk.core.advice.work import WORK_MINUTES
@@ -12,7 +12,7 @@ from locatk.core.dots.design.camera_materials import PARTS as CAMERA_PARTS
 from locatk.core.landmarks.design.materials import PARTS as LANDMARK_PARTS
 from locatk.core.lighthouse.design.materials import PARTS as STATION_PARTS
 from locatk.core.lighthouse.design.materials import PUBLISHED_PRICES as STATION_PRICES
-from locatk.core.materials import Price
+from locatk.core.materials import Price, PriceList
 from locatk.core.polaris.design.materials import PARTS as TAG_PARTS
 from locatk.core.polaris.design.materials import PUBLISHED_PRICES as TAG_PRICES
 from locatk.formats.artifacts.kinds import (
@@ -47,25 +47,6 @@ PARTS = tuple(
 
 PUBLISHED_PRICES = {**TAG_PRICES, **STATION_PRICES, **CAMERA_PRICES}
 """Prices that the papers state, by part."""
-
-Prices = dict[str, Price]
-"""Prices by part."""
-
-
-@dataclass(frozen=True)
-class PriceList:
-    """Content of ``prices.toml``.
-
-    Attributes
-    ----------
-    parts : dict of str to Price
-    work_minutes : dict of str to float
-        Minutes of the pieces of work that the file states, as in
-        :data:`~locatk.core.advice.work.WORK_MINUTES`.
-    """
-
-    parts: Prices = field(default_factory=dict)
-    work_minutes: dict[str, float] = field(default_factory=dict)
 
 
 def _item_of(values: Values) -> Values:
@@ -177,7 +158,7 @@ def read_price_list(path: str | os.PathLike[str] | None) -> PriceList | None:
     return None if path is None else PRICES.read(path)
 
 
-def read_prices(path: str | os.PathLike[str] | None) -> Prices | None:
+def read_prices(path: str | os.PathLike[str] | None) -> Mapping[str, Price] | None:
     """Read the prices of a file as :func:`read_price_list`; return None if there is none."""
     prices = read_price_list(path)
     return None if prices is None else prices.parts

@@ -9,9 +9,9 @@ import pytest
 
 from locatk.core.advice import comparison, dots, polaris
 from locatk.core.advice.answer import Check, SystemAdvice
-from locatk.core.advice.comparison import PriceTable, advise, combine
+from locatk.core.advice.comparison import advise, combine
 from locatk.core.advice.task import Task
-from locatk.core.materials import Price
+from locatk.core.materials import Price, PriceList
 from locatk.core.routes import Route
 
 ROUTE = Route(np.array([[0.0, 0.0], [4.0, 0.0]]))
@@ -38,7 +38,7 @@ def test_feasible_systems_with_less_work_come_first() -> None:
 
 
 def test_minutes_of_the_user_change_hours_and_order() -> None:
-    advice = advise(TASK, PriceTable(work_minutes={"lay a sheet": 600.0}))
+    advice = advise(TASK, PriceList(work_minutes={"lay a sheet": 600.0}))
     assert [system.system for system in advice.systems] == ["polaris", "dots"]
     step = next(step for step in advice.systems[1].work if step.name == "lay a sheet")
     assert step.hours == 10 * step.count
@@ -63,7 +63,7 @@ def test_complete_prices_decide_about_the_budget() -> None:
     }
     prices = {part: Price(1.0, "EUR", "2026-11", "shop") for part in parts}
     task = replace(TASK, budget=1e4, currency="EUR")
-    for system in advise(task, PriceTable(prices)).systems:
+    for system in advise(task, PriceList(prices)).systems:
         cost = system.check("cost")
         assert cost is not None
         assert cost.is_met is True
