@@ -114,10 +114,16 @@ class DotError:
         return math.hypot(self.noise_px, self.sampling_px, self.jitter_px)
 
 
+@functools.lru_cache(maxsize=64)
 def dot_error(image: DotImage) -> DotError:
     """Return the error of a dot, averaged over its positions within a pixel and its neighbours."""
     directions = MOTION_DIRECTIONS_RAD if image.motion_px > MIN_MOTION_PX else (0.0,)
-    parts = [_error_of_direction(image, direction) for direction in directions]
+    spectrum, fx, fy = _ink_spectrum(image)
+    parts = []
+    for direction in directions:
+        motion = np.sinc(image.motion_px * (fx * math.cos(direction) + fy * math.sin(direction)))
+        profile = np.fft.irfft2(spectrum * motion, (len(fy), len(fy))) * PHASES_PER_PX**2
+        parts.append(_error_of_profile(image, profile))
     return DotError(
         noise_px=math.sqrt(np.mean([part.noise_px**2 for part in parts])),
         sampling_px=math.sqrt(np.mean([part.sampling_px**2 for part in parts])),
@@ -128,8 +134,11 @@ def dot_error(image: DotImage) -> DotError:
     )
 
 
-def _error_of_direction(image: DotImage, motion_rad: float) -> DotError:
-    profile = _dot_profile(image, motion_rad)
+def _error_of_profile(image: DotImage, profile: Array) -> DotError:
+    """Return the error of a dot with the smoothed ink (n, n), :data:`PHASES_PER_PX` samples per px.
+
+    The dot is at sample (0, 0) of a periodic image.
+    """
     phase, ink = _sampled_ink(image, profile)
     flat = 1 - image.contrast * ink
     count = len(flat)
@@ -200,11 +209,11 @@ def _is_within_gates(error: Array, variance: Array, pitch_px: float) -> NDArray[
     return result
 
 
-def _dot_profile(image: DotImage, motion_rad: float) -> Array:
-    """Return the smoothed ink of one dot (n, n), :data:`PHASES_PER_PX` samples per pixel.
+def _ink_spectrum(image: DotImage) -> tuple[Array, Array, Array]:
+    """Return the spectrum (n, n / 2 + 1) of the smoothed ink of a dot at rest, and fx and fy.
 
-    The dot is at sample (0, 0) of a periodic image, so wide that the farthest neighbour does not
-    reach the window from the other side.
+    The frequencies, in 1/px, are those of a periodic image, so wide that the farthest neighbour
+    does not reach the window from the other side.
     """
     tail = image.diameter_px + 4 * image.blur_px + image.motion_px + 2 * SMOOTHING_RADIUS_PX
     farthest = 2 * image.pitch_px if _has_neighbours_in_window(image) else 0.0
@@ -222,12 +231,7 @@ def _dot_profile(image: DotImage, motion_rad: float) -> Array:
         np.sinc(f) * np.exp(-2 * (np.pi * image.blur_px * f) ** 2) * _tap_transfer(f)
         for f in (fy, fx)
     ]
-    spectrum = spectrum * separable[0] * separable[1]
-    if image.motion_px > 0:
-        along = fx * math.cos(motion_rad) + fy * math.sin(motion_rad)
-        spectrum = spectrum * np.sinc(image.motion_px * along)
-    result: Array = np.fft.irfft2(spectrum, (n, n)) * PHASES_PER_PX**2
-    return result
+    return spectrum * separable[0] * separable[1], fx, fy
 
 
 def _has_neighbours_in_window(image: DotImage) -> bool:
