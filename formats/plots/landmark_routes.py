@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Normalize
@@ -20,11 +17,10 @@ from numpy.typing import NDArray
 from locatk.core.landmarks.design.routes import RouteCheck
 from locatk.core.landmarks.drawing.floor_bars import bars_on_floor, cells_near
 from locatk.core.landmarks.map.floor import FloorMap
-from locatk.formats.output import atomic_write
+from locatk.formats.plots.figure_files import write_figure
 
 Array = NDArray[np.float64]
 
-DPI = 100
 WIDTH_INCHES, MIN_HEIGHT_INCHES, MAX_HEIGHT_INCHES = 10.0, 4.0, 12.0
 """Size of the picture; its height follows that of the floor."""
 
@@ -55,16 +51,13 @@ def write_routes_picture(
     checks : sequence of RouteCheck
     overwrite : bool
         Replace an existing file.
+
+    Raises
+    ------
+    InputError, OutputExistsError, MissingDataError
+        See :func:`~.figure_files.write_figure`.
     """
-    suffix = Path(path).suffix.lower()
-    # The picture must depend neither on the date, nor on a random salt, nor on a matplotlibrc.
-    metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
-    settings = mpl.rc_context({"svg.hashsalt": "locatk", "font.size": 9})
-    with style.context("default"), settings, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing")  # It is drawn as a box.
-        figure = draw_routes(floor, checks)
-        with atomic_write(path, overwrite=overwrite) as stream:
-            figure.savefig(stream, format=suffix[1:], dpi=DPI, metadata=metadata)
+    write_figure(path, lambda: draw_routes(floor, checks), overwrite=overwrite)
 
 
 def draw_routes(floor: FloorMap, checks: Sequence[RouteCheck]) -> Figure:

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import os
 import textwrap
-import warnings
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
@@ -20,11 +16,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from locatk.core.errors import InputError
 from locatk.core.evaluation import Evaluation
 from locatk.core.solution import Solution
 from locatk.core.trajectory import Trajectory
-from locatk.formats.output import atomic_write, check_output
+from locatk.formats.plots.figure_files import write_figure
 from locatk.formats.plots.ground import (
     Ground,
     build_ground,
@@ -63,10 +58,8 @@ from locatk.formats.plots.units import (
 
 Array = NDArray[np.float64]
 
-SUFFIXES = (".png", ".svg", ".pdf")
-
-SIZE_INCHES, DPI = (12.0, 6.0), 100
-"""Size and resolution of a picture: 1200 x 600 pixels as PNG."""
+SIZE_INCHES = (12.0, 6.0)
+"""Size of a picture: 1200 x 600 pixels as PNG."""
 
 POINTS_PER_PX = 0.64
 """Size in points of one pixel of a :class:`Style`: the map of a picture is about half as wide as
@@ -92,8 +85,8 @@ def write_picture(
     Parameters
     ----------
     path : path
-        The output; its suffix is one of :data:`SUFFIXES`. The same arguments result in the same
-        bytes.
+        The output; its suffix is one of :data:`~.figure_files.SUFFIXES`. The same arguments result
+        in the same bytes.
     solution : Solution
     truth : sequence of Trajectory
         Drawn under the trajectories.
@@ -107,26 +100,12 @@ def write_picture(
 
     Raises
     ------
-    InputError
-        The suffix is another one.
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
+    InputError, OutputExistsError, MissingDataError
+        See :func:`~.figure_files.write_figure`.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(
-            f"{Path(path).name!r} is not the name of a picture",
-            hint=f"End its name with one of {', '.join(SUFFIXES)}",
-        )
-    check_output(path, overwrite=overwrite)
-    # The picture must depend neither on the date, nor on a random salt, nor on a matplotlibrc.
-    metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
-    settings = mpl.rc_context({"svg.hashsalt": "locatk", "font.size": 9})
-    with style.context("default"), settings, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing")  # It is drawn as a box.
-        figure = draw_picture(solution, truth, evaluation, start_ns)
-        with atomic_write(path, overwrite=overwrite) as stream:
-            figure.savefig(stream, format=suffix[1:], dpi=DPI, metadata=metadata)
+    write_figure(
+        path, lambda: draw_picture(solution, truth, evaluation, start_ns), overwrite=overwrite
+    )
 
 
 def draw_picture(

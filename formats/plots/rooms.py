@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
@@ -22,8 +20,7 @@ from locatk.core.errors import InputError
 from locatk.core.lighthouse.design.report import RoomReport
 from locatk.core.lighthouse.room import Room
 from locatk.core.lighthouse.scene import Scene
-from locatk.formats.output import atomic_write, check_output
-from locatk.formats.plots.picture import DPI, SUFFIXES
+from locatk.formats.plots.figure_files import write_figure
 
 Array = NDArray[np.float64]
 
@@ -75,23 +72,11 @@ def write_room_maps(
     Raises
     ------
     InputError
-        The suffix is another one, or the scene has no room.
-    OutputExistsError, MissingDataError
-        See :func:`locatk.formats.output.atomic_write`.
+        The scene has no room.
+    InputError, OutputExistsError, MissingDataError
+        See :func:`~.figure_files.write_figure`.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(
-            f"{Path(path).name!r} is not the name of a picture",
-            hint=f"End its name with one of {', '.join(SUFFIXES)}",
-        )
-    check_output(path, overwrite=overwrite)
-    metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
-    settings = mpl.rc_context({"svg.hashsalt": "locatk", "font.size": 9})
-    with style.context("default"), settings:
-        figure = draw_room_maps(scene, report)
-        with atomic_write(path, overwrite=overwrite) as stream:
-            figure.savefig(stream, format=suffix[1:], dpi=DPI, metadata=metadata)
+    write_figure(path, lambda: draw_room_maps(scene, report), overwrite=overwrite)
 
 
 def draw_room_maps(scene: Scene, report: RoomReport) -> Figure:

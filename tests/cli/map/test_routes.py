@@ -89,9 +89,8 @@ def test_conditions_change_the_prediction(locatk, made: Path, drive: Path) -> No
     assert p95_m("--iron", "0.5") > 1.05 * usual
 
 
-@pytest.mark.parametrize("ending", [".png", ".svg", ".pdf"])
-def test_picture_is_written_once(locatk, made: Path, drive: Path, ending: str) -> None:
-    picture = made.with_suffix(ending)
+def test_picture_is_written_once(locatk, made: Path, drive: Path) -> None:
+    picture = made.with_suffix(".svg")
     command = "map", "check", made, "--route", drive, "-o", picture
     assert locatk(*command).exit_code == 0
     first = picture.read_bytes()

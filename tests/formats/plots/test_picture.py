@@ -23,7 +23,8 @@ from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.solution import Solution, SolverWarning
 from locatk.core.trajectory import Trajectory
 from locatk.formats import plots
-from locatk.formats.plots.picture import SUFFIXES, draw_picture, write_picture
+from locatk.formats.plots.figure_files import SUFFIXES
+from locatk.formats.plots.picture import draw_picture, write_picture
 
 START_NS = 1_767_225_600_000_000_000
 ROTATION = rotation_exp([0.0, 0.6, 0.0])
