@@ -237,8 +237,10 @@ def _ink_spectrum(image: DotImage) -> tuple[Array, Array, Array]:
 def _has_neighbours_in_window(image: DotImage) -> bool:
     """Return whether neighbours, as near as their symbols allow, reach the pixels about a dot."""
     nearest = (1 - 2 * DOT_OFFSET_PITCHES) * image.pitch_px
-    reach = image.diameter_px / 2 + 4 * image.blur_px + image.motion_px / 2 + SMOOTHING_RADIUS_PX
-    return nearest < math.sqrt(2) * WINDOW_PX + reach
+    ink_radius = (
+        image.diameter_px / 2 + 4 * image.blur_px + image.motion_px / 2 + SMOOTHING_RADIUS_PX
+    )
+    return nearest < math.sqrt(2) * WINDOW_PX + ink_radius
 
 
 def _sampled_ink(image: DotImage, profile: Array) -> tuple[Array, Array]:

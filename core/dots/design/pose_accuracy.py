@@ -94,15 +94,15 @@ def _accuracy_of_direction(
     # Point in half diagonals, and the derivatives of u and v, in pitches, by the parameters.
     p = u @ np.array([[c, -s], [s, c]]) / scale
     affine = np.column_stack([p, np.ones(count)])
-    nothing = np.zeros_like(affine)
+    zeros = np.zeros_like(affine)
     shared = [-u[:, :, None] * p[:, None, :]]
     if not is_lens_known:
         shared.append((-(p**2).sum(axis=1)[:, None] * u)[:, :, None])
     common = np.concatenate(shared, axis=2)
     columns = np.concatenate(
         [
-            np.column_stack([affine, nothing, common[:, 0]]),
-            np.column_stack([nothing, affine, common[:, 1]]),
+            np.column_stack([affine, zeros, common[:, 0]]),
+            np.column_stack([zeros, affine, common[:, 1]]),
         ]
     )
     sigma = sigma_px / pitch_px
@@ -126,8 +126,8 @@ def dots_in_frame(size_px: tuple[int, int], pitch_px: float, direction_rad: floa
     :data:`~.soft_bits.MAX_WINDOW_DOTS` columns and rows are decoded.
     """
     half = np.array(size_px) / 2 - SMOOTHING_RADIUS_PX
-    reach = min(math.ceil(float(np.linalg.norm(half)) / pitch_px), MAX_WINDOW_DOTS // 2)
-    line = np.arange(-reach, reach) + 0.5
+    half_count = min(math.ceil(float(np.linalg.norm(half)) / pitch_px), MAX_WINDOW_DOTS // 2)
+    line = np.arange(-half_count, half_count) + 0.5
     nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     c, s = math.cos(direction_rad), math.sin(direction_rad)
     in_frame = pitch_px * nodes @ np.array([[c, -s], [s, c]])

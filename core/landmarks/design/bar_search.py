@@ -150,14 +150,8 @@ def _option_of(
     wanted_heading_rad: float | None,
 ) -> BarOption:
     """Return the best height of some bars, and the reason if none suffices."""
-
-    def is_accurate(forecast: FloorForecast) -> bool:
-        return forecast.position_p95_m <= wanted_position_m and (
-            wanted_heading_rad is None or forecast.heading_p95_rad <= wanted_heading_rad
-        )
-
     separate = [each for each in tried if each[0].min_pitch_m <= pitch_m]
-    good = [each for each in separate if is_accurate(each[1])]
+    good = [each for each in separate if each[1].is_within(wanted_position_m, wanted_heading_rad)]
     analysis, forecast = min(good or separate or tried, key=lambda each: each[1].position_p95_m)
     if good:
         reason = ""

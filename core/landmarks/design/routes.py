@@ -2,9 +2,9 @@
 
 A robot that follows a route passes some landmarks. Each pass is a fix, whose covariance is the
 bound of :mod:`.visit_accuracy` plus the errors of the landmark's installation; odometry carries the
-pose between fixes (:mod:`locatk.core.routes`). A pose on the map is known once no other place and
+pose between fixes (:mod:`locatk.core.routes`). A pose on the map is known once no other cell and
 heading of the map would have read the same landmarks along the same route
-(:func:`count_places`), and final once the cell filter of the solver is certain
+(:func:`count_matching_poses`), and final once the cell filter of the solver is certain
 (:mod:`.final_poses`).
 
 Nothing here is simulated or measured. Landmarks count as they were built, as far as that is known.
@@ -26,16 +26,16 @@ from locatk.core.error_quantiles import error_quantile
 from locatk.core.errors import InputError
 from locatk.core.landmarks.design.final_poses import MapEvidence
 from locatk.core.landmarks.design.visit_accuracy import (
-    REACH_M,
     STEP_M,
     STEP_RAD,
+    VISIT_MARGIN_M,
     VisitAccuracy,
     VisitErrors,
     installation_covariance,
     predict_visit,
     sensor_arms,
     straight_path,
-    visit_reach,
+    visit_range,
 )
 from locatk.core.landmarks.field import basis
 from locatk.core.landmarks.halls import circle
@@ -266,9 +266,9 @@ def find_visits(
     """Return the passes of a route over landmarks, in order.
 
     A pass is an interval in which the solver notices the field of a landmark, plus
-    :data:`~.visit_accuracy.REACH_M` on both sides. Its fix is at the point next to the centre of
-    the landmark if ``is_smoothed``. Otherwise it is where the last sensor leaves that field,
-    because a live robot has no fix before. If a landmark is visited several times, the
+    :data:`~.visit_accuracy.VISIT_MARGIN_M` on both sides. Its fix is at the point next to the
+    centre of the landmark if ``is_smoothed``. Otherwise it is where the last sensor leaves that
+    field, because a live robot has no fix before. If a landmark is visited several times, the
     errors of its installation are those of all visits; each of n fixes has n times their
     variance, so that all together count them once.
     """
@@ -282,9 +282,9 @@ def find_visits(
     centres = np.array([pose[:2] for pose, _ in landmarks])
     arm = float(np.hypot(*sensors.T).max())
     near = cKDTree(poses[:, :2]).query_ball_point(
-        centres, visit_reach(floor.geometry) - floor.geometry.circle_m + arm, return_sorted=True
+        centres, visit_range(floor.geometry) - floor.geometry.circle_m + arm, return_sorted=True
     )
-    margin = math.ceil(REACH_M / STEP_M)
+    margin = math.ceil(VISIT_MARGIN_M / STEP_M)
     peak_t = MIN_PEAK_THRESHOLDS * floor.geometry.threshold_t
     field_t = max(
         MIN_FIELD_THRESHOLDS * floor.geometry.threshold_t, MIN_FIELD_SIGMAS * errors.noise_t
@@ -367,10 +367,9 @@ def _sampled(route: Route) -> tuple[Array, Array]:
     for number, length_m in enumerate(route.segment_m.tolist()):
         first = route.waypoint_m[number]
         if number:
-            turn = heading[number] - heading[number - 1]
-            angles = heading[number - 1] + turn * np.linspace(
-                0.0, 1.0, math.ceil(abs(turn) / STEP_RAD) + 1
-            )[1:-1]  # fmt: skip
+            before, after = heading[number - 1 : number + 1].tolist()
+            count = math.ceil(abs(after - before) / STEP_RAD) + 1
+            angles = np.linspace(before, after, count)[1:-1]
             poses.append(np.column_stack([np.tile(first, (len(angles), 1)), angles]))
             distances.append(np.full(len(angles), start_m))
         along = np.linspace(0.0, length_m, max(math.ceil(length_m / STEP_M), 1) + 1)
@@ -399,8 +398,8 @@ def _rotated(covariance: Array, angle_rad: float) -> Array:
 # ---- localization without a prior
 
 
-def count_places(floor: FloorMap, cells: Sequence[Cell]) -> NDArray[np.int64]:
-    """Return how many places of a map read the same landmarks along the same path.
+def count_matching_poses(floor: FloorMap, cells: Sequence[Cell]) -> NDArray[np.int64]:
+    """Return how many poses on a map read the same landmarks along the same path.
 
     Parameters
     ----------
@@ -412,8 +411,8 @@ def count_places(floor: FloorMap, cells: Sequence[Cell]) -> NDArray[np.int64]:
     Returns
     -------
     (len(cells),) int64 ndarray
-        After each landmark, places times headings, the true one included. Holes are not read:
-        a place is excluded if a landmark is missing there, but not by one that was not expected.
+        After each landmark, cells times headings, the true pose included. Holes are not read:
+        a pose is excluded if a landmark is missing there, but not by one that was not expected.
     """
     rows, columns = floor.shape
     codes = np.where(floor.codes == HOLE_CODE, 0, floor.codes)
@@ -477,9 +476,9 @@ def _check_route(
     ambiguous = 4 * len(floor.cells())
     for chain in chains:
         cells = [visit.cell for visit in chain]
-        places = count_places(built, cells)
-        ambiguous = min([ambiguous, *places.tolist()])
-        unique = np.flatnonzero(places == 1)
+        counts = count_matching_poses(built, cells)
+        ambiguous = min([ambiguous, *counts.tolist()])
+        unique = np.flatnonzero(counts == 1)
         if localized_after is None and len(unique):
             localized_after = int(unique[0]) + 1
             localized_m = chain[unique[0]].fix.distance_m
@@ -638,7 +637,7 @@ def max_pass_offset(
 
     It is a multiple of 5 mm; 0 if no pass reads all landmarks.
     """
-    offsets = PASS_STEP_M * np.arange(math.ceil(visit_reach(geometry) / PASS_STEP_M))
+    offsets = PASS_STEP_M * np.arange(math.ceil(visit_range(geometry) / PASS_STEP_M))
     for offset in offsets[::-1].tolist():
         path = straight_path(geometry, offset, 0.0)
         visits = (
@@ -734,6 +733,12 @@ class FloorForecast:
     without_fix_p95_m: float
     read_fraction: float
     landmarks_per_m: float
+
+    def is_within(self, position_m: float, heading_rad: float | None) -> bool:
+        """Return whether the errors anywhere are at most these; None for any heading."""
+        return self.position_p95_m <= position_m and (
+            heading_rad is None or self.heading_p95_rad <= heading_rad
+        )
 
 
 def forecast_floor(

@@ -48,7 +48,7 @@ deviations change by less than 1 % at heights of 6 mm and more."""
 STEP_RAD = math.radians(3)
 """Rotation on the spot between two points: the sensors then move by 1.3 mm."""
 
-REACH_M = MARGIN_M
+VISIT_MARGIN_M = MARGIN_M
 """Path before and after the field of a landmark that counts as part of a visit [m]."""
 
 MAX_POSITION_SIGMA_M = 6e-3
@@ -151,8 +151,8 @@ class VisitAccuracy:
 
 def straight_path(geometry: Geometry, offset_m: float, heading_rad: float) -> Array:
     """Return a straight path (n, 3) over a landmark, which the middle point is next to."""
-    reach = visit_reach(geometry) + REACH_M
-    count = math.ceil(reach / STEP_M)
+    half_length_m = visit_range(geometry) + VISIT_MARGIN_M
+    count = math.ceil(half_length_m / STEP_M)
     along = STEP_M * np.arange(-count, count + 1)
     c, s = math.cos(heading_rad), math.sin(heading_rad)
     x, y = c * along - s * offset_m, s * along + c * offset_m
@@ -166,7 +166,7 @@ def sensor_arms(poses: Array, sensors_m: Array) -> Array:
     return np.stack([cos * x - sin * y, sin * x + cos * y], -1)
 
 
-def visit_reach(geometry: Geometry) -> float:
+def visit_range(geometry: Geometry) -> float:
     """Return a distance [m] from the centre beyond which a robot does not notice a landmark.
 
     At twice the length of the bars beyond them, the field of the default landmark is 0.4 mT.
@@ -176,8 +176,8 @@ def visit_reach(geometry: Geometry) -> float:
 
 def installation_covariance(pose: Array, errors: VisitErrors) -> Array:
     """Return the covariance (3, 3) of a pose (3,) by the installation of the landmark."""
-    lever = np.array([-pose[1], pose[0], 1.0])
-    covariance = errors.landmark_heading_rad**2 * np.outer(lever, lever)
+    lever_arm = np.array([-pose[1], pose[0], 1.0])
+    covariance = errors.landmark_heading_rad**2 * np.outer(lever_arm, lever_arm)
     covariance[[0, 1], [0, 1]] += errors.landmark_position_m**2
     return np.asarray(covariance)
 
@@ -261,9 +261,9 @@ def _other_strengths(strength: Array) -> Array:
     return np.asarray(others[(others != strength).any(axis=1)])
 
 
-def _pose_columns(gradient: Array, lever: Array) -> list[Array]:
+def _pose_columns(gradient: Array, lever_arm: Array) -> list[Array]:
     """Return the derivatives (n, N) of the readings by x, y and heading at the reference."""
-    by_heading = gradient[..., 1] * lever[..., 0] - gradient[..., 0] * lever[..., 1]
+    by_heading = gradient[..., 1] * lever_arm[..., 0] - gradient[..., 0] * lever_arm[..., 1]
     return [gradient[..., 0], gradient[..., 1], by_heading]
 
 

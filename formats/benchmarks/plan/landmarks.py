@@ -175,12 +175,12 @@ def _route(rng: np.random.Generator, floor: FloorMap) -> Route:
             corners.append(corner)
         points = floor.pitch_m * np.array(corners) + rng.normal(0, 0.015, 2)
     else:
-        places = [rng.uniform(0, last, 2)]
-        while len(places) < 4:
-            place = rng.uniform(0, last, 2)
-            if np.hypot(*(place - places[-1])) > 0.4 * last:
-                places.append(place)
-        points = np.array(places)
+        corners = [rng.uniform(0, last, 2)]
+        while len(corners) < 4:
+            corner = rng.uniform(0, last, 2)
+            if np.hypot(*(corner - corners[-1])) > 0.4 * last:
+                corners.append(corner)
+        points = np.array(corners)
     return Route(points)
 
 
@@ -326,10 +326,10 @@ class _TruePath:
     def errors(self, time_ns: NDArray[np.int64], pose: Array) -> tuple[Array, Array]:
         """Return the distances (n,) along the route and the squared errors (n, 2) of poses."""
         true = np.column_stack([np.interp(time_ns, self.time_ns, each) for each in self.pose.T])
-        turn = np.remainder(pose[:, 2] - true[:, 2] + math.pi, 2 * math.pi) - math.pi
+        heading_error = np.remainder(pose[:, 2] - true[:, 2] + math.pi, 2 * math.pi) - math.pi
         position = ((pose[:, :2] - true[:, :2]) ** 2).sum(axis=1)
         distance_m = np.interp(time_ns, self.time_ns, self.distance_m)
-        return distance_m, np.column_stack([position, turn**2])
+        return distance_m, np.column_stack([position, heading_error**2])
 
 
 def _sigmas(check: RouteCheck, distance_m: Array) -> Array:

@@ -15,7 +15,7 @@ from locatk.core.landmarks.design.generation import DesignOptions, design_map
 from locatk.core.landmarks.design.routes import (
     best_shift,
     check_routes,
-    count_places,
+    count_matching_poses,
     find_visits,
     forecast_floor,
     max_pass_offset,
@@ -76,7 +76,7 @@ def test_places_are_those_of_a_walk(data) -> None:
     if not cells:
         return
     path = data.draw(st.lists(st.sampled_from(cells), min_size=1, max_size=4, unique=True))
-    counts = count_places(floor, path)
+    counts = count_matching_poses(floor, path)
     assert counts.tolist() == [places_by_hand(floor, path[: k + 1]) for k in range(len(path))]
 
 
