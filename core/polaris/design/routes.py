@@ -472,20 +472,22 @@ def forecast_routes(
         k = int(variance.argmax())
         worst_m = np.concatenate([each.accuracy.position_m for each in forecasts])[k]
         worst = covariance[k : k + 1]
-    known = (covariance[is_known], weight[is_known])
     fixed = np.array(fixes).reshape(-1, 3, 3)
-    length_m = sum(route.length_m for route in routes)
+    position_p95_m, heading_p95_rad = _quantiles(covariance[is_known], weight[is_known])
+    fix_position_p95_m, fix_heading_p95_rad = _quantiles(fixed, np.ones(len(fixed)))
     return SiteForecast(
-        tuple(forecasts),
-        length_m,
-        len({each.tag_id for forecast in forecasts for each in forecast.passes}),
-        *_quantiles(*known),
-        *_quantiles(fixed, np.ones(len(fixed))),
-        float(weight[is_known].sum() / weight.sum()),
-        max(each.accuracy.longest_without_fix_m for each in forecasts),
-        worst_m,
-        error_quantile(worst[:, :2, :2], PROBABILITY),
-        tuple(warnings),
+        routes=tuple(forecasts),
+        length_m=sum(route.length_m for route in routes),
+        tags=len({each.tag_id for forecast in forecasts for each in forecast.passes}),
+        position_p95_m=position_p95_m,
+        heading_p95_rad=heading_p95_rad,
+        fix_position_p95_m=fix_position_p95_m,
+        fix_heading_p95_rad=fix_heading_p95_rad,
+        covered_fraction=float(weight[is_known].sum() / weight.sum()),
+        longest_gap_m=max(each.accuracy.longest_without_fix_m for each in forecasts),
+        worst_m=worst_m,
+        worst_position_p95_m=error_quantile(worst[:, :2, :2], PROBABILITY),
+        warnings=tuple(warnings),
     )
 
 

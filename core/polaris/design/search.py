@@ -214,7 +214,7 @@ def search_designs(
         if near is not None:
             closest.append(near)
     if designs:
-        return DesignSearch(tuple(sorted(designs, key=_cost)))
+        return DesignSearch(tuple(sorted(designs, key=lambda design: _cost(design.tags))))
     if closest and min(_excess(each, position_m, heading_rad) for each in closest) > 1:
         nearest = min(closest, key=lambda each: _excess(each, position_m, heading_rad))
         built = _evaluated(nearest.tags, use, AS_BUILT_SIGMA_M)[0]
@@ -228,11 +228,11 @@ def search_designs(
     return DesignSearch((), None, reason)
 
 
-def _cost(design: TagDesign) -> tuple[float, ...]:
+def _cost(tags: Tags) -> tuple[float, ...]:
     """Return the sort key: magnets to place, side of the tag, volume of a magnet."""
-    tags = design.tags
+    side_m = round(tags.order * tags.spacing_m, 6)
     volume = tags.magnet.diameter_m**2 * tags.magnet.height_m
-    return tags.magnets, round(design.side_m, 6), volume, tags.orientations, -tags.clearance_m
+    return tags.magnets, side_m, volume, tags.orientations, -tags.clearance_m
 
 
 def _excess(design: TagDesign, position_m: float, heading_rad: float) -> float:
@@ -287,7 +287,7 @@ def _best_of_magnet(
 
     ``reasons`` counts why candidates were left out.
     """
-    candidates: list[TagDesign] = []
+    candidates: list[Tags] = []
     clearances = np.linspace(*space.clearance_m, CLEARANCE_STEPS).round(CLEARANCE_DECIMALS)
     for clearance_m in dict.fromkeys(clearances.tolist()):
         reason = _unreadable(magnet, clearance_m, use)
@@ -297,20 +297,19 @@ def _best_of_magnet(
         for spacing_m, code in itertools.product(_spacings(magnet, clearance_m, space), codes.tags):
             tags = replace(code, magnet=magnet, clearance_m=clearance_m, spacing_m=spacing_m)
             if (tags.order - 1) * spacing_m <= use.array_m + 1e-9:
-                candidates.append(TagDesign(tags, math.inf, math.inf))
+                candidates.append(tags)
     if not candidates:
         return None, None
-    least = {id(each): _least_excess(each.tags, position_m, heading_rad) for each in candidates}
-    viable = [each for each in candidates if least[id(each)] <= 1]
+    bounds = [(_least_excess(tags, position_m, heading_rad), tags) for tags in candidates]
+    viable = [tags for bound, tags in bounds if bound <= 1]
     if not viable:
-        nearest = min(candidates, key=lambda each: (least[id(each)], _cost(each)))
-        return None, _evaluated(nearest.tags, use)[0]
+        _, nearest = min(bounds, key=lambda pair: (pair[0], _cost(pair[1])))
+        return None, _evaluated(nearest, use)[0]
     closest: TagDesign | None = None
     placement = use.placement_rad or PLACEMENT_SIGMA_RAD
     angle_rad: dict[float, float] = {}
     tried = 0
-    for candidate in sorted(viable, key=_cost):
-        tags = candidate.tags
+    for tags in sorted(viable, key=_cost):
         # The angle of a magnet hardly depends on the code.
         max_rad = math.pi / tags.orientations / ORIENTATION_MARGIN_SIGMAS
         if math.hypot(placement, angle_rad.get(tags.clearance_m, 0.0)) > max_rad:
@@ -319,9 +318,9 @@ def _best_of_magnet(
         if math.hypot(placement, angle_rad[tags.clearance_m]) > max_rad:
             continue
         excess = _excess(design, position_m, heading_rad)
-        if excess <= 1 and not codes.has_family(tags):
-            continue
         if excess <= 1:
+            if not codes.has_family(tags):
+                continue
             report = evaluate_design(tags, use)
             design = TagDesign(tags, *_errors_of(report.placed))
             excess = _excess(design, position_m, heading_rad)
