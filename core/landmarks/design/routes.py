@@ -454,6 +454,35 @@ def _connected_visits(
     return chains
 
 
+def _localization(
+    floor: FloorMap, chains: Sequence[Sequence[RouteVisit]]
+) -> tuple[int | None, float | None, int]:
+    """Return landmarks and distance until a robot is localized, and the other possible poses."""
+    built = replace(floor, codes=as_built_codes(floor))
+    fewest = 4 * len(floor.cells())
+    for chain in chains:
+        counts = count_matching_poses(built, [visit.cell for visit in chain])
+        unique = np.flatnonzero(counts == 1)
+        if len(unique):
+            return int(unique[0]) + 1, chain[unique[0]].fix.distance_m, 0
+        fewest = min([fewest, *counts.tolist()])
+    return None, None, max(fewest - 1, 0)
+
+
+def _final_poses(
+    chains: Sequence[Sequence[RouteVisit]], evidence: MapEvidence | None
+) -> tuple[int | None, float | None]:
+    """Return landmarks and distance until the poses are final; None if they never are."""
+    if evidence is None:
+        return None, None
+    for chain in chains:
+        cells = [visit.cell for visit in chain]
+        for count, probability in enumerate(evidence.posteriors(cells), 1):
+            if probability >= PROVISIONAL_PROBABILITY:
+                return count, chain[count - 1].fix.distance_m
+    return None, None
+
+
 # ---- one route
 
 
@@ -467,26 +496,11 @@ def _check_route(
     speed_mps: float,
     is_smoothed: bool,
 ) -> RouteCheck:
-    usable = [visit for visit in visits if visit.accuracy.is_usable]
-    fixes = [visit.fix for visit in usable]
-    accuracy = predict_accuracy(route, fixes, noise, speed_mps)
-    chains = _connected_visits(floor, visits, accuracy)
-    built = replace(floor, codes=as_built_codes(floor))
-    localized_after = localized_m = final_after = final_m = None
-    ambiguous = 4 * len(floor.cells())
-    for chain in chains:
-        cells = [visit.cell for visit in chain]
-        counts = count_matching_poses(built, cells)
-        ambiguous = min([ambiguous, *counts.tolist()])
-        unique = np.flatnonzero(counts == 1)
-        if localized_after is None and len(unique):
-            localized_after = int(unique[0]) + 1
-            localized_m = chain[unique[0]].fix.distance_m
-        if final_after is None and evidence is not None:
-            for count, probability in enumerate(evidence.posteriors(cells), 1):
-                if probability >= PROVISIONAL_PROBABILITY:
-                    final_after, final_m = count, chain[count - 1].fix.distance_m
-                    break
+    fixes = [visit.fix for visit in visits if visit.accuracy.is_usable]
+    with_all_fixes = predict_accuracy(route, fixes, noise, speed_mps)
+    chains = _connected_visits(floor, visits, with_all_fixes)
+    localized_after, localized_m, ambiguous = _localization(floor, chains)
+    final_after, final_m = _final_poses(chains, evidence)
     length_m = route.length_m
     stops = np.array([0.0, *(fix.distance_m for fix in fixes), length_m])
     longest = int(np.argmax(np.diff(stops)))
@@ -511,7 +525,7 @@ def _check_route(
         localized_m=localized_m,
         final_after=final_after,
         final_m=final_m,
-        ambiguous_places=0 if localized_after is not None else max(ambiguous - 1, 0),
+        ambiguous_places=ambiguous,
         accuracy=accuracy,
         longest_m=(float(stops[longest]), float(stops[longest + 1])),
         covered_fraction=float(weight.sum() / length_m),
