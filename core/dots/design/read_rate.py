@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from locatk.core.dots.design.dot_noise import PAPER_LEVEL, DotError
-from locatk.core.dots.localization.frames import MIN_SIDE_PX, MIN_TRIED_LEVELS, PREFERRED_SIDE_PX
+from locatk.core.dots.localization.frames import tried_levels
 
 MIN_DOTS, DOTS_SPREAD = 48.0, 3.0
 """Dots of a frame with which half of the frames are read, and the width of the transition.
@@ -104,14 +104,11 @@ def _condition_rates(error: DotError, dots: float, pitch_px: float) -> dict[str,
 
 
 def searched_levels(size_px: tuple[int, int]) -> tuple[int, ...]:
-    """Return the numbers of halvings of a frame that the decoder tries, in its order."""
-    short = min(size_px)
-    if short < MIN_SIDE_PX:
-        return (0,)
-    preferred = max(0, round(math.log2(short / PREFERRED_SIDE_PX)))
-    levels = range(max(MIN_TRIED_LEVELS, preferred + 1))
-    possible = [level for level in levels if short >> level >= MIN_SIDE_PX]
-    return tuple(sorted(possible, key=lambda level: (abs(level - preferred), level)))
+    """Return the numbers of halvings of a frame that the decoder tries, in its order.
+
+    It is 0 for frames that are too small for the decoder.
+    """
+    return tuple(tried_levels(*size_px)) or (0,)
 
 
 def _logistic(x: float) -> float:

@@ -159,7 +159,7 @@ def localize_frames(
         return result
     for start in range(0, n, FRAMES_PER_BATCH):
         remaining = np.arange(start, min(start + FRAMES_PER_BATCH, n))
-        for level in _levels(height, width):
+        for level in tried_levels(height, width):
             points, dots = _detect_points(images[remaining], camera, level)
             part, _, _ = _localize_dots(
                 points, dots, codec, camera is None, min_confidence, other_codec_odds
@@ -290,7 +290,7 @@ def _localize_decoded(
     return poses
 
 
-def _levels(height: int, width: int) -> list[int]:
+def tried_levels(height: int, width: int) -> list[int]:
     """Return the numbers of halvings of the frame to try, the most suitable first."""
     short = min(height, width)
     preferred = max(0, round(math.log2(short / PREFERRED_SIDE_PX)))
@@ -343,7 +343,7 @@ def dot_correspondences(
     _, height, width = images.shape
     centre, half_diagonal = _normalization(height, width, camera)
     for image in images:
-        for level, is_thorough in itertools.product(_levels(height, width), (False, True)):
+        for level, is_thorough in itertools.product(tried_levels(height, width), (False, True)):
             points, detected = _detect_points(image[None], camera, level)
             frame, lattices, windows = _localize_dots(
                 points,

@@ -30,7 +30,6 @@ from locatk.core.dots.design.read_rate import (
     MAX_BLUR_PITCHES,
     MAX_MOTION_PITCHES,
     MAX_SHEAR,
-    searched_levels,
 )
 from locatk.core.dots.localization import frames
 from locatk.core.dots.simulation.session import SimulationOptions, camera, simulate
@@ -109,11 +108,6 @@ def test_a_window_in_view_has_a_diagonal_that_fits(side_m: float, pitch_m: float
     if dots:
         assert window_diagonal_m(dots, pitch_m) <= side_m * (1 + 1e-6)
     assert window_diagonal_m(dots + 1, pitch_m) > side_m * (1 - 1e-6)
-
-
-@pytest.mark.parametrize("size", [(188, 120), (640, 480), (1280, 800), (1640, 1232), (60, 50)])
-def test_sizes_are_searched_as_by_the_decoder(size: tuple[int, int]) -> None:
-    assert list(searched_levels(size)) == frames._levels(size[1], size[0])
 
 
 # ---- choices
