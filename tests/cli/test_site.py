@@ -142,8 +142,8 @@ def test_a_route_with_an_accuracy_is_designed_and_checked(
     assert errors["fix_position_p95_m"] < 0.2 * entry["forecast"]["fix_position_p95_m"]
 
 
-def test_impossible_accuracies_are_answered_with_status_3(
-    locatk, tmp_path: Path, tag: Path, aisle: Path
+def test_an_impossible_accuracy_is_answered_with_status_3(
+    locatk, tmp_path: Path, aisle: Path
 ) -> None:
     free, out = tmp_path / "any.toml", tmp_path / "site.toml"
     write_tags(free, Tags())
@@ -152,17 +152,31 @@ def test_impossible_accuracies_are_answered_with_status_3(
     assert "1 mm (95 %) is impossible on this route: tags 249 mm apart give" in result.stderr
     assert "locatk site survey" in result.stderr
     assert read_tags(out).site
-    few = locatk(
-        "site", "design", tag, "--route", aisle, "--accuracy", 5, "-o", tmp_path / "2.toml"
-    )
-    assert few.exit_code == 3
-    assert "tags are needed, but there are 6 ids: design more" in few.stderr
-    assert not (tmp_path / "2.toml").exists()
-    narrow = ("--route", aisle, "--accuracy", 9, "--sensors", 4, "-o", tmp_path / "3.toml")
-    thin = locatk("site", "design", free, *narrow)
-    assert thin.exit_code == 3
-    assert "no tag passes wholly below the array" in thin.stderr
-    assert "take a wider array, of" in thin.stderr
+    beside = tmp_path / "beside.csv"
+    beside.write_text("x_mm,y_mm\n0,500\n2900,500\n")
+    missed = locatk("site", "check", out, "--route", beside)
+    assert missed.exit_code == 3
+    assert "on route beside, no tag passes wholly below the array" in missed.stderr
+
+
+def test_a_family_with_too_few_ids_is_answered_with_status_3(
+    locatk, tmp_path: Path, tag: Path, aisle: Path
+) -> None:
+    out = tmp_path / "site.toml"
+    result = locatk("site", "design", tag, "--route", aisle, "--accuracy", 5, "-o", out)
+    assert result.exit_code == 3
+    assert "tags are needed, but there are 6 ids: design more" in result.stderr
+    assert not out.exists()
+
+
+def test_a_narrow_array_is_answered_with_status_3(locatk, tmp_path: Path, aisle: Path) -> None:
+    free = tmp_path / "any.toml"
+    write_tags(free, Tags())
+    options = ("--route", aisle, "--accuracy", 9, "--sensors", 4, "-o", tmp_path / "site.toml")
+    result = locatk("site", "design", free, *options)
+    assert result.exit_code == 3
+    assert "no tag passes wholly below the array" in result.stderr
+    assert "take a wider array, of" in result.stderr
     for line, reason in (("100,0", "no tag is passed straight"), ("9e6,0", "too many tags")):
         other = tmp_path / "other.csv"
         other.write_text(f"x_mm,y_mm\n0,0\n{line}\n")
@@ -170,11 +184,6 @@ def test_impossible_accuracies_are_answered_with_status_3(
         result = locatk("site", "design", free, *args)
         assert result.exit_code == 3
         assert reason in result.stderr
-    beside = tmp_path / "beside.csv"
-    beside.write_text("x_mm,y_mm\n0,500\n2900,500\n")
-    missed = locatk("site", "check", out, "--route", beside)
-    assert missed.exit_code == 3
-    assert "on route beside, no tag passes wholly below the array" in missed.stderr
 
 
 # ---- check

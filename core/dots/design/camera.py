@@ -544,7 +544,7 @@ class SensorFit:
 
     @property
     def fits(self) -> bool:
-        """Whether all requirements are met."""
+        """True if all requirements are met."""
         return not self.reasons
 
 

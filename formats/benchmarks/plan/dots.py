@@ -151,7 +151,7 @@ def task_figures(results: list[TaskResult]) -> Iterable[Figure]:
         ("position", [result.position_ratio for result in results]),
         ("heading", [result.heading_ratio for result in results]),
     ):
-        yield from ratio_figures(f"dots: predicted over reached, {name}", ratios, how)
+        yield from ratio_figures(f"dots: {name}, predicted / reached", ratios, how)
     predicted = [100 * result.report.read_rate for result in results]
     reached = [100 * result.measured.read_rate for result in results]
     worst = float(np.abs(np.subtract(predicted, reached)).max())

@@ -43,9 +43,9 @@ def test_table_and_json_give_the_prediction(locatk, made: Path, drive: Path) -> 
     (line,) = (row for row in result.stdout.splitlines() if row.startswith("drive "))
     assert max(map(len, result.stdout.splitlines()[1:])) <= 80
     assert "by locatk live" in result.stdout
-    told = json.loads(locatk("map", "check", made, "--route", drive, "--json").stdout)
-    assert told["maps"][0]["verdict"].startswith("unique")
-    (route,) = told["routes"]
+    output = json.loads(locatk("map", "check", made, "--route", drive, "--json").stdout)
+    assert output["maps"][0]["verdict"].startswith("unique")
+    (route,) = output["routes"]
     floor = read_map(made)
     expected = check_routes(floor, [Route(np.array([[0, 0.2], [1.2, 0.2], [1.2, 1.0]]))])[0]
     assert route["localizable"] is True
@@ -64,9 +64,9 @@ def test_route_that_is_not_localisable_ends_with_3(
     assert result.exit_code == 3
     assert "route between is not localisable" in result.stderr
     assert "shift the route by" in result.stderr
-    told = json.loads(locatk("map", "check", made, "--route", between, "--json").stdout)
-    assert told["routes"][0]["position_p95_m"] is None
-    assert told["routes"][0]["warnings"]
+    output = json.loads(locatk("map", "check", made, "--route", between, "--json").stdout)
+    assert output["routes"][0]["position_p95_m"] is None
+    assert output["routes"][0]["warnings"]
 
 
 def test_accuracy_is_compared_with_the_route(locatk, made: Path, drive: Path) -> None:
@@ -187,6 +187,7 @@ def few_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     bar_search = "locatk.core.landmarks.design.bar_search"
     monkeypatch.setattr(f"{bar_search}.BARS_M", ((30e-3, 10e-3, 5e-3), (50e-3, 12e-3, 12e-3)))
     monkeypatch.setattr(f"{bar_search}.HEIGHTS_M", (12e-3,))
+    monkeypatch.setattr(f"{bar_search}.SEARCH_ROUTES", 2)
 
 
 @pytest.mark.usefixtures("few_bars")
@@ -198,8 +199,8 @@ def test_search_lists_bars_and_heights(locatk) -> None:
     (line,) = (each for each in lines if "30x10x5" in each)
     assert line.split()[1] == "12"
     assert "needs a" in result.stdout
-    told = json.loads(locatk("map", "design", "--landmark", "--search", "20,5", "--json").stdout)
-    assert [bool(each["heights_m"]) for each in told["bars"]] == [True, False]
+    output = json.loads(locatk("map", "design", "--landmark", "--search", "20,5", "--json").stdout)
+    assert [bool(each["heights_m"]) for each in output["bars"]] == [True, False]
 
 
 @pytest.mark.usefixtures("few_bars")

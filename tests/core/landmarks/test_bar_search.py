@@ -14,6 +14,7 @@ from locatk.core.landmarks.design.routes import forecast_floor
 DEFAULT_BAR = (30e-3, 10e-3, 5e-3)
 
 
+@pytest.mark.slow
 def test_heights_are_those_with_the_wanted_accuracy() -> None:
     heights_m = (8e-3, 16e-3)
     (loose,) = search_bars(0.2, 20e-3, bars_m=[DEFAULT_BAR], heights_m=heights_m)
@@ -22,7 +23,8 @@ def test_heights_are_those_with_the_wanted_accuracy() -> None:
     expected = forecast_floor(loose.analysis.geometry, 0.2, routes=6)
     assert loose.forecast == expected
     wanted_m = 0.99 * expected.position_p95_m
-    (strict,) = search_bars(0.2, wanted_m, bars_m=[DEFAULT_BAR], heights_m=heights_m)
+    best_m = [loose.analysis.geometry.sensor_height_m]
+    (strict,) = search_bars(0.2, wanted_m, bars_m=[DEFAULT_BAR], heights_m=best_m)
     assert (strict.heights_m, strict.reason) == ((), "not accurate enough")
 
 
