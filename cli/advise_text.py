@@ -34,7 +34,7 @@ def text(task: Task, advice: Advice) -> str:
     parts += [_design(best), _next(best)]
     parts.append(
         console.wrapped(
-            "Errors are predictions (95 %). Hours are assumptions and prices those of the papers "
+            "Errors are predictions (95 %). A cost with + has parts without a price. Hours are assumptions and prices those of the papers "
             "unless you give yours with --prices. --report writes maps, parts, sources and risks.",
             indent=0,
         )
@@ -72,7 +72,7 @@ def _comparison(task: Task, advice: Advice) -> str:
     )
     rows.append(
         (
-            "power, each robot",
+            "power per robot",
             value_text(task.power_w, "W"),
             *(
                 value_text(max(p.power_w for p in s.power), "W") + _mark(s.check("power"))

@@ -42,11 +42,11 @@ def value_text(value: float | str | None, unit: str) -> str:
 
 
 def total_text(total: BillTotal) -> str:
-    """Return a total as short as a cell of a table: ``">= 400 USD"`` if prices are missing."""
+    """Return a total as short as a cell of a table: ``"400+ USD"`` if prices are missing."""
     if not total.currency:
         return "not priced"
-    sign = ">= " if total.parts_without_price else ""
-    return f"{sign}{total.amount:,.0f} {total.currency}"
+    sign = "+" if total.parts_without_price else ""
+    return f"{total.amount:,.0f}{sign} {total.currency}"
 
 
 def advice_entry(advice: Advice) -> dict[str, Any]:
