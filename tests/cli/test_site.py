@@ -177,13 +177,21 @@ def test_a_narrow_array_is_answered_with_status_3(locatk, tmp_path: Path, aisle:
     assert result.exit_code == 3
     assert "no tag passes wholly below the array" in result.stderr
     assert "take a wider array, of" in result.stderr
-    for line, reason in (("100,0", "no tag is passed straight"), ("9e6,0", "too many tags")):
-        other = tmp_path / "other.csv"
-        other.write_text(f"x_mm,y_mm\n0,0\n{line}\n")
-        args = ("--route", other, "--accuracy", 9, "-o", tmp_path / f"{line[0]}.toml")
-        result = locatk("site", "design", free, *args)
-        assert result.exit_code == 3
-        assert reason in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("end", "reason"), [("100,0", "no tag is passed straight"), ("9e6,0", "too many tags")]
+)
+def test_a_route_too_short_or_too_long_is_answered_with_status_3(
+    locatk, tmp_path: Path, end: str, reason: str
+) -> None:
+    free, route = tmp_path / "any.toml", tmp_path / "route.csv"
+    write_tags(free, Tags())
+    route.write_text(f"x_mm,y_mm\n0,0\n{end}\n")
+    options = ("--route", route, "--accuracy", 9, "-o", tmp_path / "site.toml")
+    result = locatk("site", "design", free, *options)
+    assert result.exit_code == 3
+    assert reason in result.stderr
 
 
 # ---- check

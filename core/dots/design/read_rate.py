@@ -65,42 +65,46 @@ def read_rate(error: DotError, dots: float, pitch_px: float) -> float:
         Number of dots in view that are used.
     pitch_px : float
     """
-    return math.prod(_condition_rates(error, dots, pitch_px).values())
+    return math.prod(_logistic(margin) for margin, _ in _conditions(error, dots, pitch_px))
 
 
 def reading_limit(error: DotError, dots: float, pitch_px: float) -> str:
     """Return the condition that lets fewest frames be read, and its remedy."""
-    rates = _condition_rates(error, dots, pitch_px)
-    return min(rates, key=rates.__getitem__)
+    return min(_conditions(error, dots, pitch_px))[1]
 
 
-def _condition_rates(error: DotError, dots: float, pitch_px: float) -> dict[str, float]:
-    """Return the fraction of frames that are read by each condition alone."""
-    noise = max(error.smoothed_noise, 1e-9)
-    margins = {
-        f"{dots:.0f} usable dots are in view: raise the lens, or choose a shorter focal length": (
-            dots - MIN_DOTS
-        )
-        / DOTS_SPREAD,
-        f"the error of a dot is {error.total_px / pitch_px:.2f} pitches: light the paper more, or "
-        "use a better printer": (MAX_SIGMA_PITCHES - error.total_px / pitch_px)
-        / SIGMA_SPREAD_PITCHES,
-        "neighbouring dots run into each other: blur less, by the f-number, focus and exposure": (
-            error.used_fraction - MIN_USED_FRACTION
-        )
-        / USED_FRACTION_SPREAD,
-        f"a dot is {error.peak / noise:.1f} times as deep as the noise: light the paper more": (
-            error.peak / noise - MIN_SIGNAL_TO_NOISE
-        )
-        / SIGNAL_TO_NOISE_SPREAD,
-        f"a dot is {PAPER_LEVEL * error.peak:.1f} grey values deep: blur less, or print darker "
-        "dots": (PAPER_LEVEL * error.peak - MIN_PEAK_LEVELS) / PEAK_SPREAD_LEVELS,
-        f"a pitch has {pitch_px:.1f} px: move the lens nearer, or choose a longer focal length": (
-            pitch_px - HALF_READ_PX_PER_PITCH
-        )
-        / PX_PER_PITCH_SPREAD,
-    }
-    return {text: _logistic(margin) for text, margin in margins.items()}
+def _conditions(error: DotError, dots: float, pitch_px: float) -> tuple[tuple[float, str], ...]:
+    """Return the margin of each condition, in widths of its transition, and its text."""
+    sigma_pitches = error.total_px / pitch_px
+    signal_to_noise = error.peak / max(error.smoothed_noise, 1e-9)
+    peak_levels = PAPER_LEVEL * error.peak
+    return (
+        (
+            (dots - MIN_DOTS) / DOTS_SPREAD,
+            f"{dots:.0f} usable dots are in view: raise the lens, or choose a shorter focal length",
+        ),
+        (
+            (MAX_SIGMA_PITCHES - sigma_pitches) / SIGMA_SPREAD_PITCHES,
+            f"the error of a dot is {sigma_pitches:.2f} pitches: light the paper more, or use a "
+            "better printer",
+        ),
+        (
+            (error.used_fraction - MIN_USED_FRACTION) / USED_FRACTION_SPREAD,
+            "neighbouring dots run into each other: blur less, by the f-number, focus and exposure",
+        ),
+        (
+            (signal_to_noise - MIN_SIGNAL_TO_NOISE) / SIGNAL_TO_NOISE_SPREAD,
+            f"a dot is {signal_to_noise:.1f} times as deep as the noise: light the paper more",
+        ),
+        (
+            (peak_levels - MIN_PEAK_LEVELS) / PEAK_SPREAD_LEVELS,
+            f"a dot is {peak_levels:.1f} grey values deep: blur less, or print darker dots",
+        ),
+        (
+            (pitch_px - HALF_READ_PX_PER_PITCH) / PX_PER_PITCH_SPREAD,
+            f"a pitch has {pitch_px:.1f} px: move the lens nearer, or choose a longer focal length",
+        ),
+    )
 
 
 def searched_levels(size_px: tuple[int, int]) -> tuple[int, ...]:
