@@ -22,7 +22,7 @@ from locatk.core.dots.simulation.paths import CameraPath
 from locatk.core.dots.simulation.session import SimulationOptions, simulate_path
 from locatk.core.dots.solver import SolveOptions, solve
 from locatk.core.errors import InputError
-from locatk.core.geometry import heading_from_quaternion
+from locatk.core.geometry import heading_from_quaternion, wrap_angle
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ def measure_camera(setup: CameraSetup, frames: int = 20, seed: int = 0) -> Camer
         frames=frames,
         read=len(index),
         position_error_m=error,
-        heading_error_rad=np.angle(np.exp(1j * heading_error)),
+        heading_error_rad=wrap_angle(heading_error),
         stated_sigma_m=math.sqrt(np.mean(variance)) if len(variance) else math.nan,
     )
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from locatk.core.dots.detection.blobs import SMOOTHING_RADIUS_PX
 from locatk.core.dots.detection.lattice import PARAMETER_SIGMAS
 from locatk.core.dots.identification.soft_bits import MAX_WINDOW_DOTS
+from locatk.core.geometry import rotation_matrix_2d
 
 Array = NDArray[np.float64]
 
@@ -90,9 +91,8 @@ def _accuracy_of_direction(
     count = len(u)
     if count < 5:
         return math.inf, math.inf, float(count)
-    c, s = math.cos(direction_rad), math.sin(direction_rad)
     # Point in half diagonals, and the derivatives of u and v, in pitches, by the parameters.
-    p = u @ np.array([[c, -s], [s, c]]) / scale
+    p = u @ rotation_matrix_2d(direction_rad) / scale
     affine = np.column_stack([p, np.ones(count)])
     zeros = np.zeros_like(affine)
     shared = [-u[:, :, None] * p[:, None, :]]
@@ -114,7 +114,7 @@ def _accuracy_of_direction(
     position = math.sqrt((covariance[2, 2] + covariance[5, 5]) / 2)
     # The direction of the image's right: derivative (u, v) by p_x, of length `scale`.
     across = np.zeros(len(normal))
-    across[0], across[3] = -s / scale, c / scale
+    across[0], across[3] = -math.sin(direction_rad) / scale, math.cos(direction_rad) / scale
     heading = math.sqrt(across @ covariance @ across)
     return position, heading, float(count)
 
@@ -129,7 +129,6 @@ def dots_in_frame(size_px: tuple[int, int], pitch_px: float, direction_rad: floa
     half_count = min(math.ceil(float(np.linalg.norm(half)) / pitch_px), MAX_WINDOW_DOTS // 2)
     line = np.arange(-half_count, half_count) + 0.5
     nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    c, s = math.cos(direction_rad), math.sin(direction_rad)
-    in_frame = pitch_px * nodes @ np.array([[c, -s], [s, c]])
+    in_frame = pitch_px * nodes @ rotation_matrix_2d(direction_rad)
     result: Array = nodes[(np.abs(in_frame) < half).all(axis=1)]
     return result

@@ -24,6 +24,7 @@ from scipy.spatial import cKDTree
 
 from locatk.core.error_quantiles import error_quantile
 from locatk.core.errors import InputError
+from locatk.core.geometry import rotation_matrix_2d
 from locatk.core.landmarks.design.final_poses import MapEvidence
 from locatk.core.landmarks.design.visit_accuracy import (
     STEP_M,
@@ -390,8 +391,8 @@ def _in_landmark_frame(poses: Array, landmark: Array) -> Array:
 
 def _rotated(covariance: Array, angle_rad: float) -> Array:
     """Return the covariance (3, 3) of a pose in axes rotated by minus an angle."""
-    c, s = math.cos(angle_rad), math.sin(angle_rad)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    rotation = np.eye(3)
+    rotation[:2, :2] = rotation_matrix_2d(angle_rad)
     return np.asarray(rotation @ covariance @ rotation.T)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from locatk.core.error_quantiles import error_quantile
 from locatk.core.errors import InputError
+from locatk.core.geometry import rotation_matrix_2d, wrap_angle
 from locatk.core.polaris import codec
 from locatk.core.polaris.design.accuracy_bound import magnet_covariance, rotate
 from locatk.core.polaris.design.planning import (
@@ -234,7 +235,7 @@ def _laying_covariance(
     # Standard deviations of a site are along its axes.
     site_rad = heading_rad - tags.site[tag_id].heading_rad
     rotation = np.eye(3)
-    rotation[:2, :2] = rotate(np.eye(2), site_rad).T
+    rotation[:2, :2] = rotation_matrix_2d(site_rad)
     return np.asarray(rotation @ np.diag(np.square(tags.site_sigma[tag_id])) @ rotation.T)
 
 
@@ -341,8 +342,8 @@ def find_tag_passes(
 
 def _sharp_turns(route: Route) -> NDArray[np.bool_]:
     """Return whether a tag at each waypoint (n,) is not passed: at turns, start and end."""
-    turn = np.remainder(np.diff(route.heading_rad) + np.pi, math.tau) - np.pi
-    return np.concatenate([[True], np.abs(turn) > MAX_TURN_RAD, [True]])
+    turn_rad = wrap_angle(np.diff(route.heading_rad))
+    return np.concatenate([[True], np.abs(turn_rad) > MAX_TURN_RAD, [True]])
 
 
 # ---- forecast

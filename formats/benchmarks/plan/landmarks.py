@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_from_quaternion
+from locatk.core.geometry import heading_from_quaternion, wrap_angle
 from locatk.core.landmarks.design.generation import DesignOptions, design_map
 from locatk.core.landmarks.design.routes import RouteCheck, check_routes, find_visits
 from locatk.core.landmarks.design.visit_accuracy import VisitErrors
@@ -326,7 +326,7 @@ class _TruePath:
     def errors(self, time_ns: NDArray[np.int64], pose: Array) -> tuple[Array, Array]:
         """Return the distances (n,) along the route and the squared errors (n, 2) of poses."""
         true = np.column_stack([np.interp(time_ns, self.time_ns, each) for each in self.pose.T])
-        heading_error = np.remainder(pose[:, 2] - true[:, 2] + math.pi, 2 * math.pi) - math.pi
+        heading_error = wrap_angle(pose[:, 2] - true[:, 2])
         position = ((pose[:, :2] - true[:, :2]) ** 2).sum(axis=1)
         distance_m = np.interp(time_ns, self.time_ns, self.distance_m)
         return distance_m, np.column_stack([position, heading_error**2])

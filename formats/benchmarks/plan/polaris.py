@@ -21,7 +21,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.geometry import heading_from_quaternion, quaternion_from_heading, umeyama
+from locatk.core.geometry import (
+    heading_from_quaternion,
+    quaternion_from_heading,
+    umeyama,
+    wrap_angle,
+)
 from locatk.core.polaris.array import Samples
 from locatk.core.polaris.codec import layout_of
 from locatk.core.polaris.design.accuracy_bound import magnet_covariance, pose_covariance
@@ -289,7 +294,7 @@ def errors_along(task: PlanningTask, session: SimulatedSession, odometry: Trajec
 
 def _errors(estimate: Trajectory, truth: Trajectory, time_ns: NDArray[np.int64]) -> Array:
     difference = _planar(estimate, time_ns) - _planar(truth, time_ns)
-    difference[:, 2] = np.remainder(difference[:, 2] + math.pi, math.tau) - math.pi
+    difference[:, 2] = wrap_angle(difference[:, 2])
     return difference
 
 
@@ -441,7 +446,7 @@ def measure_recordings(samples: Sequence[Samples], tag_id: int) -> RecordingErro
         [umeyama(run.position_m, cells_m, with_scale=False).apply(run.position_m) for run in runs]
     )
     angles = np.array([run.angle_rad - run.heading_rad for run in runs])
-    deviation = np.angle(np.exp(1j * (angles - np.angle(np.exp(1j * angles).mean(axis=0)))))
+    deviation = wrap_angle(angles - np.angle(np.exp(1j * angles).mean(axis=0)))
     unbiased = len(runs) / (len(runs) - 1)
     return RecordingErrors(
         (_mean_length(placed), float(np.linalg.norm(aligned - cells_m, axis=2).mean())),
