@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
 from scipy.special import erf
 from scipy.stats import chi
 
@@ -15,8 +16,9 @@ DIRECTIONS = 256
 """Number of directions over which a distribution is averaged. The quantiles of covariances with
 axes in any ratio change by less than 0.5 % with more of them."""
 
-BISECTIONS = 40
-"""Halvings of the interval that contains a quantile: it is then exact to 12 digits."""
+MIN_SIGMA = 1e-150
+"""Standard deviation below which errors count as none: their squares are near the smallest
+number."""
 
 
 def error_quantile(
@@ -31,7 +33,7 @@ def error_quantile(
     probability : float
         Between 0 and 1.
     weight : (n,) array_like, optional
-        Relative frequency of each covariance; equal by default.
+        Relative frequency of each covariance; equal by default, or if all are 0.
 
     Returns
     -------
@@ -54,29 +56,38 @@ def error_quantile(
     if count == 0:
         return math.nan
     weights = np.ones(count) if weight is None else np.asarray(weight, float)
-    weights = weights / weights.sum()
+    weights = weights / weights.sum() if weights.any() else np.full(count, 1 / count)
     is_known = np.isfinite(covariances).all(axis=(1, 2))
     if weights[is_known].sum() < probability:
         return math.inf
     directions = _unit_directions(size)
     variance = np.einsum("ki,nij,kj->nk", directions, covariances[is_known], directions)
-    sigma = np.sqrt(np.maximum(variance, 1e-300))
+    sigma = np.sqrt(np.maximum(variance, MIN_SIGMA**2))
     share = np.repeat(weights[is_known, None] / len(directions), len(directions), axis=1)
-    low, high = 0.0, float(chi.ppf(probability, size) * sigma.max()) + 1e-300
-    # Unlikely lengths are reached only if some covariances are unknown.
-    while _probability_within(high, sigma, share, size) < probability:
+    scale = float(sigma.max())
+    if scale <= MIN_SIGMA:
+        return 0.0
+
+    def excess(ratio: float) -> float:
+        within = share * _chi_probability(ratio * scale / sigma, size)
+        return float(within.sum()) - probability
+
+    high = float(chi.ppf(probability, size))
+    # Longer errors are so likely only if some covariances are unknown.
+    while excess(high) < 0:
         high *= 2
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        if _probability_within(middle, sigma, share, size) < probability:
-            low = middle
-        else:
-            high = middle
-    return high
+    return scale * float(brentq(excess, 0.0, high, xtol=1e-12, rtol=1e-12))
 
 
-def _probability_within(length: float, sigma: Array, share: Array, size: int) -> float:
-    return float((share * _chi_probability(length / sigma, size)).sum())
+def pose_error_quantiles(
+    covariance: Array, probability: float = 0.95, weight: ArrayLike | None = None
+) -> tuple[float, float]:
+    """Return the quantiles of position and heading errors of planar poses.
+
+    ``covariance`` (n, 3, 3) is that of x, y [m] and heading [rad]; see :func:`error_quantile`.
+    """
+    position_m = error_quantile(covariance[:, :2, :2], probability, weight)
+    return position_m, error_quantile(covariance[:, 2:, 2:], probability, weight)
 
 
 def _chi_probability(ratio: Array, size: int) -> Array:

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.error_quantiles import error_quantile
+from locatk.core.error_quantiles import pose_error_quantiles
 from locatk.core.errors import InputError
 from locatk.core.streaming.planar_filter import OdometryNoise
 
@@ -125,6 +125,8 @@ class RouteAccuracy:
         pose is not yet known.
     since_fix_m : (m,) ndarray
         Distance since the last fix; ``inf`` before the first.
+    step_m : (m,) ndarray
+        Distance from the point before: the weight of a point in a mean over the length.
     """
 
     distance_m: Array
@@ -132,7 +134,7 @@ class RouteAccuracy:
     heading_rad: Array
     covariance: Array
     since_fix_m: Array
-    _weight: Array = field(repr=False)
+    step_m: Array
 
     @property
     def position_sigma_m(self) -> Array:
@@ -145,28 +147,19 @@ class RouteAccuracy:
         return np.asarray(np.sqrt(self.covariance[:, 2, 2]))
 
     @property
-    def known_fraction(self) -> float:
-        """Fraction of the length of the route on which the pose is known."""
-        is_known = np.isfinite(self.covariance).all(axis=(1, 2))
-        return float(self._weight[is_known].sum() / self._weight.sum())
-
-    @property
     def longest_without_fix_m(self) -> float:
         """Longest distance without a fix, the start and the end of the route included."""
         is_known = np.isfinite(self.since_fix_m)
         before = self.distance_m[-1] if not is_known.any() else self.distance_m[is_known][0]
         return float(max(before, self.since_fix_m[is_known].max(initial=0.0)))
 
-    def position_quantile_m(self, probability: float = 0.95) -> float:
-        """Return the position error that is not exceeded with a probability, over the length.
+    def quantiles(self, probability: float = 0.95) -> tuple[float, float]:
+        """Return the errors of position [m] and heading [rad] that are not exceeded.
 
-        ``inf`` if the pose is unknown on a larger part of the route than that.
+        Over the length of the route, with a probability. They are ``inf`` if the pose is unknown on
+        a larger part of it than that.
         """
-        return error_quantile(self.covariance[:, :2, :2], probability, self._weight)
-
-    def heading_quantile_rad(self, probability: float = 0.95) -> float:
-        """Return the heading error that is not exceeded with a probability, over the length."""
-        return error_quantile(self.covariance[:, 2:, 2:], probability, self._weight)
+        return pose_error_quantiles(self.covariance, probability, self.step_m)
 
 
 def predict_accuracy(
@@ -226,10 +219,14 @@ def predict_accuracy(
     pose[~np.isfinite(pose).all(axis=(1, 2))] = np.nan
     is_fix = np.array([step.fix is not None for step in steps])
     last_fix = np.maximum.accumulate(np.where(is_fix, distance_m, -np.inf))
-    weight = np.diff(distance_m, prepend=0.0)
-    if not weight.any():
-        weight = np.ones(len(weight))
-    return RouteAccuracy(distance_m, position_m, heading_rad, pose, distance_m - last_fix, weight)
+    return RouteAccuracy(
+        distance_m,
+        position_m,
+        heading_rad,
+        pose,
+        distance_m - last_fix,
+        np.diff(distance_m, prepend=0.0),
+    )
 
 
 @dataclass(frozen=True, eq=False)

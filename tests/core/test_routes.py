@@ -112,11 +112,12 @@ def test_pose_is_unknown_before_the_first_fix_unless_smoothed() -> None:
     live, offline = (
         predict_accuracy(L_ROUTE, fixes, is_smoothed=smoothed) for smoothed in (False, True)
     )
-    assert live.known_fraction == pytest.approx(0.6)
-    assert offline.known_fraction == 1.0
+    is_known = np.isfinite(live.heading_sigma_rad)
+    assert live.step_m[is_known].sum() == pytest.approx(3.0)
+    assert np.isfinite(offline.heading_sigma_rad).all()
     assert live.longest_without_fix_m == pytest.approx(3.0)
-    assert live.position_quantile_m(0.95) == math.inf
-    assert live.position_quantile_m(0.3) < offline.position_quantile_m(0.95) < 1.0
+    assert live.quantiles(0.95) == (math.inf, math.inf)
+    assert live.quantiles(0.3)[0] < offline.quantiles(0.95)[0] < 1.0
 
 
 def test_fix_of_the_position_only_updates_a_known_pose() -> None:
@@ -128,7 +129,7 @@ def test_fix_of_the_position_only_updates_a_known_pose() -> None:
     assert after[1, 1] < 1.1e-6 < before[1, 1]
     assert after[2, 2] < before[2, 2]
     alone = predict_accuracy(L_ROUTE, [RouteFix(0.0, position)])
-    assert alone.known_fraction == 0.0
+    assert np.isnan(alone.heading_sigma_rad).all()
 
 
 def test_position_and_heading_along_a_route() -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from locatk.core.error_quantiles import error_quantile
+from locatk.core.error_quantiles import pose_error_quantiles
 from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_matrix_2d
 from locatk.core.landmarks.design.final_poses import MapEvidence
@@ -509,16 +509,14 @@ def _check_route(
     used = [fix for fix in fixes if is_smoothed or (localized_m or 0.0) <= fix.distance_m]
     accuracy = predict_accuracy(route, used, noise, speed_mps, is_smoothed=is_smoothed)
     is_covered = np.isfinite(accuracy.covariance).all(axis=(1, 2)) & (localized_m is not None)
-    weight = np.where(is_covered, np.diff(accuracy.distance_m, prepend=0.0), 0.0)
-    covariance = accuracy.covariance[is_covered]
+    weight = np.where(is_covered, accuracy.step_m, 0.0)
     worst_m = worst_rad = p95_m = p95_rad = math.nan
     if is_covered.any():
-        # At the end of a route that is localized there, there is one point without a length.
-        part = weight[is_covered] if weight.any() else np.ones(int(is_covered.sum()))
         worst_m = float(accuracy.position_sigma_m[is_covered].max())
         worst_rad = float(accuracy.heading_sigma_rad[is_covered].max())
-        p95_m = error_quantile(covariance[:, :2, :2], 0.95, part)
-        p95_rad = error_quantile(covariance[:, 2:, 2:], 0.95, part)
+        p95_m, p95_rad = pose_error_quantiles(
+            accuracy.covariance[is_covered], 0.95, weight[is_covered]
+        )
     return RouteCheck(
         route=route,
         visits=visits,
@@ -812,7 +810,7 @@ def forecast_floor(
         length_m += route.length_m
         is_known = np.isfinite(accuracy.since_fix_m)
         covariances.append(accuracy.covariance[is_known])
-        weights.append(np.diff(accuracy.distance_m, prepend=0.0)[is_known])
+        weights.append(accuracy.step_m[is_known])
         at_fix.append(accuracy.since_fix_m[is_known] == 0)
     covariance, weight = np.concatenate(covariances), np.concatenate(weights)
     is_fix = np.concatenate(at_fix)
@@ -823,12 +821,9 @@ def forecast_floor(
             read_fraction=0.0,
             landmarks_per_m=0.0,
         )
-    one = np.ones(int(is_fix.sum()))
     return FloorForecast(
-        position_at_p95_m=error_quantile(covariance[is_fix, :2, :2], 0.95, one),
-        heading_at_p95_rad=error_quantile(covariance[is_fix, 2:, 2:], 0.95, one),
-        position_p95_m=error_quantile(covariance[:, :2, :2], 0.95, weight),
-        heading_p95_rad=error_quantile(covariance[:, 2:, 2:], 0.95, weight),
+        *pose_error_quantiles(covariance[is_fix]),
+        *pose_error_quantiles(covariance, weight=weight),
         without_fix_p95_m=float(np.quantile(gaps, 0.95)),
         read_fraction=read / passes,
         landmarks_per_m=float(is_fix.sum() / length_m),

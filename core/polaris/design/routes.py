@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from locatk.core.error_quantiles import error_quantile
+from locatk.core.error_quantiles import error_quantile, pose_error_quantiles
 from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_matrix_2d, wrap_angle
 from locatk.core.polaris import codec
@@ -31,6 +31,7 @@ from locatk.core.polaris.design.planning import (
 from locatk.core.polaris.design.site import (
     MAX_SITE_TAGS,
     SitePoint,
+    TooManyTagsError,
     check_tag_count,
     pass_separation,
 )
@@ -464,8 +465,7 @@ def forecast_routes(
         forecasts.append(RouteForecast(route, passes, accuracy, missed))
         warnings += _route_warnings(tags, use, forecasts[-1])
     covariance = np.concatenate([each.accuracy.covariance for each in forecasts])
-    distances = [each.accuracy.distance_m for each in forecasts]
-    weight = np.concatenate([np.diff(distance, prepend=0.0) for distance in distances])
+    weight = np.concatenate([each.accuracy.step_m for each in forecasts])
     is_known = np.isfinite(covariance).all(axis=(1, 2))
     worst_m, worst = np.full(2, math.nan), np.full((1, 3, 3), math.inf)
     if is_known.any():
@@ -526,12 +526,9 @@ class _PassCovariances:
 
 def _quantiles(covariance: Array, weight: Array) -> tuple[float, float]:
     """Return the quantiles of the errors of position and heading; ``inf`` without covariances."""
-    if not weight.sum() > 0:
-        weight = np.ones(len(covariance))
     if not len(covariance):
         return math.inf, math.inf
-    position_m = error_quantile(covariance[:, :2, :2], PROBABILITY, weight)
-    return position_m, error_quantile(covariance[:, 2:, 2:], PROBABILITY, weight)
+    return pose_error_quantiles(covariance, PROBABILITY, weight)
 
 
 def _route_warnings(tags: Tags, use: ReadingConditions, forecast: RouteForecast) -> list[str]:
@@ -661,8 +658,7 @@ def spacing_for_accuracy(
             step_m=spacing_m / STEPS_PER_SPACING,
         )
         errors = (
-            accuracy.position_quantile_m(),
-            accuracy.heading_quantile_rad(),
+            *accuracy.quantiles(),
             max(lateral_p95_m(accuracy, distance_m) for distance_m in tags_m[1:]),
         )
         exceeded = {
@@ -814,12 +810,36 @@ def plan_route(
 
     It begins with the spacing for a straight route, which is reduced until the forecast for this
     route (turns, tags that are not passed) has the accuracy, too. If that is impossible, the
-    points are those of the smallest spacing.
+    points are those of the smallest spacing; none if these are more than a site may have.
 
     The parameters and errors are those of :func:`spacing_for_accuracy` and
     :func:`points_along_route`.
     """
     plan = spacing_for_accuracy(tags, use, noise, position_m, heading_rad, laying=laying)
+    try:
+        return _points_for_plan(
+            plan, tags, waypoints, use, noise, position_m, heading_rad, laying=laying
+        )
+    except TooManyTagsError:
+        remedy = f"divide the route into sites of at most {MAX_SITE_TAGS} tags"
+        return [], replace(plan, is_feasible=False, limited_by="count", remedies=(remedy,))
+
+
+def _points_for_plan(
+    plan: SpacingPlan,
+    tags: Tags,
+    waypoints: Sequence[SitePoint],
+    use: ReadingConditions | None,
+    noise: OdometryNoise | None,
+    position_m: float,
+    heading_rad: float,
+    *,
+    laying: tuple[float, float] | None,
+) -> tuple[list[SitePoint], SpacingPlan]:
+    """Adapt the plan for a straight route to a given one; see :func:`plan_route`.
+
+    Raises :class:`.site.TooManyTagsError` if a trial needs too many tags.
+    """
     smallest_m = pass_separation(tags, use)
     if math.isnan(smallest_m):
         return [], plan
@@ -840,9 +860,7 @@ def plan_route(
 
     low_m, high_m = smallest_m, plan.spacing_m
     route = Route(np.array([[point.x_m, point.y_m] for point in waypoints]))
-    if route.length_m > MAX_SITE_TAGS * plan.spacing_m:
-        remedy = f"divide the route into sites of at most {MAX_SITE_TAGS} tags"
-        return [], replace(plan, is_feasible=False, limited_by="count", remedies=(remedy,))
+    check_tag_count(math.floor(route.length_m / plan.spacing_m))
     points, result = forecast(high_m)
     if result.tags == 0 and plan.limited_by != "play":
         straight_m = (tags.order - 1) * tags.spacing_m + 2 * RUN_UP_CLEARANCES * tags.clearance_m

@@ -349,7 +349,7 @@ def measure_task(task: PlanningTask, seed: int, drives: int = DRIVES) -> TaskErr
         ]
     )
     first_m, last_m = route.passes[0].distance_m, route.passes[-1].distance_m
-    weight = np.diff(accuracy.distance_m, prepend=0.0)
+    weight = accuracy.step_m
     weight[(accuracy.distance_m <= first_m) | (accuracy.distance_m > last_m)] = 0.0
     predicted2 = [
         np.trace(fixes[:, :2, :2], axis1=1, axis2=2).mean(),
