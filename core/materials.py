@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from locatk.core.errors import InputError
@@ -133,6 +133,16 @@ class PriceList:
 def priced_part(item: BillItem) -> str:
     """Return the part whose price an item has: that of ``"bar magnet, spare"`` is a bar magnet."""
     return item.part.split(",")[0]
+
+
+def split_bill(
+    items: Sequence[BillItem], robot_parts: Collection[str]
+) -> tuple[tuple[BillItem, ...], tuple[BillItem, ...]]:
+    """Return the items of the infrastructure, and those of robots, whose parts are given."""
+    return (
+        tuple(item for item in items if item.part not in robot_parts),
+        tuple(item for item in items if item.part in robot_parts),
+    )
 
 
 def with_prices(

@@ -105,7 +105,7 @@ class AccuracyMap:
 
 @dataclass(frozen=True)
 class SystemAdvice:
-    """What one system would do for a task.
+    """Design of one system for a task.
 
     Attributes
     ----------
@@ -166,10 +166,17 @@ class SystemAdvice:
 
 @dataclass(frozen=True)
 class Combination:
-    """Two systems that together do what neither does alone."""
+    """Two systems that together do what neither does alone.
 
-    everywhere: str
-    at_places: str
+    Attributes
+    ----------
+    area_system, spot_system : str
+        The one that covers the area, and the one at the places that demand the accuracy.
+    reason : str
+    """
+
+    area_system: str
+    spot_system: str
     reason: str
 
 

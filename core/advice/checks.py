@@ -10,18 +10,15 @@ from numpy.typing import NDArray
 
 from locatk.core.advice.answer import AccuracyMap, Certainty, Check
 from locatk.core.advice.task import Task
+from locatk.core.polaris.design.environment import MOTORS, REINFORCED
 from locatk.core.polygons import is_inside
 
 Array = NDArray[np.float64]
 
-IRON_FIELDS_T = {"none": 0.0, "reinforced": 3e-6, "plates": 30e-6}
-"""Standard deviation [T] of the field of iron in the floor over a few centimetres. Reinforced: see
-:data:`locatk.core.polaris.design.environment.REINFORCED`. Plates: magnetised steel a few
-centimetres below the sensors differs by tens of microtesla from place to place; an assumption."""
-
-MOTOR_FIELD_T = 2.6e-6
-"""Standard deviation [T] of the field of motors during a pass, see
-:data:`locatk.core.polaris.design.environment.MOTORS`."""
+IRON_FIELDS_T = {"none": 0.0, "reinforced": REINFORCED.field_t, "plates": 30e-6}
+"""Standard deviation [T] of the field of iron in the floor over a few centimetres. Plates:
+magnetised steel a few centimetres below the sensors differs by tens of microtesla from place to
+place; an assumption."""
 
 MAP_POINTS = 42
 """Points of a map along each side of the area, both ends included."""
@@ -105,4 +102,4 @@ def uniform_map(
 
 def disturbance_t(task: Task) -> float:
     """Return the standard deviation [T] of fields that vary during a pass."""
-    return math.hypot(IRON_FIELDS_T[task.iron], MOTOR_FIELD_T * task.has_motors)
+    return math.hypot(IRON_FIELDS_T[task.iron], MOTORS.field_t * task.has_motors)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from locatk.core.advice import dots, landmarks, lighthouse, polaris
 from locatk.core.advice.answer import Advice, Check, Combination, SystemAdvice
+from locatk.core.advice.checks import limit_check
 from locatk.core.advice.task import Task
 from locatk.core.materials import PriceList, with_prices
 
@@ -21,6 +22,9 @@ ADVISERS: dict[str, Callable[[Task, Mapping[str, float]], SystemAdvice]] = {
 
 ACCURACY_CHECKS = ("position", "heading")
 """Checks that a second system can meet at the places that need it."""
+
+UNAVOIDABLE = ("indoors", "light", "floor", "robots in space", "iron", "speed", "rate")
+"""Checks that fail at single places as they do in the whole area."""
 
 GUIDANCE_RATIO = 10.0
 """Ratio of the position error of a system to the wanted one up to which it can guide robots to the
@@ -66,46 +70,35 @@ def _with_costs(advice: SystemAdvice, task: Task, prices: PriceList | None) -> S
         infrastructure=with_prices(advice.infrastructure, parts),
         robot_parts=with_prices(advice.robot_parts, parts),
     )
-    checks = [*advice.checks, _budget_check(advice, task)]
-    checks.append(
-        Check(
+    checks = [
+        *advice.checks,
+        _budget_check(advice, task),
+        limit_check(
             "installation",
             "h",
             advice.hours,
             task.hours,
-            None if task.hours is None else advice.hours <= task.hours,
             "assumed",
             "counts of the design; minutes of each piece of work are assumptions",
             "More hours or people, or a smaller area",
-        )
-    )
+        ),
+    ]
     if advice.power:
         highest = max(advice.power, key=lambda power: power.power_w)
+        remedy = f"The robot must supply {1e3 * highest.power_w:.3g} mW for its localization"
         checks.append(
-            Check(
-                "power",
-                "W",
-                highest.power_w,
-                task.power_w,
-                None if task.power_w is None else highest.power_w <= task.power_w,
-                "published",
-                highest.source,
-                f"The robot must supply {1e3 * highest.power_w:.3g} mW for its localization",
+            limit_check(
+                "power", "W", highest.power_w, task.power_w, "published", highest.source, remedy
             )
         )
-    if advice.power and task.battery_wh is not None:
-        life_h = task.battery_wh / max(power.power_w for power in advice.power)
-        checks.append(
-            Check(
-                "battery life, localization alone",
-                "h",
-                life_h,
-                None,
-                None,
-                "published",
-                "energy of the battery over the highest power above",
+        if task.battery_wh is not None:
+            life_h = task.battery_wh / highest.power_w
+            source = "energy of the battery over this power"
+            checks.append(
+                limit_check(
+                    "battery life, localization alone", "h", life_h, None, "published", source
+                )
             )
-        )
     return replace(advice, checks=tuple(checks))
 
 
@@ -160,7 +153,3 @@ def combine(systems: Sequence[SystemAdvice], task: Task) -> tuple[Combination, .
                 )
             )
     return tuple(pairs)
-
-
-UNAVOIDABLE = ("indoors", "light", "floor", "robots in space", "iron", "speed", "rate")
-"""Checks that fail at single places as they do in the whole area."""

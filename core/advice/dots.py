@@ -15,16 +15,13 @@ from locatk.core.advice.work import work_steps
 from locatk.core.dots.design.camera import PRINT_SIGMA_M, CameraReport, compare_sensors
 from locatk.core.dots.design.camera_sensors import SENSORS
 from locatk.core.error_quantiles import error_quantile
+from locatk.core.hand_placement import EDGE_SIGMA_M, LAYING_SIGMA_M
 from locatk.core.materials import BillItem
 from locatk.core.paper_sizes import PAPER_SIZES_MM
-from locatk.core.polaris.design.routes import LAYING_SIGMA_M
 from locatk.core.polygons import is_inside
 
 PAPER_NAME = "A0"
 """Paper of large floors."""
-
-EDGE_SIGMA_M = 1e-3
-"""Standard deviation of each end of a sheet's edge, by which its heading is set [m]."""
 
 MIN_READ_RATE = 0.95
 """Fraction of the frames that must be decoded."""

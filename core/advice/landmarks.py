@@ -216,18 +216,13 @@ def _choose_pitch(task: Task, geometry: Geometry) -> tuple[float, FloorForecast]
             routes=FORECAST_ROUTES,
         )
 
-    def is_enough(result: FloorForecast) -> bool:
-        return result.position_p95_m <= task.position_m and (
-            task.heading_rad is None or result.heading_p95_rad <= task.heading_rad
-        )
-
     best = forecast(low)
-    if not is_enough(best):
+    if not best.is_within(task.position_m, task.heading_rad):
         return low * PITCH_STEP_M, best
     while low < high:
         middle = (low + high + 1) // 2
         result = forecast(middle)
-        if is_enough(result):
+        if result.is_within(task.position_m, task.heading_rad):
             low, best = middle, result
         else:
             high = middle - 1

@@ -23,6 +23,7 @@ from locatk.core.lighthouse.design import (
 from locatk.core.lighthouse.design.report import deck_heading_sigma
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.room import RobotSize, Room
+from locatk.core.materials import split_bill
 
 Array = NDArray[np.float64]
 
@@ -69,26 +70,16 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
         )
     stations = len(design.scene.stations)
     report = design.report
+    items = bill_of_materials(design.mounts, robots=task.robots, photodiodes=photodiodes)
+    infrastructure, robot_parts = split_bill(items, ROBOT_PARTS)
     return SystemAdvice(
         "lighthouse",
         f"{stations} station{'s' * (stations > 1)} ("
         + ", ".join(f"{count} {kind}" for kind, count in sorted(design.mounts.items()))
         + f"), {photodiodes} photodiode{'s' * (photodiodes > 1)} on each robot",
         (*_accuracy_checks(task, room, design, request, photodiodes), *_condition_checks(task)),
-        infrastructure=tuple(
-            item
-            for item in bill_of_materials(
-                design.mounts, robots=task.robots, photodiodes=photodiodes
-            )
-            if item.part not in ROBOT_PARTS
-        ),
-        robot_parts=tuple(
-            item
-            for item in bill_of_materials(
-                design.mounts, robots=task.robots, photodiodes=photodiodes
-            )
-            if item.part in ROBOT_PARTS
-        ),
+        infrastructure=infrastructure,
+        robot_parts=robot_parts,
         work=work_steps(
             {
                 "mount and aim a station": stations,

@@ -19,6 +19,7 @@ from locatk.core.advice.checks import (
 )
 from locatk.core.advice.task import Task
 from locatk.core.advice.work import work_steps
+from locatk.core.materials import split_bill
 from locatk.core.polaris import codec
 from locatk.core.polaris.design.environment import MOTORS, QUIET, REINFORCED, Environment
 from locatk.core.polaris.design.planning import ReadingConditions, evaluate_design
@@ -145,7 +146,7 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
         ),
         *magnetic_checks(task, "tags"),
     ]
-    items = report.materials
+    infrastructure, array = split_bill(report.materials, ROBOT_PARTS)
     return SystemAdvice(
         "polaris",
         f"{count} tags of {tags.magnets} magnets, {spacing} along "
@@ -155,12 +156,8 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
             else f"lanes {LANE_SPACING_M:g} m apart"
         ),
         tuple(checks),
-        infrastructure=tuple(item for item in items if item.part not in ROBOT_PARTS),
-        robot_parts=tuple(
-            replace(item, count=item.count * task.robots)
-            for item in items
-            if item.part in ROBOT_PARTS
-        ),
+        infrastructure=infrastructure,
+        robot_parts=tuple(replace(item, count=item.count * task.robots) for item in array),
         work=work_steps(
             {
                 "make a tag": count,

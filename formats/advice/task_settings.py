@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.advice.task import FLOOR_WORK, INFRARED, IRON, Task
-from locatk.core.errors import error_context
 from locatk.core.polygons import rectangle
 from locatk.core.routes import Route
 from locatk.formats.artifacts.kinds import (
@@ -28,7 +27,7 @@ from locatk.formats.artifacts.kinds import (
     Text,
     Unit,
 )
-from locatk.formats.importers.floors.site_csv import read_site_points
+from locatk.formats.importers.floors.site_csv import read_route
 from locatk.formats.settings.config import SettingsConfig, with_values
 from locatk.formats.settings.setting import Setting
 
@@ -248,7 +247,7 @@ def task_of(settings: Mapping[str, Any]) -> Task:
         A route cannot be read.
     """
     values = CONFIG.in_si(settings)
-    routes = tuple(_read_route(Path(path)) for path in values.pop("area.routes", None) or ())
+    routes = tuple(read_route(Path(path)) for path in values.pop("area.routes", None) or ())
     if routes and not {"size_m", "outline_m"} & set(values):
         values["outline_m"] = _around(routes, values.get("diameter_m", Task.diameter_m))
     floor = values.pop("area.floor", None)
@@ -266,9 +265,3 @@ def _around(routes: Sequence[Route], margin_m: float) -> NDArray[np.float64]:
     low, high = waypoints.min(axis=0) - margin_m, waypoints.max(axis=0) + margin_m
     length_m, width_m = (high - low).tolist()
     return rectangle(length_m, width_m, (float(low[0]), float(low[1])))
-
-
-def _read_route(path: Path) -> Route:
-    points, _ = read_site_points(path)
-    with error_context(path):
-        return Route(np.array([[point.x_m, point.y_m] for point in points]), path.stem)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from locatk.core.error_quantiles import error_quantile, pose_error_quantiles
 from locatk.core.errors import InputError
 from locatk.core.geometry import rotation_matrix_2d, wrap_angle
+from locatk.core.hand_placement import EDGE_SIGMA_M, LAYING_SIGMA_M
 from locatk.core.polaris import codec
 from locatk.core.polaris.design.accuracy_bound import magnet_covariance, rotate
 from locatk.core.polaris.design.planning import (
@@ -46,14 +47,6 @@ from locatk.core.streaming.planar_filter import OdometryNoise
 from locatk.core.units import length_text
 
 Array = NDArray[np.float64]
-
-LAYING_SIGMA_M = 1.5e-3
-"""Standard deviation of the position of a tag that was laid by hand along each axis [m]: 1 mm for
-the mark and the edge of the sheet, and 1.2 mm for a tape of class II, which is allowed an error of
-0.3 mm + 0.2 mm/m (directive 2014/32/EU, annex X, chapter I), 1.3 mm in 5 m."""
-
-EDGE_SIGMA_M = 1e-3
-"""Standard deviation of each end of the edge by which the heading of a tag is set [m]."""
 
 SAMPLED_LAYOUTS = 4
 """Number of layouts over which the accuracy of a pass is averaged."""

@@ -93,7 +93,7 @@ def system(name: str, position_m: float, *failed: str) -> SystemAdvice:
 def test_a_coarse_system_guides_robots_to_the_places_of_a_fine_one() -> None:
     task = Task(position_m=0.001)
     coarse, fine = system("lighthouse", 0.004), system("dots", 0.0005, "installation")
-    assert [(p.everywhere, p.at_places) for p in combine([coarse, fine], task)] == [
+    assert [(p.area_system, p.spot_system) for p in combine([coarse, fine], task)] == [
         ("lighthouse", "dots")
     ]
     # A system that meets the task needs no second one.
