@@ -117,12 +117,16 @@ def forecast_entry(forecast: SiteForecast) -> dict[str, Any]:
 
 def plan_text(plan: SpacingPlan) -> str:
     """Format the plan of a spacing in 80 columns."""
+    from locatk.core.polaris.design.site import MAX_SITE_TAGS
+
     limit = LIMITS[plan.limited_by]
     rows = [
         ("spacing", f"{length_text(plan.spacing_m)}; a larger one is limited by the {limit}"),
     ]
     if plan.limited_by == "field":
         rows = [("spacing", "none: no pass over a tag is detected")]
+    elif plan.limited_by == "count":
+        rows = [("spacing", f"none: it takes more than {MAX_SITE_TAGS} tags")]
     elif not plan.is_feasible:
         rows = [("spacing", f"{length_text(plan.spacing_m)}, the smallest for separate passes")]
     return console.labelled(rows)

@@ -211,10 +211,14 @@ def route_points(
     return points, len(candidates) - len(points)
 
 
+class TooManyTagsError(InputError):
+    """A site would have more than :data:`MAX_SITE_TAGS` tags."""
+
+
 def check_tag_count(count: int) -> None:
-    """Raise an error for more than :data:`MAX_SITE_TAGS` tags."""
+    """Raise :class:`TooManyTagsError` for more than :data:`MAX_SITE_TAGS` tags."""
     if count > MAX_SITE_TAGS:
-        raise InputError(
+        raise TooManyTagsError(
             f"more than {MAX_SITE_TAGS} tags on a site", hint="Give a larger spacing, in mm"
         )
 

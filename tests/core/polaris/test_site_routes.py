@@ -23,7 +23,7 @@ from locatk.core.polaris.design.routes import (
     spacing_for_accuracy,
     tag_fix_covariance,
 )
-from locatk.core.polaris.design.site import SitePoint, pass_separation
+from locatk.core.polaris.design.site import MAX_SITE_TAGS, SitePoint, pass_separation
 from locatk.core.polaris.tag import AsBuiltTag, PlanarPose, Tags
 from locatk.core.routes import Route
 from locatk.core.streaming.planar_filter import OdometryNoise
@@ -314,6 +314,14 @@ def test_stations_keep_their_ids_and_tags_are_shared_by_the_way_back() -> None:
     assert distance.min() >= 0.12 - 1e-9
     with pytest.raises(InputError):
         points_along_route(Tags(), [SitePoint(0, 0), SitePoint(0, 0)], 1.0)
+
+
+def test_a_route_that_needs_too_many_tags_is_impossible_but_no_error() -> None:
+    """Each leg of the zigzag takes a tag, although its length would need fewer."""
+    zigzag = [SitePoint(0.25 * k, 0.5 * (k % 2)) for k in range(MAX_SITE_TAGS + 3)]
+    points, plan = plan_route(Tags(), zigzag, None, None, 0.02)
+    assert (points, plan.is_feasible, plan.limited_by) == ([], False, "count")
+    assert "divide the route" in plan.remedies[0]
 
 
 @pytest.mark.slow
