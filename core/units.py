@@ -18,10 +18,10 @@ def length_text(value_m: float, digits: int = 3) -> str:
 
     Examples
     --------
-    >>> length_text(0.01234), length_text(0.2, 4)
-    ('12.3 mm', '200 mm')
+    >>> length_text(0.01234), length_text(0.2, 4), length_text(1.5496)
+    ('12.3 mm', '200 mm', '1550 mm')
     """
-    return f"{1e3 * value_m:.{digits}g} mm"
+    return f"{float(f'{1e3 * value_m:.{digits}g}'):g} mm"
 
 
 def mm_text(value_m: float, decimals: int = 1) -> str:
