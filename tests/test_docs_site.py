@@ -114,15 +114,20 @@ def _modules(system: str) -> Iterator[ast.Module]:
     start = BENCHES[system].split(":")[0]
     packages = {entry.split(":")[0].rpartition(".")[0] for entry in BENCHES.values()}
     others = tuple(f"{each}." for each in packages - {package, start.rpartition(".")[0]})
-    left, seen = [start], {f"{package}.timing"}
+    # The names of ratios are given by their callers.
+    left, seen = [start], {f"{package}.timing", f"{package}.plan.ratios"}
     while left:
         name = left.pop()
         if name in seen or not name.startswith(f"{package}.") or name.startswith(others):
             continue
         seen.add(name)
         path = ROOT / Path(*name.split(".")[1:]).with_suffix(".py")
+        if not path.exists():
+            continue  # a package
         module = ast.parse(path.read_text(encoding="utf-8"))
-        left += [n.module or "" for n in ast.walk(module) if isinstance(n, ast.ImportFrom)]
+        for node in ast.walk(module):
+            if isinstance(node, ast.ImportFrom):
+                left += [f"{node.module}", *(f"{node.module}.{each.name}" for each in node.names)]
         yield module
 
 
@@ -181,6 +186,8 @@ def _named(node: ast.AST, values: Values) -> Iterator[str]:
             values = {**values, **dict(_bound(target, None))}
         case ast.Call(func=ast.Name(id="Figure" | "measured"), args=[name, *_]):
             yield from _texts(name, values)
+        case ast.Call(func=ast.Name(id="ratio_figures"), args=[name, *_]):
+            yield from (f"{text}: *" for text in _texts(name, values))
         case ast.Call(func=ast.Name(id="replace"), keywords=keywords):
             for keyword in keywords:
                 if keyword.arg == "name":
