@@ -131,7 +131,7 @@ def command(
                 "input": scene_file,
                 "stations": room_text.station_entries(scene.stations, [None] * len(scene.stations)),
                 "report": {**room_text.report_entry(report), "notes": notes},
-                "heading_sigma_rad": None if heading is None else room_text.finite(heading),
+                "heading_sigma_rad": heading,
                 "best_addition": room_text.addition_entry(addition),
                 "warnings": warnings,
             }

@@ -10,6 +10,7 @@ import click
 
 from locatk.cli import console, failures, options
 from locatk.cli.command import Command, section
+from locatk.cli.materials_text import materials_text
 from locatk.cli.price_options import price_options
 from locatk.cli.room.options import (
     TRIPOD,
@@ -203,6 +204,7 @@ def _print_design(
 ) -> None:
     from locatk.cli.room import room_text
     from locatk.core.lighthouse.design.report import deck_heading_sigma
+    from locatk.formats.exporters.bill_of_materials import bill_rows, total_entry
 
     heading = None
     if device == "deck":
@@ -223,7 +225,7 @@ def _print_design(
     if design.scene.markers:
         text = room_text.marker_text(design.scene.markers)
         console.result("\n" + console.wrapped(text, indent=0))
-    console.result("\n" + room_text.materials_text(items))
+    console.result("\n" + materials_text(items))
     for text in design.report.notes:
         console.result("\n" + console.wrapped(f"Note: {text}.", indent=0))
     if as_json:
@@ -232,17 +234,9 @@ def _print_design(
                 "version": 1,
                 "outputs": written,
                 **room_text.design_entry(design),
-                "heading_sigma_rad": None if heading is None else room_text.finite(heading),
-                "materials": [
-                    {
-                        "part": item.part,
-                        "count": item.count,
-                        "detail": item.detail,
-                        "price": None if item.price is None else item.price.amount,
-                        "currency": None if item.price is None else item.price.currency,
-                    }
-                    for item in items
-                ],
+                "heading_sigma_rad": heading,
+                "materials": bill_rows(items),
+                "materials_total": total_entry(items),
                 "warnings": design.warnings,
             }
         )

@@ -6,13 +6,10 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from locatk.cli import console
-
 if TYPE_CHECKING:
     from locatk.core.lighthouse.design import Addition, RoomDesign, RoomReport
     from locatk.core.lighthouse.room import Room
     from locatk.core.lighthouse.scene import Marker, Station
-    from locatk.core.materials import BillItem
 
 
 def room_lines(room: Room) -> list[tuple[str, str]]:
@@ -119,38 +116,15 @@ def addition_text(addition: Addition) -> str:
     )
 
 
-def materials_text(items: Sequence[BillItem]) -> str:
-    """Format the bill of materials."""
-    from locatk.core.materials import total_of
-
-    total = total_of(items)
-    rows = [
-        (
-            item.part,
-            item.count,
-            "" if item.price is None else f"{item.price.amount:g}",
-            "" if item.amount is None else f"{item.amount:.2f}",
-            item.detail,
-        )
-        for item in items
-    ]
-    sources = sorted({f"{i.price.source}, {i.price.date}" for i in items if i.price is not None})
-    header = ("material", "count", "each", f"sum {total.currency}".strip(), "")
-    text = f"{total.text[0].upper()}{total.text[1:]}."
-    if sources:
-        text += f" Prices: {'; '.join(sources)}."
-    return f"{console.table(header, rows)}\n\n{console.wrapped(text, indent=0)}"
-
-
 def report_entry(report: RoomReport) -> dict[str, Any]:
     """Return a report for ``--json``."""
     return {
         "places": len(report.points_m),
         "min_seen": report.min_seen,
         "covered_fraction": report.covered_fraction,
-        "p95_sigma_m": finite(report.p95_sigma_m),
-        "mean_sigma_m": finite(report.mean_sigma_m),
-        "p95_noise_sigma_m": finite(report.p95_noise_sigma_m),
+        "p95_sigma_m": report.p95_sigma_m,
+        "mean_sigma_m": report.mean_sigma_m,
+        "p95_noise_sigma_m": report.p95_noise_sigma_m,
         "stations_seen": {
             "min": int(report.stations_seen.min()),
             "mean": float(report.stations_seen.mean()),
@@ -162,7 +136,7 @@ def report_entry(report: RoomReport) -> dict[str, Any]:
         "worst_places": [
             {
                 "position_m": report.points_m[index].tolist(),
-                "sigma_m": finite(float(report.sigma_m[index])),
+                "sigma_m": float(report.sigma_m[index]),
                 "stations_seen": int(report.stations_seen[index]),
                 "covered": bool(report.is_covered[index]),
             }
@@ -204,7 +178,7 @@ def design_entry(design: RoomDesign) -> dict[str, Any]:
         ],
         "reached": design.is_reached,
         "report": report_entry(design.report),
-        "mounted_p95_sigma_m": finite(design.mounted_report.p95_sigma_m),
+        "mounted_p95_sigma_m": design.mounted_report.p95_sigma_m,
     }
 
 
@@ -215,13 +189,8 @@ def addition_entry(addition: Addition | None) -> dict[str, Any] | None:
     return {
         **station_entries([addition.station], [None])[0],
         "covered_fraction": addition.report.covered_fraction,
-        "p95_sigma_m": finite(addition.report.p95_sigma_m),
+        "p95_sigma_m": addition.report.p95_sigma_m,
     }
-
-
-def finite(value: float) -> float | None:
-    """Return a number for JSON: None if it is infinite."""
-    return value if math.isfinite(value) else None
 
 
 def mm(value_m: float) -> str:

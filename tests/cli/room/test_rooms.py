@@ -53,6 +53,8 @@ def test_a_design_is_a_scene_that_check_judges_alike(locatk, designed: Path) -> 
         designed_again["report"]["p95_sigma_m"]
     )
     assert designed_again["materials"][0]["part"] == "base station"
+    assert designed_again["materials"][0]["sum"] == 400.0
+    assert designed_again["materials_total"]["currency"] == "USD"
 
 
 def test_json_is_valid_where_figures_are_infinite(locatk, tmp_path: Path) -> None:
