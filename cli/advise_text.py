@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from locatk.cli import console
 
 if TYPE_CHECKING:
-    from locatk.core.advice.answer import Advice, Check, SystemAdvice
+    from locatk.core.advice.answer import Advice, SystemAdvice
     from locatk.core.advice.task import Task
 
 SHOWN_CHECKS = (
@@ -18,6 +18,8 @@ SHOWN_CHECKS = (
     ("rate", "rate"),
     ("latency", "latency"),
     ("speed", "speed, at most"),
+    ("installation", "installation"),
+    ("power", "power per robot"),
 )
 """Check and its name in the table."""
 
@@ -34,7 +36,8 @@ def text(task: Task, advice: Advice) -> str:
     parts += [_design(best), _next(best)]
     parts.append(
         console.wrapped(
-            "Errors are predictions (95 %). A cost with + has parts without a price. Hours are assumptions and prices those of the papers "
+            "Errors are predictions (95 %). A cost with + has parts without a price. Hours are "
+            "assumptions and prices those of the papers "
             "unless you give yours with --prices. --report writes maps, parts, sources and risks.",
             indent=0,
         )
@@ -43,56 +46,22 @@ def text(task: Task, advice: Advice) -> str:
 
 
 def _comparison(task: Task, advice: Advice) -> str:
-    from locatk.formats.advice.entries import total_text, value_text
+    from locatk.formats.advice.entries import check_text, cost_text, value_text
 
-    header = ("", "wanted", *(system.system for system in advice.systems))
+    systems = advice.systems
+    header = ("", "wanted", *(system.system for system in systems))
     rows: list[tuple[str, ...]] = [
-        ("meets the task", "", *("yes" if s.is_feasible else "no" for s in advice.systems))
+        ("meets the task", "", *("yes" if s.is_feasible else "no" for s in systems))
     ]
     for name, title in SHOWN_CHECKS:
-        checks = [system.check(name) for system in advice.systems]
-        present = [check for check in checks if check is not None]
-        if not present:
-            continue
-        wanted = next((check.wanted for check in present if check.wanted is not None), None)
-        rows.append((title, value_text(wanted, present[0].unit), *map(_cell, checks)))
-    rows.append(
-        (
-            "cost",
-            "-" if task.budget is None else f"{task.budget:,.0f} {task.currency}",
-            *(total_text(s.totals[0]) + _mark(s.check("cost")) for s in advice.systems),
-        )
-    )
-    rows.append(
-        (
-            "installation",
-            value_text(task.hours, "h"),
-            *(value_text(s.hours, "h") + _mark(s.check("installation")) for s in advice.systems),
-        )
-    )
-    rows.append(
-        (
-            "power per robot",
-            value_text(task.power_w, "W"),
-            *(
-                value_text(max(p.power_w for p in s.power), "W") + _mark(s.check("power"))
-                if s.power
-                else "-"
-                for s in advice.systems
-            ),
-        )
-    )
+        checks = [system.check(name) for system in systems]
+        shown = [check for check in checks if check is not None]
+        if shown:
+            wanted = next((check.wanted for check in shown if check.wanted is not None), None)
+            rows.append((title, value_text(wanted, shown[0].unit), *map(check_text, checks)))
+    budget = "-" if task.budget is None else f"{task.budget:,.0f} {task.currency}"
+    rows.insert(-2, ("cost", budget, *map(cost_text, systems)))
     return console.table(header, rows)
-
-
-def _cell(check: Check | None) -> str:
-    from locatk.formats.advice.entries import value_text
-
-    return "-" if check is None else value_text(check.expected, check.unit) + _mark(check)
-
-
-def _mark(check: Check | None) -> str:
-    return " !" if check is not None and check.is_met is False else ""
 
 
 def _failures(system: SystemAdvice) -> str:

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from locatk.core.advice.answer import AccuracyMap, Advice, Check, SystemAdvice
-from locatk.core.materials import BillItem, BillTotal
+from locatk.core.materials import BillTotal
 from locatk.formats.exporters.bill_of_materials import bill_rows
 
 _SCALES = {
@@ -39,6 +39,22 @@ def value_text(value: float | str | None, unit: str) -> str:
     scaled = factor * value
     number = f"{scaled:.0f}" if scaled >= 100 else f"{scaled:.3g}"
     return f"{number} {shown}".rstrip()
+
+
+def check_text(check: Check | None) -> str:
+    """Return the figure of a check, with an exclamation mark if it is not as wanted."""
+    return "-" if check is None else value_text(check.expected, check.unit) + failure_mark(check)
+
+
+def failure_mark(check: Check | None) -> str:
+    """Return the mark of a check that is not met; empty for others."""
+    return " !" if check is not None and check.is_met is False else ""
+
+
+def cost_text(advice: SystemAdvice) -> str:
+    """Return the cost of a system, in each currency of its prices."""
+    totals = ", ".join(map(total_text, advice.totals))
+    return totals + failure_mark(advice.check("cost"))
 
 
 def total_text(total: BillTotal) -> str:
@@ -97,8 +113,3 @@ def _map_entry(shown: AccuracyMap) -> dict[str, Any]:
         "infrastructure": shown.infrastructure,
         "infrastructure_m": shown.infrastructure_m,
     }
-
-
-def priced_items(advice: SystemAdvice) -> tuple[BillItem, ...]:
-    """Return all parts of a system."""
-    return (*advice.infrastructure, *advice.robot_parts)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from plotly.graph_objects import Figure, Scatter
 
-from locatk.core.advice.answer import AccuracyMap, Advice, Check, SystemAdvice
+from locatk.core.advice.answer import AccuracyMap, Advice, SystemAdvice
 from locatk.core.advice.task import Task
 from locatk.core.materials import BillItem
-from locatk.formats.advice.entries import priced_items, total_text, value_text
+from locatk.formats.advice.entries import check_text, cost_text, value_text
 from locatk.formats.output import atomic_write, check_output, tool_version
 from locatk.formats.plots.shapes import COLORS
 from locatk.formats.report import page
 from locatk.formats.report.panels import Panel, Table
 from locatk.formats.report.theme import INK, MUTED, SENSOR_SHADES
+
+Array = NDArray[np.float64]
 
 MAP_WIDTH_PX, MIN_MAP_HEIGHT_PX, MAX_MAP_HEIGHT_PX = 760, 320, 700
 """Width and limits of the height of a map in pixels."""
@@ -134,23 +138,13 @@ def _comparison(advice: Advice) -> Table:
             continue
         wanted = next((c for c in checks if c is not None and c.wanted is not None), None)
         if name == "cost":
-            cells = [
-                ", ".join(map(total_text, system.totals)) + _mark(check)
-                for system, check in zip(advice.systems, checks, strict=True)
-            ]
+            cells = [cost_text(system) for system in advice.systems]
         else:
-            cells = [
-                "-" if check is None else value_text(check.expected, check.unit) + _mark(check)
-                for check in checks
-            ]
+            cells = [check_text(check) for check in checks]
         rows.append(
             (name, "-" if wanted is None else value_text(wanted.wanted, wanted.unit), *cells)
         )
     return Table(("", "wanted", *(system.system for system in advice.systems)), rows)
-
-
-def _mark(check: Check | None) -> str:
-    return " !" if check is not None and check.is_met is False else ""
 
 
 def _article(task: Task, system: SystemAdvice) -> Iterator[str]:
@@ -252,7 +246,7 @@ def _checks_table(system: SystemAdvice) -> Table:
 
 def _total_note(system: SystemAdvice) -> str:
     text = "; ".join(total.text for total in system.totals)
-    return f"{text[0].upper()}{text[1:]}." if priced_items(system) else ""
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _bill_table(system: SystemAdvice) -> Table:
@@ -333,34 +327,37 @@ def _map_panel(task: Task, shown: AccuracyMap) -> Panel:
             marker={"color": INK, "size": 5 if len(shown.infrastructure_m) > 50 else 11},
         )
     )
-    low, high = task.corners_m.min(axis=0), task.corners_m.max(axis=0)
-    everything = np.concatenate([task.corners_m, shown.infrastructure_m])
-    low, high = np.minimum(low, everything.min(axis=0)), np.maximum(high, everything.max(axis=0))
-    margin = 0.05 * float((high - low).max())
-    ratio = float((high[1] - low[1] + 2 * margin) / (high[0] - low[0] + 2 * margin))
-    height = round(min(MAX_MAP_HEIGHT_PX, max(MIN_MAP_HEIGHT_PX, MAP_WIDTH_PX * ratio + 90)))
-    figure.update_layout(
-        height=height,
-        xaxis={
-            "title": {"text": "x [m]"},
-            "range": [low[0] - margin, high[0] + margin],
-            "constrain": "domain",
-        },
-        yaxis={
-            "title": {"text": "y [m]"},
-            "range": [low[1] - margin, high[1] + margin],
-            "scaleanchor": "x",
-            "scaleratio": 1,
-            "constrain": "domain",
-        },
-        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom"},
-    )
+    figure.update_layout(**_map_layout(np.concatenate([task.corners_m, shown.infrastructure_m])))
     return Panel(
         "Map of the expected errors",
         f"{len(shown.infrastructure_m)} {shown.infrastructure}. Colors are position errors that "
         "95 % of the poses do not exceed.",
         figure=figure,
     )
+
+
+def _map_layout(points_m: Array) -> dict[str, Any]:
+    """Return equal axes over points (n, 2)."""
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    margin = 0.05 * float((high - low).max())
+    low, high = low - margin, high + margin
+    height = MAP_WIDTH_PX * float((high[1] - low[1]) / (high[0] - low[0])) + 90
+    return {
+        "height": round(min(MAX_MAP_HEIGHT_PX, max(MIN_MAP_HEIGHT_PX, height))),
+        "xaxis": {
+            "title": {"text": "x [m]"},
+            "range": [float(low[0]), float(high[0])],
+            "constrain": "domain",
+        },
+        "yaxis": {
+            "title": {"text": "y [m]"},
+            "range": [float(low[1]), float(high[1])],
+            "scaleanchor": "x",
+            "scaleratio": 1,
+            "constrain": "domain",
+        },
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom"},
+    }
 
 
 def _colorscale() -> list[list[object]]:
