@@ -330,8 +330,8 @@ def _map_panel(task: Task, shown: AccuracyMap) -> Panel:
     figure.update_layout(**_map_layout(np.concatenate([task.corners_m, shown.infrastructure_m])))
     return Panel(
         "Map of the expected errors",
-        f"{len(shown.infrastructure_m)} {shown.infrastructure}. Colors are position errors that "
-        "95 % of the poses do not exceed.",
+        f"{shown.infrastructure.capitalize()}: {len(shown.infrastructure_m)}. Colors are position "
+        "errors that 95 % of the poses do not exceed.",
         figure=figure,
     )
 
