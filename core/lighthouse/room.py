@@ -154,3 +154,9 @@ class Room:
     def working_outline_m(self) -> Array:
         """Outline (k, 2) of the working area."""
         return self.outline_m if self.area_m is None else self.area_m
+
+
+def hand_mounting_covariance() -> Array:
+    """Return the covariance (6, 6) of position and rotation of a station mounted by hand."""
+    sigma = np.repeat([MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD], 3)
+    return np.diag(sigma**2)

@@ -244,6 +244,11 @@ def working_points(room: Room, count: int) -> Array:
     """Return about ``count`` points (p, 3) on a regular grid in the working volume.
 
     They are the centres of equal cells; those in obstacles are omitted.
+
+    Raises
+    ------
+    InputError
+        No point is in the room and outside of obstacles.
     """
     outline = room.working_outline_m
     low_z, high_z = room.photodiode_z_m
@@ -264,7 +269,13 @@ def working_points(room: Room, count: int) -> Array:
     )
     grid = np.stack(np.meshgrid(x, y, levels, indexing="ij"), axis=-1).reshape(-1, 3)
     is_free = is_inside(outline, grid[:, :2]) & is_inside(room.outline_m, grid[:, :2])
-    return grid[is_free & ~in_obstacle(room, grid)]
+    points = grid[is_free & ~in_obstacle(room, grid)]
+    if not len(points):
+        raise InputError(
+            "the working volume is empty: it is outside the room or inside obstacles",
+            hint="Check the working area, the heights of photodiodes and the obstacles",
+        )
+    return points
 
 
 def candidates(room: Room, points_m: Array) -> StationPoses:
@@ -481,11 +492,6 @@ class PlacementProblem:
     def __init__(self, room: Room, request: RoomRequest, points_m: Array | None = None) -> None:
         self.room, self.request = room, request
         self.points_m = working_points(room, SEARCH_POINTS) if points_m is None else points_m
-        if not len(self.points_m):
-            raise InputError(
-                "the working volume is empty: it is outside the room or inside obstacles",
-                hint="Check the working area, the heights of photodiodes and the obstacles",
-            )
         self.min_seen = request.seen_by(room)
         self._dims = 2 if room.is_planar else 3
         self._area_m2 = abs(signed_area(room.working_outline_m))

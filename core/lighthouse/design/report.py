@@ -36,8 +36,9 @@ from locatk.core.lighthouse.design.visibility import (
 )
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.receiver import DECK
-from locatk.core.lighthouse.room import MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD, Room
+from locatk.core.lighthouse.room import Room, hand_mounting_covariance
 from locatk.core.lighthouse.scene import Scene, Station
+from locatk.core.lighthouse.scene.model import stack_stations
 from locatk.core.lighthouse.scene.scene_errors import SceneErrors
 from locatk.core.polygons import rectangle, signed_area
 
@@ -160,16 +161,10 @@ class Addition:
     report: RoomReport
 
 
-def mounting_covariance() -> Array:
-    """Return the covariance (6, 6) of a station that was mounted by hand at its designed pose."""
-    sigma = np.repeat([MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD], 3)
-    return np.diag(sigma**2)
-
-
 def station_of(channel: int, position_m: Array, rotation: Array) -> Station:
-    """Return a designed station."""
+    """Return a designed station with the covariance of its mounting by hand."""
     return Station(
-        channel, position_m, rotation, GENERIC_CALIBRATION, covariance=mounting_covariance()
+        channel, position_m, rotation, GENERIC_CALIBRATION, covariance=hand_mounting_covariance()
     )
 
 
@@ -199,13 +194,8 @@ def report_room(
     """
     request = RoomRequest() if request is None else request
     points = working_points(room, REPORT_POINTS) if points_m is None else points_m
-    if not len(points):
-        raise InputError(
-            "the working volume is empty: it is outside the room or inside obstacles",
-            hint="Check the working area, the heights of photodiodes and the obstacles",
-        )
     min_seen = request.seen_by(room)
-    position, rotation = _stacked(scene)
+    position, rotation, _ = stack_stations(scene.stations)
     is_seen = seen_stations(room, position, rotation, points, request)
     accuracy = _accuracy(scene, room, request, points, is_seen, given_errors)
     blocked = blocked_fraction(
@@ -237,7 +227,7 @@ def deck_heading_sigma(scene: Scene, report: RoomReport, room: Room, request: Ro
 
     It is that of a single epoch of a level :data:`~locatk.core.lighthouse.receiver.DECK`.
     """
-    position, rotation = _stacked(scene)
+    position, rotation, _ = stack_stations(scene.stations)
     is_seen = seen_stations(room, position, rotation, report.points_m, request)
     poses = predict_poses(position, rotation, report.points_m, is_seen, DECK.position_m)
     return percentile(poses.heading_sigma_rad)
@@ -254,7 +244,7 @@ def best_addition(scene: Scene, room: Room, request: RoomRequest) -> Addition | 
     if not free:
         return None
     problem = PlacementProblem(room, request)
-    position, rotation = _stacked(scene)
+    position, rotation, _ = stack_stations(scene.stations)
     poses = candidates(room, problem.points_m)
     costs = problem.costs_with(problem.views_of(position, rotation), problem.views(poses))
     order = np.argsort(costs, kind="stable")[:COMPARED_ADDITIONS]
@@ -296,7 +286,7 @@ def assumed_room(scene: Scene) -> Room:
             "the floor of the scene is unknown: its z axis is not known to be up from the floor",
             hint="Give the room with --room, or fix the frame with `locatk calibrate scene`",
         )
-    position, _ = _stacked(scene)
+    position, _, _ = stack_stations(scene.stations)
     places = np.concatenate([position, *[m.position[None] for m in scene.markers]])
     low, high = places[:, :2].min(axis=0) - MOUNT_DEPTH_M, places[:, :2].max(axis=0) + MOUNT_DEPTH_M
     size = np.maximum(high - low, 1.0)
@@ -309,12 +299,6 @@ def assumed_room(scene: Scene) -> Room:
     return Room(outline, top + MOUNT_DEPTH_M, z)
 
 
-def _stacked(scene: Scene) -> tuple[Array, Array]:
-    position = np.array([s.position for s in scene.stations]).reshape(-1, 3)
-    rotation = np.array([s.rotation for s in scene.stations]).reshape(-1, 3, 3)
-    return position, rotation
-
-
 def _accuracy(
     scene: Scene,
     room: Room,
@@ -324,7 +308,7 @@ def _accuracy(
     given_errors: bool,
 ) -> PositionAccuracy:
     """Predict the accuracy with the errors of solved stations, or with those of the scene."""
-    position, rotation = _stacked(scene)
+    position, rotation, _ = stack_stations(scene.stations)
     # Devices move through the whole working volume when the scene is recorded.
     grid = working_points(room, SEARCH_POINTS)
     everywhere = np.concatenate([points, grid])

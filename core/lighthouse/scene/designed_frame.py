@@ -31,7 +31,7 @@ from locatk.core.lighthouse.calibration import Calibration
 from locatk.core.lighthouse.devices.alignment import MARKER_SIGMA_M
 from locatk.core.lighthouse.motion.frames import common_motions
 from locatk.core.lighthouse.results import FrameFacts, LighthouseFacts
-from locatk.core.lighthouse.room import MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD
+from locatk.core.lighthouse.room import hand_mounting_covariance
 from locatk.core.lighthouse.scene.model import Scene, Station
 from locatk.core.lighthouse.scene.reframing import transform_solution
 from locatk.core.solution import Solution, SolverWarning
@@ -180,7 +180,7 @@ def design_prior(design: Scene) -> Scene:
 
 def with_mounting_tolerance(design: Scene) -> Scene:
     """Return a design whose stations all have a covariance, by default that of hand mounting."""
-    stations = tuple(replace(s, covariance=mounting_covariance(s)) for s in design.stations)
+    stations = tuple(replace(s, covariance=_mounting_covariance(s)) for s in design.stations)
     return replace(design, stations=stations)
 
 
@@ -371,7 +371,7 @@ class _Matching:
             np.stack([np.zeros((6, 6)) if s.covariance is None else s.covariance for s in own]),
             np.stack([s.position for s in designed]),
             np.stack([s.rotation for s in designed]),
-            np.stack([mounting_covariance(s) for s in designed]),
+            np.stack([_mounting_covariance(s) for s in designed]),
             sigma,
             (scene.floor_z, design.floor_z) if scene.planar else None,
         )
@@ -503,12 +503,9 @@ def _station(scene: Scene, channel: int) -> Station:
     return station
 
 
-def mounting_covariance(station: Station) -> Array:
+def _mounting_covariance(station: Station) -> Array:
     """Return the covariance (6, 6) of a designed station; by default, that of mounting by hand."""
-    if station.covariance is not None:
-        return station.covariance
-    sigma = np.repeat([MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD], 3)
-    return np.diag(sigma**2)
+    return hand_mounting_covariance() if station.covariance is None else station.covariance
 
 
 def _plausible_swaps(

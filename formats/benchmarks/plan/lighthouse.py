@@ -27,11 +27,10 @@ from numpy.typing import NDArray
 from locatk.core.errors import LocatkError
 from locatk.core.evaluation import EvaluationOptions, evaluate
 from locatk.core.geometry import Similarity, apply_homography, fit_homography, umeyama
-from locatk.core.lighthouse.calibration import GENERIC_CALIBRATION
 from locatk.core.lighthouse.design import RoomRequest, design_room
 from locatk.core.lighthouse.design.accuracy import PositionAccuracy
 from locatk.core.lighthouse.design.placement import seen_stations
-from locatk.core.lighthouse.design.report import report_room
+from locatk.core.lighthouse.design.report import report_room, station_of
 from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
 from locatk.core.lighthouse.devices.alignment import MARKER_SIGMA_M
 from locatk.core.lighthouse.epochs import group_epochs
@@ -39,13 +38,7 @@ from locatk.core.lighthouse.localization.photodiodes import track_photodiodes
 from locatk.core.lighthouse.motion.frames import common_motions
 from locatk.core.lighthouse.noise import ANGLE_SIGMA_RAD
 from locatk.core.lighthouse.recording import Sweeps
-from locatk.core.lighthouse.room import (
-    MOUNTING_POSITION_SIGMA_M,
-    MOUNTING_ROTATION_SIGMA_RAD,
-    Obstacle,
-    RobotSize,
-    Room,
-)
+from locatk.core.lighthouse.room import Obstacle, RobotSize, Room
 from locatk.core.lighthouse.scene import Marker, Scene, Station
 from locatk.core.lighthouse.scene.model import stack_stations
 from locatk.core.lighthouse.scene.standstills import find_standstills
@@ -228,9 +221,6 @@ def _random_stations(rng: np.random.Generator, room: Room, count: int) -> tuple[
     """Return stations on walls, at least a quarter of the way around from each other for two."""
     size = room.outline_m.max(axis=0)
     start = rng.random()
-    covariance = np.diag(
-        np.repeat([MOUNTING_POSITION_SIGMA_M, MOUNTING_ROTATION_SIGMA_RAD], 3) ** 2
-    )
     stations = []
     for k in range(count):
         # Along the walls, a fraction of the circumference from the corner at the origin.
@@ -238,12 +228,7 @@ def _random_stations(rng: np.random.Generator, room: Room, count: int) -> tuple[
         x, y = _on_walls(along, *size)
         position = np.array([x, y, room.height_m - rng.uniform(0.1, 0.6)])
         target = np.append(size * rng.uniform(0.35, 0.65, 2), room.photodiode_z_m[0])
-        stations.append(
-            Station(
-                k + 1, position, _facing(position, target), GENERIC_CALIBRATION,
-                covariance=covariance,
-            )
-        )  # fmt: skip
+        stations.append(station_of(k + 1, position, _facing(position, target)))
     return tuple(stations)
 
 
@@ -464,7 +449,7 @@ def homography_variance(corners: Array, points: Array, *, is_aligned: bool) -> f
 def _predict(scene: Scene, points_m: Array) -> PositionAccuracy:
     """Predict the accuracy at places at which all stations of a solved scene were received."""
     step = max(1, len(points_m) // MAX_PREDICTED_PLACES)
-    position, rotation = _stacked(scene)
+    position, rotation, _ = stack_stations(scene.stations)
     points = points_m[::step]
     is_seen = np.ones((len(position), len(points)), bool)
     return predict_solved_positions(
@@ -529,18 +514,12 @@ def _predicted_variance(scene: Scene, points_m: Array) -> float:
     """
     assert scene.room is not None
     points = points_m[:: max(1, len(points_m) // MAX_PREDICTED_PLACES)]
-    position, rotation = _stacked(scene)
+    position, rotation, _ = stack_stations(scene.stations)
     is_seen = seen_stations(scene.room, position, rotation, points, REQUEST)
     sigma = predict_solved_positions(
         position, rotation, points, is_seen, is_planar=scene.room.is_planar
     ).sigma_m
     return float(np.mean(sigma[np.isfinite(sigma)] ** 2))
-
-
-def _stacked(scene: Scene) -> tuple[Array, Array]:
-    """Return the positions (s, 3) and rotations (s, 3, 3) of the stations."""
-    position, rotation, _ = stack_stations(scene.stations)
-    return position, rotation
 
 
 def _simulate(scene: Scene, seed: int, duration_s: float) -> SimulatedSession:
