@@ -40,6 +40,7 @@ def solved(recorded: session.Session) -> solution.Solution:
     return functions.solve(recorded)
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pandas")
     monkeypatch.chdir(tmp_path)
@@ -154,6 +155,7 @@ def test_the_table_has_the_numbers_of_the_poses(solved: solution.Solution) -> No
     assert rows[["qx", "qy", "qz", "qw", "sigma_heading_rad", "probability"]].isna().all(axis=None)
 
 
+@pytest.mark.slow
 def test_plot_and_report(folder: Path, solved: solution.Solution) -> None:
     solved.plot(align="se2").savefig(folder / "plot.png")
     picture = matplotlib.image.imread(folder / "plot.png")
@@ -225,6 +227,7 @@ def test_settings_are_those_of_the_file(tmp_path: Path, recorded: session.Sessio
     ("system", "observations"),
     [("dots", "frames"), ("polaris", "magnetometers"), ("landmarks", "halls")],
 )
+@pytest.mark.slow
 def test_other_systems(tmp_path: Path, locatk: Any, system: str, observations: str) -> None:
     artifact = None
     if system == "landmarks":

@@ -157,6 +157,7 @@ def test_bad_tables(tmp_path: Path, rows: str, message: str) -> None:
     assert not output.exists()
 
 
+@pytest.mark.slow
 def test_nothing_is_written_if_the_drawing_does_not_fit(tmp_path: Path) -> None:
     words = ("--grid", "30x30", "--pitch", 20, "-o", tmp_path / "a.toml")
     result = run("array", "design", *words, "--drawing", tmp_path / "a.pdf")

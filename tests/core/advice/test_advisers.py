@@ -118,11 +118,13 @@ def test_lighthouse_reaches_the_accuracy_with_more_stations() -> None:
         assert float(check.expected) <= wanted
 
 
+@pytest.mark.slow
 def test_lighthouse_fails_outdoors_and_in_the_sun() -> None:
     task = Task(size_m=(3.0, 3.0), position_m=0.02, is_outdoor=True, infrared="sun")
     assert {"indoors", "light"} == failures(lighthouse.advise(task, {}))
 
 
+@pytest.mark.slow
 def test_lighthouse_without_walls_stands_on_tripods() -> None:
     advice = lighthouse.advise(Task(size_m=(4.0, 4.0), may_use_ceiling=False), {})
     assert "tripod" in advice.design

@@ -2,27 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from locatk.core.advice import comparison, dots, polaris
-from locatk.core.advice.answer import Check, SystemAdvice
+from locatk.core.advice import comparison
+from locatk.core.advice.answer import Check, Power, SystemAdvice
+from locatk.core.advice.checks import condition_check
 from locatk.core.advice.comparison import advise, combine
 from locatk.core.advice.task import Task
-from locatk.core.materials import Price, PriceList
-from locatk.core.routes import Route
+from locatk.core.advice.work import work_steps
+from locatk.core.materials import BillItem, Price, PriceList
 
-ROUTE = Route(np.array([[0.0, 0.0], [4.0, 0.0]]))
-TASK = Task(size_m=(4.0, 1.0), routes=(ROUTE,), position_m=0.02)
+TASK = Task(position_m=0.02)
+
+
+def dots(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
+    """Ten sheets and two cameras, priced in euros but for the sheets."""
+    return SystemAdvice(
+        "dots",
+        "",
+        (condition_check("floor", "print" in task.floor_work, "", ""),),
+        infrastructure=(BillItem("printed sheet", 10, ""),),
+        robot_parts=(BillItem("image sensor", 2, "", Price(12.86, "EUR", "2016", "Table II")),),
+        work=work_steps({"lay a sheet": 10}, minutes),
+        power=(Power("moving", 0.873, "paper"), Power("at rest", 0.352, "paper")),
+    )
+
+
+def polaris(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
+    """Twenty tags, priced in dollars but for glue."""
+    return SystemAdvice(
+        "polaris",
+        "",
+        (condition_check("floor", "glue" in task.floor_work, "", ""),),
+        infrastructure=(
+            BillItem("disc magnet", 100, "", Price(0.015, "USD", "2024", "paper")),
+            BillItem("glue", 1, ""),
+        ),
+        robot_parts=(BillItem("magnetometer", 9, "", Price(2.0, "USD", "2024", "paper")),),
+        work=work_steps({"make a tag": 20, "place a tag": 20}, minutes),
+        power=(Power("always", 0.08, "paper"),),
+    )
 
 
 @pytest.fixture(autouse=True)
 def two_systems(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare the two systems that are designed in a second."""
-    advisers = {"dots": dots.advise, "polaris": polaris.advise}
-    monkeypatch.setattr(comparison, "ADVISERS", advisers)
+    """Compare two systems whose counts are known."""
+    monkeypatch.setattr(comparison, "ADVISERS", {"dots": dots, "polaris": polaris})
 
 
 def test_feasible_systems_with_less_work_come_first() -> None:
@@ -32,7 +60,7 @@ def test_feasible_systems_with_less_work_come_first() -> None:
     assert [system.system for system in advice.systems] == ["dots", "polaris"]
     assert all(system.is_feasible for system in advice.systems)
     assert advice.systems[0].hours < advice.systems[1].hours
-    untouched = advise(replace(TASK, floor_work=frozenset({"mill"})))
+    untouched = advise(replace(TASK, floor_work=frozenset({"glue"})))
     assert [system.system for system in untouched.systems] == ["polaris", "dots"]
     assert untouched.best is untouched.systems[0]
 
@@ -48,7 +76,7 @@ def test_minutes_of_the_user_change_hours_and_order() -> None:
 def test_budget_is_compared_in_its_currency_only() -> None:
     task = replace(TASK, budget=10.0, currency="USD")
     costs = {s.system: s.check("cost") for s in advise(task).systems}
-    # Nine magnetometers alone are 18 USD; prices of the dots are in euros.
+    # Magnets and magnetometers are 19.50 USD; prices of the dots are in euros.
     assert costs["polaris"].is_met is False  # type: ignore[union-attr]
     assert costs["dots"].is_met is None  # type: ignore[union-attr]
     enough = {s.system: s.check("cost") for s in advise(replace(task, budget=1e4)).systems}

@@ -561,6 +561,7 @@ def test_designed_stations_stay_in_use_if_they_cannot_be_estimated() -> None:
     assert "designed poses" in warning.message
 
 
+@pytest.mark.slow
 def test_notes_of_a_scene_are_said_with_the_first_sweep() -> None:
     session = simulated(PHOTODIODES)
     scene = replace(session.true_scene, notes=("stations were measured by hand",))

@@ -93,6 +93,7 @@ def test_the_default_works() -> None:
     assert result.noise_from == "measured"
 
 
+@pytest.mark.slow
 def test_the_papers_rate_is_not_the_sensors() -> None:
     """100 Hz with a conversion of 16.05 ms: the warning's settings do it."""
     result = evaluate_design(Tags(), ReadingConditions(rate_hz=100))
@@ -191,6 +192,7 @@ def test_magnets_that_are_no_points() -> None:
     assert evaluate_design(replace(wide, clearance_m=0.0041), dense).warnings == ()
 
 
+@pytest.mark.slow
 def test_spacing() -> None:
     below = evaluate_design(replace(Tags(), spacing_m=0.016))
     assert below.warnings == ()

@@ -38,6 +38,7 @@ def assert_all_lines(path: Path, raw_bytes: Any, count: int = 20) -> None:
 # ---- sinks
 
 
+@pytest.mark.slow
 def test_a_sink_that_raises_stops_nothing(
     start: Any, port: Any, stream: Any, sink: Any, ListSink: Any, tmp_path: Path, raw_bytes: Any
 ) -> None:
@@ -69,6 +70,7 @@ def test_a_sink_that_raises_stops_nothing(
     assert_all_lines(path, raw_bytes)
 
 
+@pytest.mark.slow
 def test_a_sink_whose_status_raises(start: Any, port: Any, ListSink: Any) -> None:
     class Silent(ListSink):  # type: ignore[misc]
         def status(self) -> SinkStatus:
@@ -156,6 +158,7 @@ def test_a_full_disk_ends_the_recording_only(
     assert "disk" in result.recording_errors[0] or "space" in result.recording_errors[0]
 
 
+@pytest.mark.slow
 def test_an_error_of_the_recorder_is_in_status_and_result(
     start: Any, port: Any, stream: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,6 +178,7 @@ def test_an_error_of_the_recorder_is_in_status_and_result(
 
 
 @pytest.mark.parametrize("place", ["push", "finish"])
+@pytest.mark.slow
 def test_an_error_of_the_solver_leaves_a_finished_recording(
     start: Any, port: Any, stream: Any, sink: Any, tmp_path: Path, raw_bytes: Any, place: str
 ) -> None:
@@ -286,6 +290,7 @@ def test_events_of_two_replays_are_merged_by_time() -> None:
 # ---- status
 
 
+@pytest.mark.slow
 def test_the_status_follows_the_connection(start: Any, port: Any, stream: Any, sink: Any) -> None:
     run = start()
     port.send(*LINES[:10])
@@ -363,6 +368,7 @@ def test_the_status_can_be_asked_by_other_threads(
     assert len(run.end().status["devices"]) >= 79
 
 
+@pytest.mark.slow
 def test_the_recording_has_the_poses_and_the_events(
     start: Any, port: Any, sink: Any, tmp_path: Path
 ) -> None:

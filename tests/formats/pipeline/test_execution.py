@@ -112,6 +112,7 @@ def test_a_deadly_job_takes_no_other_along(module: ModuleType, tmp_path: Path) -
     assert calls(tmp_path, 7) == 1  # after all deaths: left in peace
 
 
+@pytest.mark.slow
 def test_workers_have_our_environment_but_one_thread(
     module: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +124,7 @@ def test_workers_have_our_environment_but_one_thread(
     assert os.environ["OMP_NUM_THREADS"] == "7"
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_the_workers(module: ModuleType, tmp_path: Path) -> None:
     jobs = [(tmp_path, 0, ""), (tmp_path, 1, "late"), (tmp_path, 2, "late"), (tmp_path, 3, "late")]
     cleaned: list[int] = []

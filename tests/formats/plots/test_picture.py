@@ -331,6 +331,7 @@ def test_expected_errors_are_drawn() -> None:
     assert not any("95 % of errors" in text for text in texts(many))
 
 
+@pytest.mark.slow
 def test_the_title_contains_the_solved_fraction() -> None:
     said = "\n".join(texts(draw_picture(solution(), TRUTH)))
     assert "100.0 % of the time solved" in said

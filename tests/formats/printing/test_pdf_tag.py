@@ -355,6 +355,7 @@ def test_paper_is_turned_where_that_saves_pages() -> None:
     assert page.size_mm == (225.0, 150.0)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn_is_refused() -> None:
     large = Tags(order=5, magnets=8)
     wanted = some(large, 1)

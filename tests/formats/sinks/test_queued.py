@@ -33,6 +33,7 @@ def test_all_messages_arrive_in_order(live: ModuleType, sink: Any) -> None:
     assert status.address == "test://host:1"
 
 
+@pytest.mark.slow
 def test_slow_receiver_gets_newest_poses_and_all_events(live: ModuleType, sink: Any) -> None:
     sink.open(SinkContext("dots"))
     sink.gate.clear()
