@@ -6,6 +6,7 @@ All positions are in closed form, so that a simulator can evaluate any time.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Protocol
 
 import numpy as np
@@ -217,7 +218,26 @@ class RobotPath(Protocol):
         ...
 
 
-class DrivenPath:
+class UprightPath(ABC):
+    """Orientation of a robot that turns about the vertical only; see :class:`RobotPath`."""
+
+    @abstractmethod
+    def heading(self, time_s: Array) -> Array:
+        """Return headings (...) in radians at times (...)."""
+
+    def quaternion(self, time_s: Array) -> Array:
+        """Return orientations (..., 4) as (x, y, z, w) at times (...)."""
+        return quaternion_from_heading(self.heading(time_s))
+
+    def rotate(self, vector: Array, time_s: Array) -> Array:
+        """Rotate a vector (3,) of the robot's axes at times (...) to (..., 3)."""
+        heading = self.heading(time_s)
+        cos, sin = np.cos(heading), np.sin(heading)
+        x, y, z = vector
+        return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=-1)
+
+
+class DrivenPath(UprightPath):
     """Path of a robot that drives along a :class:`ClosedCurve`; see :class:`RobotPath`.
 
     Parameters
@@ -253,17 +273,6 @@ class DrivenPath:
     def heading(self, time_s: Array) -> Array:
         """Return headings (...) in radians; on markers, that with which it will start to drive."""
         return self._curve.heading(self._start_distance_m + self._drive(time_s))
-
-    def quaternion(self, time_s: Array) -> Array:
-        """Return orientations (..., 4) as (x, y, z, w) at times (...)."""
-        return quaternion_from_heading(self.heading(time_s))
-
-    def rotate(self, vector: Array, time_s: Array) -> Array:
-        """Rotate a vector (3,) of the robot's axes at times (...) to (..., 3)."""
-        heading = self.heading(time_s)
-        cos, sin = np.cos(heading), np.sin(heading)
-        x, y, z = vector
-        return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=-1)
 
 
 class FlownPath:

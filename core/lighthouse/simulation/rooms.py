@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.errors import InputError
-from locatk.core.geometry import quaternion_from_heading, rotation_exp, wrap_angle
+from locatk.core.geometry import rotation_exp, wrap_angle
 from locatk.core.lighthouse.room import (
     MOUNTING_POSITION_SIGMA_M,
     MOUNTING_ROTATION_SIGMA_RAD,
@@ -25,6 +25,7 @@ from locatk.core.lighthouse.simulation.paths import (
     MarkerTour,
     RobotPath,
     StopAndGo,
+    UprightPath,
 )
 
 Array = NDArray[np.float64]
@@ -77,7 +78,7 @@ def mounted_stations(rng: np.random.Generator, scene: Scene) -> list[Station]:
 # ---- robots
 
 
-class RoomPath:
+class RoomPath(UprightPath):
     """Path of a robot in straight legs between random points of a room, with rests in between.
 
     See :class:`~locatk.core.lighthouse.simulation.paths.RobotPath`. It begins with a tour of the
@@ -136,17 +137,6 @@ class RoomPath:
     def heading(self, time_s: Array) -> Array:
         """Return headings (...) in radians."""
         return np.asarray(self._first_heading + self._turn(np.asarray(time_s)))
-
-    def quaternion(self, time_s: Array) -> Array:
-        """Return orientations (..., 4) as (x, y, z, w) at times (...)."""
-        return quaternion_from_heading(self.heading(time_s))
-
-    def rotate(self, vector: Array, time_s: Array) -> Array:
-        """Rotate a vector (3,) of the robot's axes at times (...) to (..., 3)."""
-        heading = self.heading(time_s)
-        cos, sin = np.cos(heading), np.sin(heading)
-        x, y, z = vector
-        return np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=-1)
 
 
 class _FreeFloor:
