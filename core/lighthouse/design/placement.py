@@ -1,15 +1,15 @@
 """Placement of base stations in a room.
 
-Stations are chosen from candidates (positions on walls, the ceiling and tripods, each with several
-directions of view) by a greedy search, improved by exchanging one station at a time, and then moved
-continuously along their mounts. The information matrices of all candidates at all points of a grid
-are computed once; those of several stations are their sums.
+Stations are chosen from candidates on the mounts by a greedy search, improved by exchanging one
+station at a time, and then moved continuously along their mounts
+(:mod:`~locatk.core.lighthouse.design.mounts`). The information matrices of all candidates at all
+points of a grid are computed once; those of several stations are their sums.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from locatk.core.lighthouse.design.accuracy import (
     variance_of,
 )
 from locatk.core.lighthouse.design.calibration_errors import calibration_sigma
+from locatk.core.lighthouse.design.mounts import StationPoses, candidates, moves, rounded
 from locatk.core.lighthouse.design.solved_accuracy import predict_solved_positions
 from locatk.core.lighthouse.design.visibility import (
     FIELD_OF_VIEW_RAD,
@@ -42,9 +43,6 @@ IntArray = NDArray[np.int64]
 MAX_STATIONS = 16
 """Channels of Lighthouse V2."""
 
-MOUNT_DEPTH_M = 0.1
-"""Distance of a rotor from the wall or the ceiling [m]: half the housing and a short bracket."""
-
 SEARCH_POINTS = 400
 """Number of points of the working volume at which placements are compared."""
 
@@ -54,9 +52,6 @@ REFINEMENT_POINTS = 1200
 COVERAGE_TOLERANCE = 0.005
 """Fraction of the working volume that may stay without coverage in favour of accuracy elsewhere:
 the last corners would cost a third of the accuracy of a 10 x 10 m room."""
-
-POSITION_DECIMALS = 2
-"""Decimals to which positions are rounded, in metres; angles are rounded to degrees."""
 
 SOLVED_POINTS = 200
 """Number of points at which accuracy in a solved scene is compared."""
@@ -71,24 +66,9 @@ MAX_PART = 250
 REFINED_STARTS = 2
 """Number of placements that are refined in solved scenes."""
 
-WALL_POSITIONS = 44
-"""Number of positions along the walls that are tried, at each height."""
-
-CEILING_POSITIONS = 25
-"""Number of positions under the ceiling that are tried."""
-
-LOW_CLEARANCE_M = 0.5
-"""Lowest mount above the highest photodiode [m], unless the room is lower: below it, robots and
-people hide the stations."""
-
-HEIGHT_FRACTIONS = (0.0, 0.5, 1.0)
-"""Heights of stations on walls, between the lowest and the highest mount."""
-
 PRIOR_SIGMA_M = 1.0
 """Standard deviation of a position before any station is seen [m]: it makes places comparable that
 are not yet determined. Covered places have errors of millimetres."""
-
-MAX_TILT_RAD = float(np.radians(90.0))
 
 REFINEMENT_STEPS = ((0.5, 0.2), (0.25, 0.1), (0.1, 0.05), (0.05, 0.02))
 """Steps of positions [m] and of angles [rad] of the refinement, one after the other."""
@@ -186,60 +166,6 @@ class RoomRequest:
         return 1 if room.is_planar else 2
 
 
-CEILING, TRIPOD = -1, -2
-"""Values of :attr:`StationPoses.wall` for stations that are not on a wall."""
-
-
-@dataclass(frozen=True)
-class StationPoses:
-    """Poses of s stations, and how they are mounted.
-
-    Attributes
-    ----------
-    position_m : (s, 3) ndarray
-    yaw_rad, tilt_rad : (s,) ndarray
-        Direction of view: its azimuth, and its angle above the horizon. There is no roll.
-    wall : (s,) int ndarray
-        Index of the edge of the outline, -1 for the ceiling and -2 for a tripod.
-    """
-
-    position_m: Array
-    yaw_rad: Array
-    tilt_rad: Array
-    wall: IntArray
-
-    def __len__(self) -> int:
-        """Return the number of stations."""
-        return len(self.yaw_rad)
-
-    @property
-    def rotation(self) -> Array:
-        """Rotations (s, 3, 3) from station to room."""
-        return view_rotation(self.yaw_rad, self.tilt_rad)
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """Kinds of the mounts of the stations, of :data:`~locatk.core.lighthouse.room.MOUNTS`."""
-        names = {CEILING: "ceiling", TRIPOD: "tripod"}
-        return tuple(names.get(wall, "wall") for wall in self.wall.tolist())
-
-    def take(self, index: Sequence[int] | IntArray) -> StationPoses:
-        """Return the stations with these indices."""
-        rows = np.asarray(index, int)
-        return StationPoses(
-            self.position_m[rows], self.yaw_rad[rows], self.tilt_rad[rows], self.wall[rows]
-        )
-
-
-def view_rotation(yaw_rad: Array, tilt_rad: Array) -> Array:
-    """Return the rotations (..., 3, 3) of stations that look to azimuths and elevations (...)."""
-    cy, sy, ct, st = np.cos(yaw_rad), np.sin(yaw_rad), np.cos(tilt_rad), np.sin(tilt_rad)
-    forward = np.stack([cy * ct, sy * ct, st], axis=-1)
-    left = np.stack([-sy, cy, np.zeros_like(cy)], axis=-1)
-    up = np.stack([-cy * st, -sy * st, ct], axis=-1)
-    return np.stack([forward, left, up], axis=-1)
-
-
 def working_points(room: Room, count: int) -> Array:
     """Return about ``count`` points (p, 3) on a regular grid in the working volume.
 
@@ -276,127 +202,6 @@ def working_points(room: Room, count: int) -> Array:
             hint="Check the working area, the heights of photodiodes and the obstacles",
         )
     return points
-
-
-def candidates(room: Room, points_m: Array) -> StationPoses:
-    """Return positions on the mounts of a room, each with several directions of view.
-
-    Parameters
-    ----------
-    room : Room
-    points_m : (p, 3) ndarray
-        Points of the working volume: the stations look to their centre and to those of their parts.
-    """
-    position, wall = _mount_positions(room)
-    targets = _targets(points_m)
-    offset = targets[None] - position[:, None]
-    across = np.hypot(offset[..., 0], offset[..., 1])
-    # The azimuth of a view straight down is arbitrary.
-    yaw = np.where(across > 1e-9, np.arctan2(offset[..., 1], offset[..., 0]), 0.0)
-    tilt = np.clip(np.arctan2(offset[..., 2], across), -MAX_TILT_RAD, MAX_TILT_RAD)
-    n = len(targets)
-    poses = StationPoses(
-        np.repeat(position, n, axis=0), yaw.ravel(), tilt.ravel(), np.repeat(wall, n)
-    )
-    down = np.flatnonzero(wall == CEILING)
-    if not len(down):
-        return poses
-    turned = np.repeat(down, 2)
-    extra = StationPoses(
-        position[turned],
-        np.tile([0.0, np.pi / 2], len(down)),
-        np.full(len(turned), -MAX_TILT_RAD),
-        wall[turned],
-    )
-    return _concatenate(poses, extra)
-
-
-def mount_heights(room: Room) -> tuple[float, float]:
-    """Return the lowest and the highest height of a station on a wall."""
-    high = room.height_m - min(MOUNT_DEPTH_M, 0.25 * room.height_m)
-    low = max(room.photodiode_z_m[1] + LOW_CLEARANCE_M, 0.5 * room.height_m)
-    return min(low, high), high
-
-
-def _mount_positions(room: Room) -> tuple[Array, IntArray]:
-    """Return the positions (n, 3) of all mounts, and their kinds as in ``StationPoses.wall``."""
-    low, high = mount_heights(room)
-    heights = np.unique(np.round([low + f * (high - low) for f in HEIGHT_FRACTIONS], 6))
-    found: list[tuple[Array, int]] = []
-    if "wall" in room.mounts:
-        lengths = np.array([length for _, _, length in _wall_frames(room)])
-        step = lengths.sum() / WALL_POSITIONS
-        for edge, (start, along, length) in enumerate(_wall_frames(room)):
-            inset = min(MOUNT_DEPTH_M, 0.5 * length)
-            number = max(2, int(np.ceil((length - 2 * inset) / step)) + 1)
-            distances = np.linspace(inset, length - inset, number)
-            if length < step:
-                # Of the short walls of a rounded outline, those at multiples of the step.
-                before = lengths[:edge].sum()
-                is_used = before // step != (before + length) // step
-                distances = np.full(int(is_used), 0.5 * length)
-            for distance in distances:
-                x, y = start + distance * along + _depth(room) * np.array([-along[1], along[0]])
-                found += [(np.array([x, y, z]), edge) for z in heights]
-    if "ceiling" in room.mounts:
-        low_xy, high_xy = room.outline_m.min(axis=0), room.outline_m.max(axis=0)
-        step = np.sqrt(abs(signed_area(room.outline_m)) / CEILING_POSITIONS)
-        cells = np.maximum(1, np.round((high_xy - low_xy) / step).astype(int))
-        x, y = (
-            low_xy[k] + (np.arange(cells[k]) + 0.5) * (high_xy[k] - low_xy[k]) / cells[k]
-            for k in (0, 1)
-        )
-        for each in np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2):
-            found.append((np.array([*each, high]), CEILING))
-    if "tripod" in room.mounts:
-        found += [(each, TRIPOD) for each in room.tripods_m]
-    position = np.array([each for each, _ in found]).reshape(-1, 3)
-    kind = np.array([edge for _, edge in found], int)
-    is_free = is_inside(room.outline_m, position[:, :2]) & ~in_obstacle(room, position)
-    if not np.any(is_free):
-        raise InputError(
-            "no station can be mounted: all mounts are outside the room or in obstacles",
-            hint="Check the outline, the obstacles and the positions of tripods",
-        )
-    return position[is_free], kind[is_free]
-
-
-def _depth(room: Room) -> float:
-    """Return the distance of stations from walls, smaller in very small rooms."""
-    return float(min(MOUNT_DEPTH_M, 0.05 * np.ptp(room.outline_m, axis=0).min()))
-
-
-def _wall_frames(room: Room) -> list[tuple[Array, Array, float]]:
-    """Return start, direction and length of each wall; the room is to its left."""
-    edges = np.roll(room.outline_m, -1, axis=0) - room.outline_m
-    lengths = np.hypot(*edges.T)
-    return [
-        (start, edge / length, float(length))
-        for start, edge, length in zip(room.outline_m, edges, lengths, strict=True)
-    ]
-
-
-def _targets(points_m: Array) -> Array:
-    """Return the centre of points, and the centres of their four quarters in plan."""
-    centre = points_m.mean(axis=0)
-    targets = [centre]
-    for right in (False, True):
-        for upper in (False, True):
-            is_part = ((points_m[:, 0] > centre[0]) == right) & (
-                (points_m[:, 1] > centre[1]) == upper
-            )
-            if np.any(is_part):
-                targets.append(points_m[is_part].mean(axis=0))
-    return np.array(targets)
-
-
-def _concatenate(first: StationPoses, second: StationPoses) -> StationPoses:
-    return StationPoses(
-        np.concatenate([first.position_m, second.position_m]),
-        np.concatenate([first.yaw_rad, second.yaw_rad]),
-        np.concatenate([first.tilt_rad, second.tilt_rad]),
-        np.concatenate([first.wall, second.wall]),
-    )
 
 
 def percentile(sigma: Array) -> float:
@@ -436,14 +241,14 @@ def seen_stations(
 
 @dataclass(frozen=True)
 class Views:
-    """What c candidates contribute at p points.
+    """Information and visibility of c candidates at p points.
 
     Attributes
     ----------
     info : (c, p, d, d) ndarray
         Information, with the noise and the calibration errors of the angles; 0 if unseen.
     is_seen : (c, p) bool ndarray
-    free : (c, p) ndarray
+    free_fraction : (c, p) ndarray
         Fraction of time in which the point receives the station: 0 if unseen, otherwise reduced by
         other robots only.
     position_m : (c, 3) ndarray
@@ -451,27 +256,32 @@ class Views:
 
     info: Array
     is_seen: NDArray[np.bool_]
-    free: Array
+    free_fraction: Array
     position_m: Array
 
     def __len__(self) -> int:
         """Return the number of candidates."""
-        return len(self.free)
+        return len(self.free_fraction)
 
     def take(self, index: Sequence[int] | IntArray) -> Views:
         """Return those of the candidates with these indices."""
         rows = np.asarray(index, int)
-        return Views(self.info[rows], self.is_seen[rows], self.free[rows], self.position_m[rows])
+        return Views(
+            self.info[rows], self.is_seen[rows], self.free_fraction[rows], self.position_m[rows]
+        )
 
+    def joined(self, other: Views) -> Views:
+        """Return the views of the candidates of both."""
+        return Views(
+            np.concatenate([self.info, other.info]),
+            np.concatenate([self.is_seen, other.is_seen]),
+            np.concatenate([self.free_fraction, other.free_fraction]),
+            np.concatenate([self.position_m, other.position_m]),
+        )
 
-def joined_views(first: Views, second: Views) -> Views:
-    """Return the views of the candidates of both."""
-    return Views(
-        np.concatenate([first.info, second.info]),
-        np.concatenate([first.is_seen, second.is_seen]),
-        np.concatenate([first.free, second.free]),
-        np.concatenate([first.position_m, second.position_m]),
-    )
+    def replaced(self, index: int, new: Views) -> Views:
+        """Return the views with that of ``new`` in place of the one with this index."""
+        return self.joined(new).take([*range(index), len(self), *range(index + 1, len(self))])
 
 
 class PlacementProblem:
@@ -532,7 +342,7 @@ class PlacementProblem:
         chunk = max(1, 200_000 // len(self.points_m))
         for first in range(0, len(costs), chunk):
             rows = slice(first, first + chunk)
-            more = state.added(views.info[rows], views.free[rows])
+            more = state.added(views.info[rows], views.free_fraction[rows])
             costs[rows] = self._costs(more.info, more.seen)
         offset = views.position_m[:, None] - stations.position_m[None]
         is_close = np.any(np.linalg.norm(offset, axis=-1) < MIN_SEPARATION_M, axis=1)
@@ -545,7 +355,7 @@ class PlacementProblem:
         seen[:, 0] = 1.0
         state = _State(np.zeros((p, self._dims, self._dims)), seen)
         for k in range(len(views)):
-            state = state.added(views.info[k], views.free[k])
+            state = state.added(views.info[k], views.free_fraction[k])
         return state
 
     def _costs(self, info: Array, seen: Array) -> Array:
@@ -570,9 +380,9 @@ class _State:
     info: Array
     seen: Array
 
-    def added(self, info: Array, free: Array) -> _State:
-        seen = self.seen * (1.0 - free[..., None])
-        seen[..., 1:] += self.seen[..., :-1] * free[..., None]
+    def added(self, info: Array, free_fraction: Array) -> _State:
+        seen = self.seen * (1.0 - free_fraction[..., None])
+        seen[..., 1:] += self.seen[..., :-1] * free_fraction[..., None]
         return _State(self.info + info, seen)
 
 
@@ -665,75 +475,28 @@ def refine(
 ) -> StationPoses:
     """Move stations along their mounts, and turn them, as long as the cost falls.
 
-    A station on a wall moves along it and in height, one under the ceiling in both horizontal
-    directions; one on a tripod turns only. ``fixed`` are the views of stations that stay.
+    ``fixed`` are the views of stations that stay.
     """
     views = problem.views(poses)
     if fixed is not None:
-        views = joined_views(views, fixed)
+        views = views.joined(fixed)
     cost = problem.cost(views)
     for length_m, angle_rad in REFINEMENT_STEPS:
         for _ in range(MAX_REFINEMENT_ROUNDS):
             before = cost
             for k in range(len(poses)):
                 others = views.take([i for i in range(len(views)) if i != k])
-                moves = _moves(problem.room, poses.take([k]), length_m, angle_rad)
-                seen = problem.views(moves)
+                steps = moves(problem.room, poses.take([k]), length_m, angle_rad)
+                seen = problem.views(steps)
                 costs = problem.costs_with(others, seen)
                 best = int(np.argmin(costs))
                 if costs[best] < cost:
                     cost = float(costs[best])
-                    poses = _replaced(poses, k, moves.take([best]))
-                    views = _with_view(views, k, seen.take([best]))
+                    poses = poses.replaced(k, steps.take([best]))
+                    views = views.replaced(k, seen.take([best]))
             if not cost < before * (1 - 1e-3):
                 break
     return poses
-
-
-def _replaced(poses: StationPoses, k: int, new: StationPoses) -> StationPoses:
-    order = [*range(k), len(poses), *range(k + 1, len(poses))]
-    return _concatenate(poses, new).take(order)
-
-
-def _with_view(views: Views, k: int, new: Views) -> Views:
-    info, is_seen, free = views.info.copy(), views.is_seen.copy(), views.free.copy()
-    position_m = views.position_m.copy()
-    info[k], is_seen[k], free[k] = new.info[0], new.is_seen[0], new.free[0]
-    position_m[k] = new.position_m[0]
-    return Views(info, is_seen, free, position_m)
-
-
-def _moves(room: Room, pose: StationPoses, length_m: float, angle_rad: float) -> StationPoses:
-    """Return the poses one step from that of a station."""
-    wall = int(pose.wall[0])
-    low, high = mount_heights(room)
-    shifts = np.zeros((0, 3))
-    if wall >= 0:
-        along = np.array([*_wall_frames(room)[wall][1], 0.0])
-        shifts = length_m * np.array([along, -along, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    elif wall == CEILING:
-        shifts = length_m * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
-    position = pose.position_m + shifts
-    position[:, 2] = np.clip(position[:, 2], low, high) if wall >= 0 else position[:, 2]
-    if wall >= 0:
-        start, direction, length = _wall_frames(room)[wall]
-        inset = min(MOUNT_DEPTH_M, 0.5 * length)
-        distance = np.clip((position[:, :2] - start) @ direction, inset, length - inset)
-        inwards = np.array([-direction[1], direction[0]])
-        position[:, :2] = start + distance[:, None] * direction + _depth(room) * inwards
-    is_free = is_inside(room.outline_m, position[:, :2]) & ~in_obstacle(room, position)
-    position = position[is_free]
-    n = len(position)
-    yaw, tilt = float(pose.yaw_rad[0]), float(pose.tilt_rad[0])
-    moved = StationPoses(position, np.full(n, yaw), np.full(n, tilt), np.full(n, wall))
-    turns = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]) * angle_rad
-    turned = StationPoses(
-        np.repeat(pose.position_m, 4, axis=0),
-        yaw + turns[:, 0],
-        np.clip(tilt + turns[:, 1], -MAX_TILT_RAD, MAX_TILT_RAD),
-        np.full(4, wall),
-    )
-    return _concatenate(moved, turned)
 
 
 def place_stations(
@@ -753,7 +516,7 @@ def place_stations(
     found = refine(PlacementProblem(problem.room, problem.request, fine), found)
     effort = SOLVED_EVALUATIONS if evaluations is None else evaluations
     part = min(effort // (len(found) ** 2 * (1 + REFINED_STARTS)), MAX_PART)
-    function = SolvedCost(problem.room, problem.request)
+    solved_cost = SolvedCost(problem.room, problem.request)
     useful = np.flatnonzero(np.any(views.is_seen, axis=1))
     random = np.random.default_rng(0)
     starts = [found]
@@ -761,20 +524,20 @@ def place_stations(
         start = poses.take(random.choice(useful, count, replace=False))
         if is_separated(start.position_m):
             starts.append(start)
-    costs = [function(start) for start in starts]
+    costs = [solved_cost(start) for start in starts]
     order = np.argsort(costs, kind="stable")[:REFINED_STARTS]
-    refined = [refine_solved(problem.room, function, starts[k], part) for k in order]
-    return rounded(min(refined, key=function))
+    refined = [refine_solved(problem.room, solved_cost, starts[k], part) for k in order]
+    return rounded(min(refined, key=solved_cost))
 
 
 def refine_solved(
-    room: Room, function: SolvedCost, poses: StationPoses, evaluations: int
+    room: Room, solved_cost: SolvedCost, poses: StationPoses, evaluations: int
 ) -> StationPoses:
     """Move and turn stations as long as positions in the solved scene become more accurate.
 
     At most about ``evaluations`` placements are compared.
     """
-    cost = function(poses)
+    cost = solved_cost(poses)
     for length_m, angle_rad in REFINEMENT_STEPS:
         improves = True
         while improves:
@@ -782,11 +545,11 @@ def refine_solved(
             for k in range(len(poses)):
                 if evaluations <= 0:
                     return poses
-                moves = _moves(room, poses.take([k]), length_m, angle_rad)
-                options = [_replaced(poses, k, moves.take([i])) for i in range(len(moves))]
+                steps = moves(room, poses.take([k]), length_m, angle_rad)
+                options = [poses.replaced(k, steps.take([i])) for i in range(len(steps))]
                 options = [each for each in options if is_separated(each.position_m)]
                 evaluations -= len(options)
-                costs = [function(each) for each in options]
+                costs = [solved_cost(each) for each in options]
                 if costs and min(costs) < cost * (1 - 1e-3):
                     cost = min(costs)
                     poses = options[costs.index(cost)]
@@ -853,16 +616,6 @@ class SolvedCost:
         return np.where(is_covered, accuracy.sigma_m, np.inf)
 
 
-def rounded(poses: StationPoses) -> StationPoses:
-    """Return poses in centimetres and degrees, which can be measured by hand."""
-    return replace(
-        poses,
-        position_m=np.round(poses.position_m, POSITION_DECIMALS),
-        yaw_rad=np.radians(np.round(np.degrees(poses.yaw_rad))),
-        tilt_rad=np.radians(np.round(np.degrees(poses.tilt_rad))),
-    )
-
-
 def is_separated(position_m: Array) -> bool:
     """Return True if no two positions (s, 3) are closer than :data:`MIN_SEPARATION_M`."""
     offset = position_m[:, None] - position_m[None]
@@ -885,12 +638,3 @@ def grow_placements(problem: PlacementProblem) -> Iterator[StationPoses]:
             return
         chosen, _ = exchange(problem, views, extended, max_rounds=1)
         yield poses.take(chosen)
-
-
-def ordered(room: Room, poses: StationPoses) -> StationPoses:
-    """Return stations counter-clockwise around the room, so that channels are easy to find."""
-    centre = 0.5 * (room.outline_m.min(axis=0) + room.outline_m.max(axis=0))
-    offset = poses.position_m[:, :2] - centre
-    # From the corner at the smallest x and y on, as the outline of a rectangle.
-    angle = (np.arctan2(offset[:, 1], offset[:, 0]) + 0.75 * np.pi + 1e-3) % (2 * np.pi)
-    return replace(poses.take(np.argsort(angle, kind="stable")))

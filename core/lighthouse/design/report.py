@@ -15,16 +15,14 @@ from locatk.core.lighthouse.design.accuracy import (
     predict_poses,
     predict_positions,
 )
+from locatk.core.lighthouse.design.mounts import MOUNT_DEPTH_M, candidates, rounded
 from locatk.core.lighthouse.design.placement import (
     MAX_STATIONS,
-    MOUNT_DEPTH_M,
     SEARCH_POINTS,
     PlacementProblem,
     RoomRequest,
     SolvedCost,
-    candidates,
     percentile,
-    rounded,
     seen_stations,
     working_points,
 )
@@ -248,11 +246,11 @@ def best_addition(scene: Scene, room: Room, request: RoomRequest) -> Addition | 
     poses = candidates(room, problem.points_m)
     costs = problem.costs_with(problem.views_of(position, rotation), problem.views(poses))
     order = np.argsort(costs, kind="stable")[:COMPARED_ADDITIONS]
-    function = SolvedCost(room, request)
+    solved_cost = SolvedCost(room, request)
 
     def rank(positions: Array, rotations: Array) -> tuple[float, float]:
-        uncovered = function.uncovered_fraction(positions, rotations)
-        sigma_m = percentile(function.sigmas(positions, rotations))
+        uncovered = solved_cost.uncovered_fraction(positions, rotations)
+        sigma_m = percentile(solved_cost.sigmas(positions, rotations))
         return max(uncovered, NEGLIGIBLE_FRACTION), sigma_m
 
     ranks = [

@@ -9,14 +9,13 @@ import numpy as np
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.design.markers import propose_markers
+from locatk.core.lighthouse.design.mounts import StationPoses, ordered
 from locatk.core.lighthouse.design.placement import (
     SOLVED_EVALUATIONS,
     PlacementProblem,
     RoomRequest,
     SolvedCost,
-    StationPoses,
     grow_placements,
-    ordered,
     percentile,
     place_stations,
 )
@@ -183,12 +182,12 @@ def _smallest_design(problem: PlacementProblem) -> RoomDesign:
     room, request = problem.room, problem.request
     accuracy_m = request.accuracy_m
     assert accuracy_m is not None  # checked by the request
-    function = SolvedCost(room, request)
+    solved_cost = SolvedCost(room, request)
     best: RoomDesign | None = None
     best_count, best_sigma_m = 0, np.inf
     for poses in grow_placements(problem):
         count = len(poses)
-        sigma_m = percentile(function.sigmas(poses.position_m, poses.rotation))
+        sigma_m = percentile(solved_cost.sigmas(poses.position_m, poses.rotation))
         if not sigma_m >= best_sigma_m or np.isinf(best_sigma_m):
             best_count, best_sigma_m = count, sigma_m
         # The search improves what was grown; with little effort first.

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from locatk.core.lighthouse.design import RoomRequest, design_room
+from locatk.core.lighthouse.design.mounts import candidates
 from locatk.core.lighthouse.design.placement import (
     PlacementProblem,
     Views,
-    candidates,
     choose_stations,
     is_separated,
     refine,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from locatk.cli import console
-from locatk.core.lighthouse.design import placement
+from locatk.core.lighthouse.design import mounts, placement
 from locatk.formats.artifacts.scene import read_scene
 
 
@@ -17,8 +17,8 @@ from locatk.formats.artifacts.scene import read_scene
 def _short_search() -> Iterator[None]:
     """Compare few candidates: the search has tests of its own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(placement, "WALL_POSITIONS", 8)
-        patch.setattr(placement, "CEILING_POSITIONS", 4)
+        patch.setattr(mounts, "WALL_POSITIONS", 8)
+        patch.setattr(mounts, "CEILING_POSITIONS", 4)
         patch.setattr(placement, "SEARCH_POINTS", 80)
         patch.setattr(placement, "REFINEMENT_POINTS", 200)
         patch.setattr(placement, "SEARCH_BUDGET", 1)

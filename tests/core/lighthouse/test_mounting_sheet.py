@@ -10,7 +10,7 @@ import pytest
 
 from locatk.core.drawing import Circle, Group, Line, Page, Polygon, Text
 from locatk.core.errors import InputError
-from locatk.core.lighthouse.design.placement import view_rotation
+from locatk.core.lighthouse.design.mounts import view_rotation
 from locatk.core.lighthouse.design.report import station_of
 from locatk.core.lighthouse.drawing.mounting_sheet import (
     draw_mounting_sheet,

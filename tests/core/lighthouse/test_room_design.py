@@ -23,17 +23,17 @@ from locatk.core.lighthouse.design import (
     bill_of_materials,
     check_room,
     design_room,
+    mounts,
     placement,
 )
 from locatk.core.lighthouse.design.calibration_errors import calibration_sigma
+from locatk.core.lighthouse.design.mounts import candidates, view_rotation
 from locatk.core.lighthouse.design.placement import (
     MIN_SEPARATION_M,
     PlacementProblem,
-    candidates,
     choose_stations,
     is_separated,
     refine,
-    view_rotation,
     working_points,
 )
 from locatk.core.lighthouse.design.report import report_room, station_of
@@ -56,8 +56,8 @@ L_ROOM = Room(
 def _short_search() -> Iterator[None]:
     """Compare fewer candidates and places: the promises are those of any search."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(placement, "WALL_POSITIONS", 16)
-        patch.setattr(placement, "CEILING_POSITIONS", 6)
+        patch.setattr(mounts, "WALL_POSITIONS", 16)
+        patch.setattr(mounts, "CEILING_POSITIONS", 6)
         patch.setattr(placement, "SEARCH_POINTS", 150)
         patch.setattr(placement, "REFINEMENT_POINTS", 500)
         patch.setattr(placement, "SEARCH_BUDGET", 2_000_000)

@@ -10,7 +10,7 @@ from matplotlib.collections import QuadMesh
 
 from locatk.core.errors import InputError
 from locatk.core.lighthouse.design import check_room
-from locatk.core.lighthouse.design.placement import view_rotation
+from locatk.core.lighthouse.design.mounts import view_rotation
 from locatk.core.lighthouse.design.report import station_of
 from locatk.core.lighthouse.room import Obstacle, Room
 from locatk.core.lighthouse.scene import Scene
