@@ -15,6 +15,9 @@ from locatk.core.units import length_text
 MAX_LEVEL = 255.0
 """Grey value of a saturated pixel of 8 bits."""
 
+MAX_QUANTITY = 1e4
+"""Limit of speeds [m/s, rad/s], jitter, blur and errors of the distance [m]."""
+
 MAX_SIDE_M = 10.0
 """Larger distances are probably in another unit."""
 
@@ -164,10 +167,18 @@ class CameraSetup:
         _require(self, 0, 1, "contrast")
         _require(self, 0, 1e-5, "wavelength_m", unit="nm", scale=1e9)
         _require(self, 0, 1e5, "wanted_rate_hz")
-        for name in ("speed_mps", "yaw_rate_rps", "jitter_m", "lens_blur_m", "focus_error_m"):
-            if not 0 <= getattr(self, name) < 1e4:
+        for name, quantity, scale, unit in (
+            ("speed_mps", "speed", 1.0, "m/s"),
+            ("yaw_rate_rps", "rate of rotation", 180 / math.pi, "deg/s"),
+            ("jitter_m", "jitter of the dots", 1e6, "um"),
+            ("lens_blur_m", "blur of the lens", 1e6, "um"),
+            ("focus_error_m", "error of the distance", 1e3, "mm"),
+        ):
+            value = getattr(self, name)
+            if not 0 <= value < MAX_QUANTITY:
                 raise InputError(
-                    f"{name.replace('_', ' ')} is {getattr(self, name):g}", hint="Give at least 0"
+                    f"the {quantity} is {value * scale:g} {unit}",
+                    hint=f"Give at least 0, below {MAX_QUANTITY * scale:g} {unit}",
                 )
         if self.illuminance_lx is not None:
             _require(self, 0, 1e7, "illuminance_lx")

@@ -208,17 +208,20 @@ class Exposer:
         """Return the fraction of each subpixel that discs cover, with the margin."""
         canvas = np.zeros(self._shape[0] * self._shape[1], np.float32)
         to_frame = np.linalg.inv(to_paper).astype(float)
+        # Discs beside and behind a tilted camera are not in the frame; their images are infinite.
+        depths = (centres @ to_frame[2, :2]) / to_frame[2, 2] + 1
+        reach = 2 * radii * np.linalg.norm(to_frame[2, :2] / to_frame[2, 2])
+        is_before = depths > reach
+        centres, radii = centres[is_before], radii[is_before]
         positions, px_per_m = self._project(to_frame, centres)
         scale = self.optics.metres_per_px
-        radius_px = float(radii.max(initial=0.0)) * px_per_m.max(initial=0.0) + 0.25
-        half_width = int(np.ceil(SUBPIXELS_PER_PX * radius_px)) + 1
+        half_widths = np.ceil(SUBPIXELS_PER_PX * (radii * px_per_m + 0.25)) + 1
         positions = (positions + self._margin + 0.5) * SUBPIXELS_PER_PX - 0.5
         rows, columns = self._shape
-        with np.errstate(invalid="ignore"):
-            is_inside = (
-                (positions > -half_width) & (positions < (columns + half_width, rows + half_width))
-            ).all(axis=1)
+        far = np.array([columns, rows]) + half_widths[:, None]
+        is_inside = ((positions > -half_widths[:, None]) & (positions < far)).all(axis=1)
         positions, centres, radii = positions[is_inside], centres[is_inside], radii[is_inside]
+        half_width = int(half_widths[is_inside].max(initial=1.0))
 
         # Indices are clipped to the canvas, so that subpixels of its edge may occur twice.
         window = np.arange(-half_width, half_width + 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
 
 import cv2
@@ -212,8 +213,8 @@ def test_too_much_light_and_too_short_an_exposure() -> None:
         ({"exposure_s": math.nan}, "exposure is nan"),
         ({"tilt_rad": 2.0}, "a tilt of 114.592 degrees"),
         ({"binning": 0}, "a binning of 0"),
-        ({"speed_mps": -1.0}, "speed mps is -1"),
-        ({"jitter_m": math.nan}, "jitter m is nan"),
+        ({"speed_mps": -1.0}, "the speed is -1 m/s"),
+        ({"jitter_m": math.nan}, "the jitter of the dots is nan um"),
         ({"noise_levels": 300.0}, "a noise of 300"),
         ({"dot_pitches": 0.7}, "dot pitches is 0.7"),
     ],
@@ -239,6 +240,16 @@ def test_sensors_and_lenses_out_of_range() -> None:
 
 
 # ---- against rendered frames
+
+
+def test_frames_at_the_largest_tilt_need_little_memory() -> None:
+    """Dots beside a tilted camera have infinite images, which must not be allocated."""
+    tracemalloc.start()
+    measured = measure_camera(suggest_camera(SENSORS[0], tilt_rad=math.pi / 4), 2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert measured.read_rate == 1.0
+    assert peak < 200e6
 
 
 def test_the_predictor_does_not_load_the_simulator() -> None:
