@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from locatk.core.dots.design import camera_measurement
+from locatk.core.dots.design.camera_measurement import CameraMeasurement
+from locatk.core.dots.design.camera_setup import CameraSetup
+from locatk.core.errors import InputError
 from locatk.formats.artifacts.cameras import CAMERAS
 
 PAPER = ("--sensor", "mt9v034-binned", "--focal-length", 5.5, "--distance", 16.0417)
@@ -54,6 +58,37 @@ def test_motion_that_cannot_be_rendered_is_predicted(locatk) -> None:
     report = json.loads(result.stdout)
     assert report["rendered"] is None
     assert report["figures"]["read_rate"] < 0.01
+
+
+def test_few_frames_are_rendered_if_motion_makes_them_slow(
+    locatk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered = []
+
+    def count(setup: CameraSetup, frames: int, seed: int) -> CameraMeasurement:
+        rendered.append(frames)
+        raise InputError("not rendered")
+
+    monkeypatch.setattr(camera_measurement, "measure_camera", count)
+    for speed in (0.3, 300):
+        locatk("camera", "design", *PAPER, "--speed", speed)
+    assert rendered == [40, 2]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--speed", 1e9, "the speed is 1e+09 m/s. Hint: Give at least 0, below 10000 m/s"),
+        ("--focus-error", 1e9, "the error of the distance is 1e+09 mm"),
+        ("--turn-rate", 1e9, "the rate of rotation is 1e+09 deg/s"),
+    ],
+)
+def test_limits_are_stated_with_the_units_of_the_options(
+    locatk, option: str, value: float, message: str
+) -> None:
+    result = locatk("camera", "design", option, value)
+    assert result.exit_code == 1
+    assert message in " ".join(result.stderr.split())
 
 
 def test_own_table_of_sensors(locatk, tmp_path: Path) -> None:
