@@ -111,9 +111,21 @@ def search_bars(
     -------
     tuple of BarOption
         One for each of the bars, feasible ones first, then as given.
+
+    Raises
+    ------
+    InputError
+        A number is not positive, or even the smallest bars of neighbouring landmarks overlap.
     """
     if not (pitch_m > 0 and wanted_position_m > 0):
         raise InputError("a pitch or an accuracy of 0 or less", hint="Give numbers above 0")
+    bars_m = tuple(bars_m)
+    least_m = min((2 * _radius_m(length, width) + width for length, width, _ in bars_m), default=0)
+    if pitch_m < least_m - 1e-9:
+        raise InputError(
+            f"bars of neighbouring landmarks overlap at a pitch of {length_text(pitch_m)}",
+            hint=f"Give at least {length_text(least_m)}",
+        )
     options = []
     for length, width, thickness in bars_m:
         tried = []
@@ -123,8 +135,7 @@ def search_bars(
                 bar_width_m=width,
                 bar_height_m=thickness,
                 remanence_t=remanence_t,
-                # The ends of neighbouring bars touch at the corners if they are closer.
-                radius_m=max(DEFAULT_RADIUS_M, (length + width) / 2),
+                radius_m=_radius_m(length, width),
                 sensor_height_m=height_m,
                 circle_m=circle_m,
                 threshold_t=THRESHOLD_PER_VOLUME * remanence_t * length * width * thickness,
@@ -141,6 +152,11 @@ def search_bars(
         options.append(_option_of(tried, pitch_m, wanted_position_m, wanted_heading_rad))
         progress()
     return tuple(sorted(options, key=lambda option: not option.is_feasible))
+
+
+def _radius_m(length_m: float, width_m: float) -> float:
+    """Return the radius at which the ends of neighbouring bars do not touch at the corners."""
+    return max(DEFAULT_RADIUS_M, (length_m + width_m) / 2)
 
 
 def _option_of(

@@ -49,3 +49,9 @@ def test_bars_far_below_the_sensors_are_too_weak() -> None:
 def test_impossible_wishes_are_refused(wrong: tuple[float, float]) -> None:
     with pytest.raises(InputError, match="accuracy"):
         search_bars(*wrong)
+
+
+def test_a_pitch_at_which_all_bars_overlap_is_refused() -> None:
+    with pytest.raises(InputError, match="overlap at a pitch of 1 mm") as raised:
+        search_bars(1e-3, 8e-3, bars_m=[DEFAULT_BAR, (40e-3, 12e-3, 5e-3)])
+    assert raised.value.hint == "Give at least 60 mm"
