@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 MAX_LENGTH_MM = 1e6
 
+MIN_EXTENT_MM = 10.0
+"""Least sides of a working area, and least difference of the heights of --volume: shorter ones are
+lengths in metres."""
+
 _NUMBER = r"[0-9]+(?:\.[0-9]*)?|\.[0-9]+"
 _SIGNED = rf"-?(?:{_NUMBER})"
 
@@ -390,22 +394,69 @@ def changed_room(
     if floor is not None:
         changes["photodiode_z_m"] = (metres(floor), metres(floor))
     if volume is not None:
+        if 0 <= volume[1] - volume[0] < MIN_EXTENT_MM:
+            raise InputError(
+                f"--volume from {volume[0]:g} to {volume[1]:g} mm is flat",
+                hint="Heights are in mm; a plane is --floor",
+            )
         changes["photodiode_z_m"] = (metres(volume[0]), metres(volume[1]))
     if area is not None:
+        if min(area[2:]) < MIN_EXTENT_MM:
+            raise InputError(
+                f"--area of {area[2]:g} x {area[3]:g} mm", hint="Positions and sizes are in mm"
+            )
+        _check_inside("--area", room, area[0], area[1], area[0] + area[2], area[1] + area[3])
         x, y, length, width = map(metres, area)
         changes["area_m"] = rectangle(length, width, (x, y))
     if obstacles:
         more = []
         for count, each in enumerate(obstacles, len(room.obstacles) + 1):
+            _check_overlap("--obstacle", room, *each[:4])
             x, y, length, width, top = map(metres, each)
             more.append(Obstacle(rectangle(length, width, (x, y)), 0.0, top, f"obstacle {count}"))
         changes["obstacles"] = (*room.obstacles, *more)
     if robots is not None:
         radius, height = (100.0, 100.0) if robot_size is None else robot_size
         changes["robots"] = RobotSize(robots, metres(radius), metres(height))
+    for each in tripods:
+        _check_inside("--tripod", room, each[0], each[1], each[0], each[1])
+        if metres(each[2]) > room.height_m:
+            raise InputError(
+                f"--tripod at a height of {each[2]:g} mm in a room of {1e3 * room.height_m:g} mm",
+                hint="Positions are in mm, and below the ceiling",
+            )
     if tripods:
         changes["tripods_m"] = np.array([[metres(v) for v in each] for each in tripods])
         changes["mounts"] = (*room.mounts, *(("tripod",) if "tripod" not in room.mounts else ()))
     if mounts is not None:
         changes["mounts"] = mounts
     return replace(room, **changes)
+
+
+def _bounds_mm(room: Room) -> tuple[float, float, float, float]:
+    """Return x and y of the lower left and of the upper right corner around a room."""
+    low, high = 1e3 * room.outline_m.min(axis=0), 1e3 * room.outline_m.max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _check_inside(name: str, room: Room, x0: float, y0: float, x1: float, y1: float) -> None:
+    """Raise an error unless a rectangle in mm is within the bounds of a room."""
+    low_x, low_y, high_x, high_y = _bounds_mm(room)
+    slack = 1.0
+    if x0 < low_x - slack or y0 < low_y - slack or x1 > high_x + slack or y1 > high_y + slack:
+        raise _outside(name, room)
+
+
+def _check_overlap(name: str, room: Room, x: float, y: float, length: float, width: float) -> None:
+    """Raise an error if a rectangle in mm is wholly outside the bounds of a room."""
+    low_x, low_y, high_x, high_y = _bounds_mm(room)
+    if x > high_x or y > high_y or x + length < low_x or y + width < low_y:
+        raise _outside(name, room)
+
+
+def _outside(name: str, room: Room) -> InputError:
+    low_x, low_y, high_x, high_y = _bounds_mm(room)
+    return InputError(
+        f"{name} is outside the room: x {low_x:g} to {high_x:g}, y {low_y:g} to {high_y:g} mm",
+        hint="Positions and sizes are in mm",
+    )
