@@ -108,8 +108,8 @@ def command(
         write_room_maps(maps, replace(scene, room=used), report, overwrite=overwrite)
         console.result(f"Wrote {maps}\n")
     lines = [*room_text.room_lines(used), *room_text.report_lines(report, heading)]
-    places = [room_text.place_text(report, index) for index in report.worst_places]
-    lines += [("worst places" if n == 0 else "", place) for n, place in enumerate(places)]
+    points = [room_text.point_text(report, index) for index in report.worst_points]
+    lines += [("worst places" if n == 0 else "", text) for n, text in enumerate(points)]
     lines.append(
         (
             "best addition",

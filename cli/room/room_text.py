@@ -93,7 +93,7 @@ def marker_text(markers: Sequence[Marker]) -> str:
     )
 
 
-def place_text(report: RoomReport, index: int) -> str:
+def point_text(report: RoomReport, index: int) -> str:
     """Return position, stations in view and sigma of a place in words."""
     x, y, z = (f"{value:.1f}" for value in report.points_m[index])
     count = int(report.stations_seen[index])
@@ -140,7 +140,7 @@ def report_entry(report: RoomReport) -> dict[str, Any]:
                 "stations_seen": int(report.stations_seen[index]),
                 "covered": bool(report.is_covered[index]),
             }
-            for index in report.worst_places
+            for index in report.worst_points
         ],
         "notes": report.notes,
         "warnings": report.warnings,

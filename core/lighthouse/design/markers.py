@@ -1,4 +1,4 @@
-"""Places on the floor of a room that are marked and measured, so that they fix frame and scale."""
+"""Points on the floor of a room that are marked and measured, so that they fix frame and scale."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ ROUNDING_M = 0.05
 
 
 def propose_markers(room: Room, points_m: Array) -> tuple[Marker, ...]:
-    """Return markers far from each other at places that are covered.
+    """Return markers far from each other at points that are covered.
 
     Parameters
     ----------
     room : Room
     points_m : (p, 3) ndarray
-        Places of photodiodes that stations locate.
+        Points of photodiodes that stations locate.
 
     Returns
     -------
@@ -36,21 +36,21 @@ def propose_markers(room: Room, points_m: Array) -> tuple[Marker, ...]:
     """
     low_m = room.photodiode_z_m[0]
     lowest = points_m[points_m[:, 2] <= points_m[:, 2].min(initial=np.inf) + 1e-9, :2]
-    places = np.unique(np.round(lowest / ROUNDING_M) * ROUNDING_M, axis=0)
+    positions = np.unique(np.round(lowest / ROUNDING_M) * ROUNDING_M, axis=0)
     outlines = [room.outline_m, room.working_outline_m, *(o.outline_m for o in room.obstacles)]
     for outline in outlines:
-        places = places[_distance_m(outline, places) >= WALL_DISTANCE_M]
-    if not len(places):
+        positions = positions[_distance_m(outline, positions) >= WALL_DISTANCE_M]
+    if not len(positions):
         return ()
     # The first is the farthest from the middle; each further one the farthest from the others.
-    gap = np.linalg.norm(places - places.mean(axis=0), axis=1)
+    gap = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
     chosen: list[int] = []
-    while len(chosen) < min(MARKERS, len(places)):
+    while len(chosen) < min(MARKERS, len(positions)):
         chosen.append(int(np.argmax(gap)))
-        distance = np.linalg.norm(places - places[chosen[-1]], axis=1)
+        distance = np.linalg.norm(positions - positions[chosen[-1]], axis=1)
         gap = distance if len(chosen) == 1 else np.minimum(gap, distance)
     return tuple(
-        Marker(f"marker-{number}", np.append(np.round(places[index], 3), low_m))
+        Marker(f"marker-{number}", np.append(np.round(positions[index], 3), low_m))
         for number, index in enumerate(chosen, 1)
     )
 

@@ -67,14 +67,14 @@ REFINED_STARTS = 2
 """Number of placements that are refined in solved scenes."""
 
 PRIOR_SIGMA_M = 1.0
-"""Standard deviation of a position before any station is seen [m]: it makes places comparable that
-are not yet determined. Covered places have errors of millimetres."""
+"""Standard deviation of a position before any station is seen [m]: it makes points comparable that
+are not yet determined. Covered points have errors of millimetres."""
 
 REFINEMENT_STEPS = ((0.5, 0.2), (0.25, 0.1), (0.1, 0.05), (0.05, 0.02))
 """Steps of positions [m] and of angles [rad] of the refinement, one after the other."""
 
 UNDETERMINED_SIGMA_M = 0.25
-"""Standard deviation from which on a place counts as not covered, however many stations it sees:
+"""Standard deviation from which on a point counts as not covered, however many stations it sees:
 they are at almost the same position or in line with it."""
 
 TYPICAL_ROUNDS = 3
@@ -84,7 +84,7 @@ MAX_REFINEMENT_ROUNDS = 20
 """Largest number of rounds over all stations with one step."""
 
 SHORTFALL_WEIGHT_M = 1e3
-"""Cost of a place without the wanted stations, relative to errors in metres: coverage is first."""
+"""Cost of a point without the wanted stations, relative to errors in metres: coverage is first."""
 
 PERCENTILE = 95.0
 """Percentile of the standard deviations that the criterion ``worst`` compares."""
@@ -113,11 +113,11 @@ class RoomRequest:
     stations : int or None
         Number of stations, 1 to 16; None for the smallest number that reaches ``accuracy_m``.
     accuracy_m : float or None
-        Largest standard deviation of positions at 95 % of the places.
+        Largest standard deviation of positions at 95 % of the points.
     criterion : str
         ``"worst"`` minimises the 95th percentile of the standard deviations, ``"mean"`` their mean.
     min_seen : int or None
-        Number of stations that each place must see; None for 1 if the room is planar, otherwise 2.
+        Number of stations that each point must see; None for 1 if the room is planar, otherwise 2.
     facing : str
         ``"up"`` for photodiodes that receive light from above only, ``"all"`` from everywhere.
     max_range_m : float
@@ -160,7 +160,7 @@ class RoomRequest:
             )
 
     def seen_by(self, room: Room) -> int:
-        """Return the number of stations that each place of a room must see."""
+        """Return the number of stations that each point of a room must see."""
         if self.min_seen is not None:
             return self.min_seen
         return 1 if room.is_planar else 2
@@ -285,14 +285,14 @@ class Views:
 
 
 class PlacementProblem:
-    """Cost of stations in a room: places without enough stations first, then standard deviations.
+    """Cost of stations in a room: points without enough stations first, then standard deviations.
 
     Parameters
     ----------
     room : Room
     request : RoomRequest
     points_m : (p, 3) ndarray, optional
-        Places that are compared.
+        Points that are compared.
 
     Attributes
     ----------
@@ -411,22 +411,13 @@ def choose_stations(problem: PlacementProblem, views: Views, count: int) -> list
     random = np.random.default_rng(0)
     steps = views.is_seen.size * count * (1 + TYPICAL_ROUNDS)
     searches = int(np.clip(SEARCH_BUDGET // steps, 1, MAX_STARTS))
-    best: tuple[float, list[int]] | None = None
-    for search in range(searches):
-        chosen: list[int] = []
-        if search:
-            chosen = random.choice(len(views), min(count, len(views)), replace=False).tolist()
-            chosen = _separated(views, chosen)
-        while len(chosen) < count:
-            extended = extend(problem, views, chosen)
-            if len(extended) == len(chosen):
-                break
-            chosen = extended
-        chosen, cost = exchange(problem, views, chosen)
-        if best is None or (-len(chosen), cost) < (-len(best[1]), best[0]):
-            best = cost, chosen
-    assert best is not None  # there is at least one search
-    return best[1]
+    starts: list[list[int]] = [[]]
+    for _ in range(searches - 1):
+        start = random.choice(len(views), min(count, len(views)), replace=False).tolist()
+        starts.append(_separated(views, start))
+    found = [exchange(problem, views, _filled(problem, views, start, count)) for start in starts]
+    chosen, _ = min(found, key=lambda each: (-len(each[0]), each[1]))
+    return chosen
 
 
 def _separated(views: Views, chosen: list[int]) -> list[int]:
@@ -444,6 +435,16 @@ def extend(problem: PlacementProblem, views: Views, chosen: list[int]) -> list[i
     costs = problem.costs_with(views.take(chosen), views)
     best = int(np.argmin(costs))
     return [*chosen, best] if np.isfinite(costs[best]) else chosen
+
+
+def _filled(problem: PlacementProblem, views: Views, chosen: list[int], count: int) -> list[int]:
+    """Return ``chosen`` extended to ``count`` candidates, or to as many as have space."""
+    while len(chosen) < count:
+        extended = extend(problem, views, chosen)
+        if len(extended) == len(chosen):
+            break
+        chosen = extended
+    return chosen
 
 
 def exchange(
@@ -470,16 +471,9 @@ def exchange(
     return chosen, cost
 
 
-def refine(
-    problem: PlacementProblem, poses: StationPoses, fixed: Views | None = None
-) -> StationPoses:
-    """Move stations along their mounts, and turn them, as long as the cost falls.
-
-    ``fixed`` are the views of stations that stay.
-    """
+def refine(problem: PlacementProblem, poses: StationPoses) -> StationPoses:
+    """Move stations along their mounts, and turn them, as long as the cost falls."""
     views = problem.views(poses)
-    if fixed is not None:
-        views = views.joined(fixed)
     cost = problem.cost(views)
     for length_m, angle_rad in REFINEMENT_STEPS:
         for _ in range(MAX_REFINEMENT_ROUNDS):
@@ -516,18 +510,24 @@ def place_stations(
     found = refine(PlacementProblem(problem.room, problem.request, fine), found)
     effort = SOLVED_EVALUATIONS if evaluations is None else evaluations
     part = min(effort // (len(found) ** 2 * (1 + REFINED_STARTS)), MAX_PART)
+    starts = [found, *_random_starts(poses, views, count, part)]
     solved_cost = SolvedCost(problem.room, problem.request)
-    useful = np.flatnonzero(np.any(views.is_seen, axis=1))
-    random = np.random.default_rng(0)
-    starts = [found]
-    for _ in range(part if len(useful) >= count else 0):
-        start = poses.take(random.choice(useful, count, replace=False))
-        if is_separated(start.position_m):
-            starts.append(start)
     costs = [solved_cost(start) for start in starts]
     order = np.argsort(costs, kind="stable")[:REFINED_STARTS]
     refined = [refine_solved(problem.room, solved_cost, starts[k], part) for k in order]
     return rounded(min(refined, key=solved_cost))
+
+
+def _random_starts(
+    poses: StationPoses, views: Views, count: int, number: int
+) -> list[StationPoses]:
+    """Return up to ``number`` placements of random candidates that see a point each."""
+    useful = np.flatnonzero(np.any(views.is_seen, axis=1))
+    if len(useful) < count:
+        return []
+    random = np.random.default_rng(0)
+    starts = [poses.take(random.choice(useful, count, replace=False)) for _ in range(number)]
+    return [start for start in starts if is_separated(start.position_m)]
 
 
 def refine_solved(
@@ -545,9 +545,7 @@ def refine_solved(
             for k in range(len(poses)):
                 if evaluations <= 0:
                     return poses
-                steps = moves(room, poses.take([k]), length_m, angle_rad)
-                options = [poses.replaced(k, steps.take([i])) for i in range(len(steps))]
-                options = [each for each in options if is_separated(each.position_m)]
+                options = _separated_moves(room, poses, k, length_m, angle_rad)
                 evaluations -= len(options)
                 costs = [solved_cost(each) for each in options]
                 if costs and min(costs) < cost * (1 - 1e-3):
@@ -557,8 +555,17 @@ def refine_solved(
     return poses
 
 
+def _separated_moves(
+    room: Room, poses: StationPoses, k: int, length_m: float, angle_rad: float
+) -> list[StationPoses]:
+    """Return the placements one step of station ``k`` away in which no stations are too close."""
+    steps = moves(room, poses.take([k]), length_m, angle_rad)
+    options = [poses.replaced(k, steps.take([i])) for i in range(len(steps))]
+    return [each for each in options if is_separated(each.position_m)]
+
+
 class SolvedCost:
-    """Cost of stations in a solved scene: uncovered places first, then standard deviations.
+    """Cost of stations in a solved scene: uncovered points first, then standard deviations.
 
     Parameters
     ----------
@@ -582,7 +589,7 @@ class SolvedCost:
         is_covered = np.isfinite(sigma)
         if not np.any(is_covered):
             return SHORTFALL_WEIGHT_M
-        # Places without coverage count by the finer grid.
+        # Points without coverage count by the finer grid.
         sigma = np.minimum(sigma[is_covered], PRIOR_SIGMA_M)
         mean = float(sigma.mean())
         spread = mean
@@ -601,7 +608,7 @@ class SolvedCost:
         return float(np.mean(is_seen.sum(axis=0) < self.min_seen))
 
     def sigmas(self, position: Array, rotation: Array) -> Array:
-        """Return the standard deviations (p,) of positions; infinite for places not covered."""
+        """Return the standard deviations (p,) of positions; infinite for points not covered."""
         points = self.points_m
         is_seen = seen_stations(self.room, position, rotation, points, self.request)
         accuracy = predict_solved_positions(

@@ -1,4 +1,4 @@
-"""Report about the stations of a room: accuracy, coverage, worst places and the best addition."""
+"""Report about the stations of a room: accuracy, coverage, worst points and the best addition."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ REPORT_POINTS = 2000
 """Number of points of the working volume of which a report consists."""
 
 MAX_GAIN_M = 100.0
-"""Position error per angle error [m/rad] from which on a place counts as not covered, however many
+"""Position error per angle error [m/rad] from which on a point counts as not covered, however many
 stations it sees: they are at almost the same position or in line with it."""
 
 COMPARED_ADDITIONS = 40
 """Number of candidates for an additional station whose accuracy in a solved scene is compared."""
 
-WORST_PLACES = 3
-"""Number of places that a report names."""
+WORST_POINTS = 3
+"""Number of points that a report names."""
 
-MIN_PLACE_DISTANCE_M = 1.0
-"""Smallest distance of two places that a report names [m]."""
+MIN_POINT_DISTANCE_M = 1.0
+"""Smallest distance of two points that a report names [m]."""
 
 NEGLIGIBLE_FRACTION = 0.01
-"""Fraction of the places below which a report does not mention them: edges of the volume."""
+"""Fraction of the points below which a report does not mention them: edges of the volume."""
 
 MIN_AVAILABILITY = 0.99
 """Fraction of time, below which a report warns of robots that hide each other."""
@@ -68,7 +68,7 @@ MIN_AVAILABILITY = 0.99
 
 @dataclass(frozen=True)
 class RoomReport:
-    """Predicted accuracy and coverage at p places of the working volume.
+    """Predicted accuracy and coverage at p points of the working volume.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class RoomReport:
     channels : tuple of int
         Of the stations.
     station_points : (s,) int ndarray
-        Number of places that see each station.
+        Number of points that see each station.
     warnings : tuple of str
         Deficiencies of the room.
     notes : tuple of str
@@ -112,34 +112,34 @@ class RoomReport:
 
     @property
     def covered_fraction(self) -> float:
-        """Fraction of the places that are covered."""
+        """Fraction of the points that are covered."""
         return float(np.mean(self.is_covered))
 
     @property
     def p95_sigma_m(self) -> float:
-        """95th percentile of ``sigma_m`` of all places; infinite if more are not covered."""
+        """95th percentile of ``sigma_m`` of all points; infinite if more are not covered."""
         return percentile(np.where(self.is_covered, self.sigma_m, np.inf))
 
     @property
     def p95_noise_sigma_m(self) -> float:
-        """95th percentile of ``noise_sigma_m`` of all places."""
+        """95th percentile of ``noise_sigma_m`` of all points."""
         return percentile(np.where(self.is_covered, self.noise_sigma_m, np.inf))
 
     @property
     def mean_sigma_m(self) -> float:
-        """Mean of ``sigma_m`` of the covered places; infinite without any."""
+        """Mean of ``sigma_m`` of the covered points; infinite without any."""
         return float(self.sigma_m[self.is_covered].mean()) if np.any(self.is_covered) else np.inf
 
     @property
-    def worst_places(self) -> tuple[int, ...]:
-        """Indices of up to three places with the largest errors, places without coverage first."""
+    def worst_points(self) -> tuple[int, ...]:
+        """Indices of up to three points with the largest errors, points without coverage first."""
         order = np.lexsort((-np.nan_to_num(self.sigma_m, posinf=1e9), self.is_covered))
         found: list[int] = []
         for index in order.tolist():
             offset = self.points_m[found] - self.points_m[index]
-            if np.all(np.linalg.norm(offset, axis=1) > MIN_PLACE_DISTANCE_M):
+            if np.all(np.linalg.norm(offset, axis=1) > MIN_POINT_DISTANCE_M):
                 found.append(index)
-            if len(found) == WORST_PLACES:
+            if len(found) == WORST_POINTS:
                 break
         return tuple(found)
 
@@ -188,7 +188,7 @@ def report_room(
         stations are taken as solved from a recording in the whole working volume, with the errors
         of :mod:`~locatk.core.lighthouse.design.solved_accuracy`.
     points_m : (p, 3) ndarray, optional
-        Places; the default is a grid in the working volume.
+        Points; the default is a grid in the working volume.
     """
     request = RoomRequest() if request is None else request
     points = working_points(room, REPORT_POINTS) if points_m is None else points_m
@@ -221,7 +221,7 @@ def report_room(
 
 
 def deck_heading_sigma(scene: Scene, report: RoomReport, room: Room, request: RoomRequest) -> float:
-    """Return the standard deviation of the heading of a deck at 95 % of the places [rad].
+    """Return the standard deviation of the heading of a deck at 95 % of the points [rad].
 
     It is that of a single epoch of a level :data:`~locatk.core.lighthouse.receiver.DECK`.
     """
@@ -238,8 +238,8 @@ def best_addition(scene: Scene, room: Room, request: RoomRequest) -> Addition | 
     improves the scene.
     """
     used = {station.channel for station in scene.stations}
-    free = [c for c in range(1, MAX_STATIONS + 1) if c not in used]
-    if not free:
+    free_channels = [c for c in range(1, MAX_STATIONS + 1) if c not in used]
+    if not free_channels:
         return None
     problem = PlacementProblem(room, request)
     position, rotation, _ = stack_stations(scene.stations)
@@ -264,7 +264,7 @@ def best_addition(scene: Scene, room: Room, request: RoomRequest) -> Addition | 
     if not ranks or not min(ranks) < rank(position, rotation):
         return None
     best = rounded(poses.take([int(order[ranks.index(min(ranks))])]))
-    station = station_of(free[0], best.position_m[0], best.rotation[0])
+    station = station_of(free_channels[0], best.position_m[0], best.rotation[0])
     more = replace(scene, stations=(*scene.stations, station), covariance=None)
     return Addition(station, report_room(more, room, request))
 
@@ -285,8 +285,8 @@ def assumed_room(scene: Scene) -> Room:
             hint="Give the room with --room, or fix the frame with `locatk calibrate scene`",
         )
     position, _, _ = stack_stations(scene.stations)
-    places = np.concatenate([position, *[m.position[None] for m in scene.markers]])
-    low, high = places[:, :2].min(axis=0) - MOUNT_DEPTH_M, places[:, :2].max(axis=0) + MOUNT_DEPTH_M
+    points = np.concatenate([position, *[m.position[None] for m in scene.markers]])
+    low, high = points[:, :2].min(axis=0) - MOUNT_DEPTH_M, points[:, :2].max(axis=0) + MOUNT_DEPTH_M
     size = np.maximum(high - low, 1.0)
     low = 0.5 * (low + high) - 0.5 * size
     top = float(position[:, 2].max())
@@ -338,7 +338,7 @@ def _accuracy(
         errors=AngleErrors(calibration_rad=0.0),
         station_covariances=[s.covariance for s in scene.stations],
     )
-    with np.errstate(invalid="ignore"):  # Places without a position are infinite in both.
+    with np.errstate(invalid="ignore"):  # Points without a position are infinite in both.
         added = given.covariance - given.noise_covariance
     added = np.nan_to_num(added, nan=0.0, posinf=0.0)
     return replace(accuracy, covariance=accuracy.covariance + added)
@@ -357,11 +357,11 @@ def _joint_errors(scene: Scene, room: Room, points: Array, is_seen: BoolArray) -
     return added
 
 
-def _availability(free: Array, min_seen: int) -> Array:
+def _availability(free_fraction: Array, min_seen: int) -> Array:
     """Return the probability (p,) that at least ``min_seen`` of independent events (s, p) occur."""
-    fewer = np.zeros((free.shape[1], min_seen))
+    fewer = np.zeros((free_fraction.shape[1], min_seen))
     fewer[:, 0] = 1.0
-    for each in free:
+    for each in free_fraction:
         more = fewer * (1.0 - each[:, None])
         more[:, 1:] += fewer[:, :-1] * each[:, None]
         fewer = more

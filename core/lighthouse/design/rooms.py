@@ -51,7 +51,7 @@ class RoomDesign:
     mounted_report : RoomReport
         With the stations as they are mounted by hand, before anything is solved.
     is_reached : bool
-        The wanted accuracy is reached at 95 % of the places; True if none is wanted.
+        The wanted accuracy is reached at 95 % of the points; True if none is wanted.
     warnings : tuple of str
         Of the report, and wishes that are not fulfilled.
     """
@@ -73,7 +73,7 @@ def design_room(room: Room, request: RoomRequest) -> RoomDesign:
     """Place stations in a room.
 
     With ``request.stations``, the accuracy of this number is as good as possible. Otherwise it is
-    the smallest number that reaches ``request.accuracy_m`` at 95 % of the places; if 16 do not, the
+    the smallest number that reaches ``request.accuracy_m`` at 95 % of the points; if 16 do not, the
     best placement is returned with a warning that tells what is possible.
 
     Raises

@@ -128,7 +128,7 @@ def predict_solved_positions(
     motions = _frame_motions(points_m, is_determined, is_planar)
     frame = motions[is_determined].reshape(-1, motions.shape[-1])
     own = jacobian[is_determined].reshape(len(frame), -1)
-    # Few places in a row do not determine all motions.
+    # Few points in a row do not determine all motions.
     common = np.linalg.lstsq(frame.T @ frame, frame.T @ own, rcond=None)[0]
     rows = jacobian.reshape(-1, len(common[0])) - motions.reshape(-1, len(common)) @ common
     weighted = np.empty_like(rows)

@@ -78,8 +78,8 @@ REPORT_HZ = 10.0
 MOUNTED_S = 4.0
 """Duration of sessions in which nothing is solved [s]."""
 
-MAX_PREDICTED_PLACES = 1000
-"""Largest number of the driven places at which a prediction is computed."""
+MAX_PREDICTED_POINTS = 1000
+"""Largest number of the driven points at which a prediction is computed."""
 
 MEDIAN_GOAL, TAIL_GOAL, DESIGN_GOAL = 1.25, 2.0, 1.2
 """Goals for the ratio of predicted and reached standard deviation, or its inverse: median and 95 %
@@ -184,7 +184,7 @@ def _deviation(ratio: float) -> float:
 
 
 def draw_room(number: int) -> Scene:
-    """Draw a room with stations on random places of its walls."""
+    """Draw a room with stations at random positions on its walls."""
     rng = np.random.default_rng(FIRST_SEED + number)
     length_m, width_m = rng.uniform(3.0, 8.0, 2)
     height_m = float(rng.uniform(2.4, 3.5))
@@ -302,10 +302,10 @@ def _crowded_rooms() -> list[Figure]:
         )
         received = np.isfinite(group_epochs(session.sweeps).counts).all(axis=2).sum(axis=1)
         reports = robots * DURATION_S * REPORT_HZ
-        places = np.concatenate([track.position[::100] for track in session.truth])
+        points = np.concatenate([track.position[::100] for track in session.truth])
         for seen in (1, 2):
             request = replace(REQUEST, min_seen=seen)
-            report = report_room(scene, room, request, points_m=places)
+            report = report_room(scene, room, request, points_m=points)
             predicted = float(report.availability.mean())
             reached = np.count_nonzero(received >= seen) / reports
             differences.append(100 * abs(predicted - reached))
@@ -392,12 +392,12 @@ def _floor_figures(
     Four marks on the floor fix the positions of the camera, and those of a single station, by one
     homography each. They have the errors of marks that are measured and visited by hand.
     """
-    places, scatter = [], []
+    positions, scatter = [], []
     for sweeps, solution, to in runs:
         rests = find_standstills(sweeps)
         for track in solution.trajectories:
             position = to.apply(track.position)
-            places.append(position)
+            positions.append(position)
             for rest in rests:
                 is_inside = (track.time_ns >= rest.start_ns) & (track.time_ns <= rest.end_ns)
                 is_long = rest.end_ns - rest.start_ns >= MIN_REST_NS
@@ -405,7 +405,7 @@ def _floor_figures(
                 if is_own and np.count_nonzero(is_inside) >= MIN_REST_POSES:
                     own = position[is_inside, :2]
                     scatter.append(own - own.mean(axis=0))
-    points = np.concatenate(places)
+    points = np.concatenate(positions)
     accuracy = _predict(scene, points)
     corners = np.stack([mark.position[:2] for mark in marks])
     of_marks = homography_variance(corners, points[:, :2], is_aligned=not are_marks_of_scene)
@@ -447,8 +447,8 @@ def homography_variance(corners: Array, points: Array, *, is_aligned: bool) -> f
 
 
 def _predict(scene: Scene, points_m: Array) -> PositionAccuracy:
-    """Predict the accuracy at places at which all stations of a solved scene were received."""
-    step = max(1, len(points_m) // MAX_PREDICTED_PLACES)
+    """Predict the accuracy at points at which all stations of a solved scene were received."""
+    step = max(1, len(points_m) // MAX_PREDICTED_POINTS)
     position, rotation, _ = stack_stations(scene.stations)
     points = points_m[::step]
     is_seen = np.ones((len(position), len(points)), bool)
@@ -506,14 +506,14 @@ def compare_sessions(scene: Scene, sessions: Sequence[int], first_seed: int) -> 
 
 
 def _predicted_variance(scene: Scene, points_m: Array) -> float:
-    """Return the mean predicted variance of positions at some of the driven places.
+    """Return the mean predicted variance of positions at some of the driven points.
 
     ``room check`` predicts it for a recording that fills the working volume evenly. Robots that
-    drive between random points are more often in its middle: the scene is solved from the places
+    drive between random points are more often in its middle: the scene is solved from the points
     that are driven, and these are compared.
     """
     assert scene.room is not None
-    points = points_m[:: max(1, len(points_m) // MAX_PREDICTED_PLACES)]
+    points = points_m[:: max(1, len(points_m) // MAX_PREDICTED_POINTS)]
     position, rotation, _ = stack_stations(scene.stations)
     is_seen = seen_stations(scene.room, position, rotation, points, REQUEST)
     sigma = predict_solved_positions(

@@ -154,7 +154,7 @@ def test_percentile_is_over_all_places_and_infinite_if_many_are_not_covered(
     hidden = replace(report, is_covered=np.arange(len(sigma)) % 10 > 0)
     assert hidden.p95_sigma_m == np.inf
     assert hidden.covered_fraction == pytest.approx(0.9, abs=0.01)
-    assert not hidden.is_covered[hidden.worst_places[0]]
+    assert not hidden.is_covered[hidden.worst_points[0]]
 
 
 @pytest.mark.slow
