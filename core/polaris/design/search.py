@@ -80,6 +80,9 @@ MAX_EVALUATIONS = 60
 NOTHING_FITS = "no tag with so many ids fits below the array"
 """Reason if no magnet is to blame."""
 
+MISREAD = "orientations are misread at this speed, noise and placement of the magnets"
+"""Reason if the angles of magnets are too uncertain for any number of orientations."""
+
 CIRCLE_QUANTILE = math.sqrt(-2 * math.log(1 - PROBABILITY))
 """Length of errors with two equal components, in standard deviations, that is not exceeded with
 :data:`.planning.PROBABILITY`."""
@@ -207,6 +210,8 @@ def search_designs(
     codes = _Codes(count, min_distance, space)
     if not codes.tags:
         return DesignSearch((), None, f"no code with {count} ids and distance {min_distance}")
+    if count > families.MAX_CANDIDATES:
+        return DesignSearch((), None, f"families have at most {families.MAX_CANDIDATES} tags")
     for magnet in space.magnets or stocked_magnets():
         best, near = _best_of_magnet(magnet, codes, use, space, position_m, heading_rad, reasons)
         if best is not None:
@@ -264,6 +269,8 @@ class _Codes:
 
     def has_family(self, tags: Tags) -> bool:
         """Return whether a family of the wanted size is found; each code is tried once."""
+        if self._min_distance == 1:
+            return True  # ids differ by a step at least, and there are enough
         key = tags.magnets, tags.order, tags.orientations
         if key not in self._has_family:
             try:
@@ -313,9 +320,11 @@ def _best_of_magnet(
         # The angle of a magnet hardly depends on the code.
         max_rad = math.pi / tags.orientations / ORIENTATION_MARGIN_SIGMAS
         if math.hypot(placement, angle_rad.get(tags.clearance_m, 0.0)) > max_rad:
+            reasons[MISREAD] = reasons.get(MISREAD, 0) + 1
             continue
         design, angle_rad[tags.clearance_m] = _evaluated(tags, use)
         if math.hypot(placement, angle_rad[tags.clearance_m]) > max_rad:
+            reasons[MISREAD] = reasons.get(MISREAD, 0) + 1
             continue
         excess = _excess(design, position_m, heading_rad)
         if excess <= 1:

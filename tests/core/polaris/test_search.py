@@ -106,6 +106,8 @@ def test_impossible_wishes_are_answered() -> None:
     assert "too weak" in far.reason
     many = search_designs(10**9, space=space)
     assert "no code" in many.reason
+    fast = search_designs(9, use=ReadingConditions(speed_mps=1000.0), space=space)
+    assert "at this speed" in fast.reason
     short = search_designs(9, use=ReadingConditions(sensors=2), space=space)
     assert "below the array" in short.reason
     for call in (
@@ -121,3 +123,14 @@ def test_stocked_discs_have_known_grades() -> None:
     assert [magnet.grade for magnet in stocked_magnets()] == [disc[2] for disc in STOCKED_DISCS]
     moments = [magnet.moment for magnet in stocked_magnets()]
     assert moments == sorted(moments)
+
+
+def test_more_tags_than_a_family_can_have_are_answered_at_once() -> None:
+    found = search_designs(10**6)
+    assert (found.designs, found.closest) == ((), None)
+    assert "at most 524288 tags" in found.reason
+
+
+def test_a_family_of_distance_1_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(families, "generate_family", None)
+    assert search_designs(300, space=SMALL).designs
