@@ -137,10 +137,14 @@ def command(
     from locatk.formats.artifacts.prices import read_prices
     from locatk.formats.artifacts.scene import write_scene
     from locatk.formats.exporters.bill_of_materials import write_bill
+    from locatk.formats.output import atomic_write
 
+    inputs = [Path(room)] if prices is None else [Path(room), prices]
     for path in (output, maps, sheet, bom):
         if path is not None:
-            options.guard_output(path, overwrite=overwrite, inputs=[Path(room)])
+            options.guard_output(path, overwrite=overwrite, inputs=inputs)
+    if maps is not None and sheet is not None and maps.resolve() == sheet.resolve():
+        raise click.UsageError("--maps and --sheet are the same file.")
     part_prices = read_prices(prices)
     device = more["device"]
     request_keys = ("seen", "facing", "range_mm", "field_of_view", "calibration", "device")
@@ -155,6 +159,8 @@ def command(
     plan = room_of(room, mounts=mounts, tripods=tripods, **more)
     with console.working("Placing stations"):
         design = design_room(plan, request)
+    # A wrong paper is an error before anything is written.
+    sheet_data = b"" if sheet is None else _drawn_sheet(design, output.stem, paper_name)
     write_scene(output, design.scene, overwrite=overwrite)
     written = [output]
     if maps is not None:
@@ -163,7 +169,8 @@ def command(
         write_room_maps(maps, design.scene, design.report, overwrite=overwrite)
         written.append(maps)
     if sheet is not None:
-        _write_sheet(sheet, design, output.stem, paper_name, overwrite)
+        with atomic_write(sheet, overwrite=overwrite) as stream:
+            stream.write(sheet_data)
         written.append(sheet)
     items = bill_of_materials(
         design.mounts,
@@ -178,19 +185,14 @@ def command(
     _print_design(design, plan, request, device, items, as_json, written)
 
 
-def _write_sheet(
-    path: Path, design: RoomDesign, title: str, paper_name: str, overwrite: bool
-) -> None:
+def _drawn_sheet(design: RoomDesign, title: str, paper_name: str) -> bytes:
     from locatk.core.lighthouse.drawing.mounting_sheet import draw_mounting_sheet
     from locatk.core.paper_sizes import paper_size
-    from locatk.formats.output import atomic_write
     from locatk.formats.printing.drawings import render_pages
 
     _, paper_mm = paper_size(paper_name)
     pages = draw_mounting_sheet(design.scene, design.poses.kinds, title, paper_mm)
-    data = render_pages(pages, f"locatk room {title}")
-    with atomic_write(path, overwrite=overwrite) as stream:
-        stream.write(data)
+    return render_pages(pages, f"locatk room {title}")
 
 
 def _print_design(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from locatk.cli import console
-from locatk.core.lighthouse.design import mounts, placement
+from locatk.core.lighthouse.design import mounts, placement, report
 from locatk.formats.artifacts.scene import read_scene
 
 
@@ -23,6 +23,8 @@ def _short_search() -> Iterator[None]:
         patch.setattr(placement, "REFINEMENT_POINTS", 200)
         patch.setattr(placement, "SEARCH_BUDGET", 1)
         patch.setattr(placement, "MAX_PART", 4)
+        patch.setattr(report, "REPORT_POINTS", 500)
+        patch.setattr(report, "COMPARED_ADDITIONS", 4)
         yield
 
 
@@ -136,6 +138,35 @@ def test_outputs_are_not_overwritten(locatk, designed: Path, tmp_path: Path) -> 
         assert result.exit_code == 1
         assert existing.read_text() == "mine"
     assert locatk("room", "design", designed, "-o", designed, "--overwrite").exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--sheet", "s.pdf", "--paper", "A9"], "no paper 'A9'"),
+        (["--sheet", "s.pdf", "--paper", "10x10mm"], "too little"),
+        (["--sheet", "s.pdf", "--maps", "s.pdf"], "the same file"),
+    ],
+)
+def test_nothing_is_written_before_all_outputs_are_possible(
+    locatk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = locatk("room", "design", "3x3x2.5", "--stations", 1, "-o", "r.toml", *arguments)
+    assert result.exit_code in (1, 2)
+    assert message in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_prices_are_not_overwritten(locatk, tmp_path: Path) -> None:
+    prices = tmp_path / "prices.toml"
+    prices.write_text(locatk("room", "design", "--print-prices").stdout)
+    text = prices.read_text()
+    arguments = "--stations", 1, "--prices", prices, "-o", prices, "--overwrite"
+    result = locatk("room", "design", "3x3x2.5", *arguments)
+    assert result.exit_code == 1
+    assert "one of the inputs" in result.stderr
+    assert prices.read_text() == text
 
 
 def test_check_takes_a_room_for_a_scene_without_one(locatk, designed: Path) -> None:
