@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from locatk.cli import console, failures, options
 from locatk.cli.command import Command
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from locatk.core.landmarks.design.proof import MapProof
     from locatk.core.landmarks.design.routes import RouteCheck
     from locatk.core.landmarks.map.floor import FloorMap
+
+ROUTE_CONDITIONS = "speed", "drift", "slip", "installation", "iron", "vehicle", "offline"
+"""Options that have no effect without a route."""
 
 
 MAX_NAMED_CELLS = 5
@@ -67,6 +71,11 @@ def command(maps: tuple[Path, ...], overwrite: bool, as_json: bool, **route_valu
         raise click.UsageError("--picture shows routes: give --route as well.")
     if request.accuracy is not None and not request.route_paths:
         raise click.UsageError("--accuracy is that of routes: give --route as well.")
+    if not request.route_paths:
+        context = click.get_current_context()
+        for name in ROUTE_CONDITIONS:
+            if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+                raise click.UsageError(f"--{name} is for routes: give --route as well.")
     if request.route_paths and len(maps) > 1:
         raise click.UsageError("--route needs one map.")
     if request.picture is not None:

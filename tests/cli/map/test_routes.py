@@ -137,6 +137,8 @@ def test_picture_shows_routes_of_any_kind_with_words_inside(made: Path) -> None:
     [
         (["-o", "a.png"], "give --route as well", 2),
         (["--accuracy", "5"], "give --route as well", 2),
+        (["--iron", "1"], "--iron is for routes: give --route as well", 2),
+        (["--offline"], "--offline is for routes: give --route as well", 2),
         (["--route", "DRIVE", "--accuracy", "-5"], "numbers above 0", 2),
         (["--route", "missing.csv"], "missing.csv", 1),
         (["--route", "DRIVE", "-o", "a.gif"], "a.gif", 2),
