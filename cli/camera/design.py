@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from locatk.cli import console, options
 from locatk.cli.command import Command, section
@@ -227,8 +228,12 @@ def command(
     from locatk.core.dots.design.camera import compare_sensors, design_camera, suggest_camera
     from locatk.formats.artifacts.cameras import read_cameras
 
+    context = click.get_current_context()
     if holder is not None:
-        options.guard_output(holder, overwrite=overwrite)
+        inputs = [] if cameras is None else [cameras]
+        options.guard_output(holder, overwrite=overwrite, inputs=inputs)
+    elif context.get_parameter_source("size") is ParameterSource.COMMANDLINE:
+        raise click.UsageError("--size is the paper of the drawing: give --holder as well.")
     sensors = read_cameras(cameras)
     chosen = None if sensor is None else _sensor_of(sensor, sensors)
     task: dict[str, Any] = {

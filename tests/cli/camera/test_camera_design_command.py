@@ -91,6 +91,12 @@ def test_limits_are_stated_with_the_units_of_the_options(
     assert message in " ".join(result.stderr.split())
 
 
+def test_a_paper_needs_a_drawing(locatk) -> None:
+    result = locatk("camera", "design", "--size", "A3")
+    assert result.exit_code == 2
+    assert "give --holder as well" in result.stderr
+
+
 def test_own_table_of_sensors(locatk, tmp_path: Path) -> None:
     template = locatk("camera", "design", "--print-cameras")
     assert template.exit_code == 0
