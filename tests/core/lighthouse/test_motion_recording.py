@@ -23,6 +23,9 @@ from locatk.core.lighthouse.recording import Sweeps
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.lighthouse.flights import DEVICE, Flight, make_flight
 
+SHORT_S = 3.0
+"""Duration of the flight of fast tests [s]: the end of a longer one, which begins with a rest."""
+
 
 def in_parts(monkeypatch: pytest.MonkeyPatch, flight: Flight, knots: int) -> Trajectory:
     """Return the trajectory of a flight whose scene is estimated from some of its knots."""
@@ -92,7 +95,7 @@ def two_devices(flight: Flight, is_second: np.ndarray) -> tuple[Sweeps, dict[str
     return sweeps, dict.fromkeys(sweeps.devices, flight.receivers[DEVICE])
 
 
-@pytest.mark.parametrize("rate_hz", [None, 50.0])
+@pytest.mark.parametrize("rate_hz", [None, pytest.param(50.0, marks=pytest.mark.slow)])
 def test_each_device_has_its_part_of_the_poses(
     short_flight: Flight, monkeypatch: pytest.MonkeyPatch, rate_hz: float | None
 ) -> None:
@@ -100,12 +103,12 @@ def test_each_device_has_its_part_of_the_poses(
     flight = short_flight
     middle_ns = int(np.median(flight.sweeps.time_ns))
     sweeps, receivers = two_devices(flight, flight.sweeps.time_ns >= middle_ns)
-    monkeypatch.setattr(recording, "MAX_SAMPLE_KNOTS", 400)
+    monkeypatch.setattr(recording, "MAX_SAMPLE_KNOTS", 200)
     solution = solve(sweeps, flight.scene, SolveOptions(rate_hz=rate_hz), receivers=receivers)
     assert not [w for w in solution.warnings if w.code == "paths_not_estimated"]
     first, second = solution.trajectories
     assert len(first) == pytest.approx(len(second), rel=0.1)
-    assert len(first) + len(second) > 0.95 * 6.0 * 50.0
+    assert len(first) + len(second) > 0.95 * SHORT_S * 50.0
     assert first.time_ns.max() <= middle_ns + 20e6
     assert second.time_ns.min() >= middle_ns - 20e6
     for trajectory in (first, second):
@@ -201,15 +204,25 @@ def test_the_covariance_of_a_relative_pose_is_that_of_samples() -> None:
 
 @pytest.fixture(scope="module")
 def short_flight() -> Flight:
-    return make_flight(12, duration_s=6.0, motion="agile", geometry="given")
+    flight = make_flight(12, duration_s=7.0, motion="agile", geometry="given")
+    time_ns = flight.sweeps.time_ns
+    return replace(flight, sweeps=flight.sweeps.take(time_ns > time_ns.max() - 1e9 * SHORT_S))
 
 
-@pytest.mark.parametrize("rate_hz", [7.0, 400.0, math.inf])
+@pytest.fixture(scope="module")
+def usual(short_flight: Flight) -> Trajectory:
+    """Trajectory of the short flight at the usual rate."""
+    return solve_flight(short_flight)
+
+
+@pytest.mark.parametrize(
+    "rate_hz", [pytest.param(7.0, marks=pytest.mark.slow), 400.0,
+                pytest.param(math.inf, marks=pytest.mark.slow)]
+)  # fmt: skip
 def test_poses_between_sweeps_are_as_good_as_their_covariance(
-    short_flight: Flight, rate_hz: float
+    short_flight: Flight, usual: Trajectory, rate_hz: float
 ) -> None:
     flight = short_flight
-    usual = solve_flight(flight)
     options = SolveOptions(rate_hz=rate_hz)
     solution = solve(flight.sweeps, flight.scene, options, receivers=flight.receivers)
     (trajectory,) = solution.trajectories
@@ -219,7 +232,7 @@ def test_poses_between_sweeps_are_as_good_as_their_covariance(
     else:
         number = trajectory.time_ns * (rate_hz * 1e-9)
         assert np.abs(number - np.rint(number)).max() < 1e-3
-        assert len(trajectory) == pytest.approx(6.0 * rate_hz, abs=0.03 * 6.0 * rate_hz + 1)
+        assert len(trajectory) == pytest.approx(SHORT_S * rate_hz, abs=0.03 * SHORT_S * rate_hz + 1)
     assert np.median(errors(flight, trajectory)) < 1.2 * np.median(errors(flight, usual)) + 2e-4
     assert errors(flight, trajectory).max() < 1.5 * errors(flight, usual).max() + 1e-3
     truth, turns = flight.true_poses(trajectory.time_ns)
@@ -231,17 +244,18 @@ def test_poses_between_sweeps_are_as_good_as_their_covariance(
     assert 0.8 < np.median(trajectory.sigma[:, 0] / sigma) < 1.2
 
 
+@pytest.mark.slow
 def test_parts_have_each_pose_of_a_grid_once(
     short_flight: Flight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = SolveOptions(rate_hz=130.0)
     flight = short_flight
     whole = solve(flight.sweeps, flight.scene, options, receivers=flight.receivers)
-    monkeypatch.setattr(recording, "MAX_SAMPLE_KNOTS", 300)
-    monkeypatch.setattr(recording, "PART_S", 1.3)
+    monkeypatch.setattr(recording, "MAX_SAMPLE_KNOTS", 150)
+    monkeypatch.setattr(recording, "PART_S", 0.9)
     parts = solve(flight.sweeps, flight.scene, options, receivers=flight.receivers)
     times = parts.trajectories[0].time_ns
-    assert len(times) > 700
+    assert len(times) > 0.9 * 130.0 * SHORT_S
     assert np.all(np.diff(times) > 0)
     assert np.array_equal(times, whole.trajectories[0].time_ns)
 

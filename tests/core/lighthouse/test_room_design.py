@@ -206,17 +206,28 @@ def test_requests_that_make_no_sense_are_refused(make: object) -> None:
         make()
 
 
-def test_tripods_and_walls_are_used_as_told() -> None:
-    tripods = np.array([[0.5, 0.5, 2.0], [4.5, 3.5, 2.0], [4.5, 0.5, 2.0]])
-    room = replace(SPACE, mounts=("tripod",), tripods_m=tripods)
-    found = design_room(room, RoomRequest(2))
+TRIPODS = replace(
+    SPACE,
+    mounts=("tripod",),
+    tripods_m=np.array([[0.5, 0.5, 2.0], [4.5, 3.5, 2.0], [4.5, 0.5, 2.0]]),
+)
+
+
+def test_tripods_are_used_as_told() -> None:
+    found = design_room(TRIPODS, RoomRequest(2))
     assert found.mounts == {"tripod": 2}
     for position in found.poses.position_m:
-        assert np.min(np.linalg.norm(tripods - position, axis=1)) < 1e-9
+        assert np.min(np.linalg.norm(TRIPODS.tripods_m - position, axis=1)) < 1e-9
+
+
+def test_walls_are_used_as_told() -> None:
     walls = design_room(replace(FLOOR, mounts=("wall",)), RoomRequest(1))
     x, y, _ = walls.poses.position_m[0]
     assert min(x, y, 5 - x, 4 - y) == pytest.approx(0.1)
-    fewer = design_room(room, RoomRequest(5))
+
+
+def test_fewer_stations_are_placed_if_there_is_no_space_for_more() -> None:
+    fewer = design_room(TRIPODS, RoomRequest(5))
     assert len(fewer.poses) == 3
     assert any("only 3 of 5" in text for text in fewer.warnings)
 
@@ -376,11 +387,15 @@ def test_a_few_places_in_view_of_two_stations_are_predicted() -> None:
     hall = Room(rectangle(30.0, 30.0), 8.0, (1.0, 1.0))
     stations = facing_down((5.0, 5.0), (6.0, 5.0))
     room = replace(hall, photodiode_z_m=(0.0, 2.0))
-    for places in ([[5.5, 5.0, 1.0]], [[5.5, 5.0, 1.0], [5.5, 5.5, 1.0]]):
+    for points in ([[5.5, 5.0, 1.0]], [[5.5, 5.0, 1.0], [5.5, 5.5, 1.0]]):
         report = report_room(
-            stations, room, RoomRequest(max_range_m=2.8), points_m=np.array(places)
+            stations, room, RoomRequest(max_range_m=2.8), points_m=np.array(points)
         )
         assert np.all(report.stations_seen == 2)
         assert np.all(np.isfinite(report.sigma_m))
+
+
+@pytest.mark.slow
+def test_a_hall_that_is_too_large_for_its_stations_is_designed() -> None:
     everywhere = design_room(Room(rectangle(60.0, 60.0), 8.0, (0.0, 1.5)), RoomRequest(6))
     assert 0.0 < everywhere.report.covered_fraction < 0.5
