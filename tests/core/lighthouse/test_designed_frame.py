@@ -143,12 +143,13 @@ def test_careless_mounting_widens_the_frame() -> None:
     truth = rooms.room(rng, 4)
     scene, _ = estimated(truth, rng)
     careful = fit_designed_frame(scene, design_of(truth, rng))
-    design = design_of(truth, rng, 3 * TOLERANCE)
+    design = design_of(truth, rng, 2 * TOLERANCE)
     stated = tuple(replace(s, covariance=np.diag(TOLERANCE**2)) for s in design.stations)
     careless = fit_designed_frame(scene, replace(design, stations=stated))
     assert careful.misfit_ratio == 1.0
-    assert careless.misfit_ratio > 1.5
-    assert careless.origin_sigma_m > 1.5 * careful.origin_sigma_m
+    assert careless.used == (1, 2, 3, 4)
+    assert careless.misfit_ratio > 1.3
+    assert careless.origin_sigma_m > 1.3 * careful.origin_sigma_m
 
 
 @pytest.mark.slow
