@@ -39,6 +39,7 @@ from locatk.core.streaming.tracker import DEFAULT_SETTINGS
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure
 from locatk.formats.benchmarks.plan.ratios import ratio_figures
+from locatk.formats.benchmarks.plan.truth import at_times, planar_poses
 
 Array = NDArray[np.float64]
 
@@ -319,13 +320,13 @@ class _TruePath:
 
     @classmethod
     def of(cls, truth: Trajectory, length_m: float) -> _TruePath:
-        pose = _poses(truth)
+        pose = planar_poses(truth)
         travelled = np.cumsum(np.r_[0.0, np.hypot(*np.diff(pose[:, :2], axis=0).T)])
         return cls(truth.time_ns, pose, travelled * length_m / travelled[-1])
 
     def errors(self, time_ns: NDArray[np.int64], pose: Array) -> tuple[Array, Array]:
         """Return the distances (n,) along the route and the squared errors (n, 2) of poses."""
-        true = np.column_stack([np.interp(time_ns, self.time_ns, each) for each in self.pose.T])
+        true = at_times(time_ns, self.time_ns, self.pose)
         heading_error = wrap_angle(pose[:, 2] - true[:, 2])
         position = ((pose[:, :2] - true[:, :2]) ** 2).sum(axis=1)
         distance_m = np.interp(time_ns, self.time_ns, self.distance_m)
@@ -347,7 +348,7 @@ def _offline_squares(
     if not solution.trajectories:
         return np.full((2, 4), np.nan), task.route.length_m
     solved = solution.trajectories[0]
-    distance_m, reached = truth.errors(solved.time_ns, _poses(solved))
+    distance_m, reached = truth.errors(solved.time_ns, planar_poses(solved))
     predicted = _sigmas(check, distance_m)
     weight = np.diff(distance_m, prepend=distance_m[:1])
     at = [visit.distance_m for visit in check.visits if visit.accuracy.is_usable]
@@ -402,9 +403,3 @@ def _live_squares(
         np.average(np.nan_to_num(each), axis=0, weights=weight) for each in (predicted, reached)
     ]
     return np.array(mean), float(distance_m[0])
-
-
-def _poses(trajectory: Trajectory) -> Array:
-    """Return x, y and unwrapped heading (n, 3)."""
-    heading = np.unwrap(heading_from_quaternion(trajectory.quaternion))
-    return np.column_stack([trajectory.position[:, :2], heading])

@@ -50,6 +50,7 @@ from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
 from locatk.formats.benchmarks.lighthouse import suite
 from locatk.formats.benchmarks.plan.ratios import ratio_figures
+from locatk.formats.benchmarks.plan.truth import at_times
 
 Array = NDArray[np.float64]
 
@@ -541,7 +542,6 @@ def _positions(tracks: Sequence[Trajectory], session: SimulatedSession) -> tuple
     estimates, trues = [], []
     for track in tracks:
         true = truth[track.device]
-        axes = [np.interp(track.time_ns, true.time_ns, axis) for axis in true.position.T]
         estimates.append(track.position)
-        trues.append(np.stack(axes, axis=1))
+        trues.append(at_times(track.time_ns, true.time_ns, true.position))
     return np.concatenate(estimates), np.concatenate(trues)

@@ -52,6 +52,7 @@ from locatk.core.streaming.tracker import DEFAULT_SETTINGS
 from locatk.core.trajectory import Trajectory
 from locatk.formats.benchmarks.figures import Figure, measure_or_explain
 from locatk.formats.benchmarks.plan.ratios import TAIL_RATIO, ratio_figures
+from locatk.formats.benchmarks.plan.truth import at_times, planar_poses
 from locatk.formats.benchmarks.polaris.suite import (
     SAMPLE_RATE_HZ,
     SET_IDS,
@@ -293,19 +294,12 @@ def errors_along(task: PlanningTask, session: SimulatedSession, odometry: Trajec
 
 
 def _errors(estimate: Trajectory, truth: Trajectory, time_ns: NDArray[np.int64]) -> Array:
-    difference = _planar(estimate, time_ns) - _planar(truth, time_ns)
+    first, second = (
+        at_times(time_ns, each.time_ns, planar_poses(each)) for each in (estimate, truth)
+    )
+    difference = first - second
     difference[:, 2] = wrap_angle(difference[:, 2])
     return difference
-
-
-def _planar(trajectory: Trajectory, time_ns: NDArray[np.int64]) -> Array:
-    """Return x, y and heading (n, 3) at some times."""
-    heading = np.unwrap(heading_from_quaternion(trajectory.quaternion))
-    columns = (*trajectory.position[:, :2].T, heading)
-    start_ns = trajectory.time_ns[0]
-    known_s = (trajectory.time_ns - start_ns) * 1e-9
-    wanted_s = (time_ns - start_ns) * 1e-9
-    return np.column_stack([np.interp(wanted_s, known_s, column) for column in columns])
 
 
 @dataclass(frozen=True)
