@@ -193,10 +193,17 @@ def build_corpus(folder: Path) -> None:
     (folder / "eight-sim.toml").write_text(
         'format = "locatk-simulation-polaris"\nformat_version = 1\n[sensors]\ncount = 8\n'
     )
+    (folder / "route.csv").write_text("x_mm,y_mm\n0,0\n1500,0\n1500,900\n")
+    (folder / "room.svg").write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="300mm" height="200mm" '
+        'viewBox="0 0 300 200"><path d="M10 10 H290 V190 H10 Z"/></svg>'
+    )
     made = (
         "tag design -o tag.toml",
         "map design 8x8 -o map.toml",
         "simulate lighthouse -o lighthouse.mcap --duration 4 --robots 2",
+        "room design 3x2x2.5 --stations 2 --floor 100 --robots 3 -o room.toml",
+        "site design tag.toml --route route.csv --spacing 900 -o site.toml",
         "simulate dots -o dots.mcap --frames 8",
         "simulate polaris tag.toml -o polaris.mcap --id 5 --seed 1",
         "simulate polaris tag.toml -o eight.mcap --config eight-sim.toml",
@@ -218,6 +225,12 @@ def build_corpus(folder: Path) -> None:
         result = run(line.split(), folder)
         if result.status not in (0, 3):
             raise SystemExit(f"locatk {line}: {result.status}, {result.stderr}")
+    for name, words in (
+        ("cameras", ["camera", "design", "--print-cameras"]),
+        ("prices", ["advise", "--print-prices"]),
+        ("task", ["advise", "--area", "1x1", "--accuracy", "30", "--print-task"]),
+    ):
+        (folder / f"{name}.toml").write_text(run(words, folder).stdout)
     for name in SYSTEMS:
         words = ["simulate", name, *(["map.toml"] if name == "landmarks" else []), "--print-config"]
         (folder / f"{name}-sim.toml").write_text(run(words, folder).stdout)
@@ -482,6 +495,47 @@ TARGETS = {
             ("simulate", "landmarks", "{}", "-o", "out.mcap", "--landmarks", "2"),
         ),
     ),
+    "rooms": Target(
+        ("room.toml",),
+        (mutations.damage_toml,),
+        (
+            ("room", "check", "{}", "--json"),
+            ("room", "design", "{}", "--stations", "1", "-o", "out.toml", "--json"),
+            ("simulate", "lighthouse", "--artifact", "{}", "-o", "out.mcap", "--duration", "2"),
+            ("solve", "lighthouse.mcap", "--artifact", "{}", "-o", "out.mcap", "--json"),
+        ),
+    ),
+    "floor-plans": Target(
+        ("room.svg",),
+        (mutations.damage_text, mutations.damage_bytes),
+        (
+            (
+                *("room", "design", "{}", "--height", "2500", "--floor", "0"),
+                *("--stations", "1", "-o", "out.toml", "--json"),
+            ),
+        ),
+    ),
+    "routes": Target(
+        ("route.csv",),
+        (mutations.damage_text,),
+        (
+            ("map", "check", "map.toml", "--route", "{}", "--json"),
+            ("site", "check", "site.toml", "--route", "{}", "--json"),
+            (
+                *("site", "design", "tag.toml", "--route", "{}", "--accuracy", "30"),
+                *("-o", "out.toml", "--json"),
+            ),
+        ),
+    ),
+    "plans": Target(
+        ("cameras.toml", "prices.toml", "task.toml"),
+        (mutations.damage_toml,),
+        (
+            ("camera", "design", "--cameras", "{}", "--frames", "0", "--json"),
+            ("tag", "design", "--prices", "{}", "-o", "out.toml", "--json"),
+            ("advise", "--task", "{}", "--json"),
+        ),
+    ),
     "foreign-maps": Target(
         ("map.csv", "map.json"),
         (mutations.damage_text, mutations.damage_text, mutations.damage_bytes),
@@ -544,6 +598,11 @@ def fits(command: Words, name: str) -> bool:
     """Return True if a command is meant for a file of this name."""
     stem, _, ending = name.partition(".")
     verb = command[0]
+    for wanted_stem in ("cameras", "prices", "task"):
+        if f"--{wanted_stem}" in command:
+            return stem == wanted_stem
+    if stem == "room":
+        return True
     if verb in ("map", "tag"):
         return ending != "toml" or stem == verb
     if verb == "simulate" and "--config" in command:
