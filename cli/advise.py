@@ -92,7 +92,7 @@ def command(
     if report is not None:
         inputs = [*input_files, *([prices] if prices else [])]
         options.guard_output(report, overwrite=overwrite, inputs=inputs)
-    if not settings:
+    if not settings and not input_files:
         settings = _ask(CONFIG)
     task = task_of(settings)
     price_list = read_price_list(prices)

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from locatk.core.advice import dots, landmarks, lighthouse, polaris
 from locatk.core.advice.answer import Advice, Check, Combination, SystemAdvice
-from locatk.core.advice.checks import limit_check
+from locatk.core.advice.checks import condition_check, limit_check
 from locatk.core.advice.task import Task
+from locatk.core.errors import InputError
 from locatk.core.materials import PriceList, with_prices
 
 ADVISERS: dict[str, Callable[[Task, Mapping[str, float]], SystemAdvice]] = {
@@ -57,7 +58,15 @@ def advise(
     for name, adviser in ADVISERS.items():
         if progress is not None:
             progress(name)
-        systems.append(_with_costs(adviser(task, minutes), task, prices))
+        try:
+            designed = adviser(task, minutes)
+        except InputError as error:
+            designed = SystemAdvice(
+                name,
+                "no design",
+                (condition_check("design", False, str(error), "its limits", error.hint or ""),),
+            )
+        systems.append(_with_costs(designed, task, prices))
     systems.sort(key=lambda system: (len(system.failures), system.hours))
     return Advice(tuple(systems), combine(systems, task))
 

@@ -20,6 +20,7 @@ from locatk.core.lighthouse.design import (
     bill_of_materials,
     design_room,
 )
+from locatk.core.lighthouse.design.placement import MAX_STATIONS
 from locatk.core.lighthouse.design.report import deck_heading_sigma
 from locatk.core.lighthouse.receiver import DECK
 from locatk.core.lighthouse.room import RobotSize, Room
@@ -60,14 +61,14 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
     room = room_of(task)
     photodiodes = 1 if task.heading_rad is None and not task.is_flying else len(DECK)
     request = RoomRequest(stations=None, accuracy_m=task.position_m / ONE_DIMENSIONAL_QUANTILE)
-    try:
-        design = design_room(room, request)
-    except InputError as error:
-        return SystemAdvice(
-            "lighthouse",
-            "no stations",
-            (condition_check("stations", False, str(error), "room", error.hint or ""),),
+    largest_m2 = MAX_STATIONS * math.pi * request.max_range_m**2 / request.seen_by(room)
+    if task.area_m2 > largest_m2:
+        raise InputError(
+            f"{MAX_STATIONS} stations cover at most {largest_m2:.0f} m2, by their range of "
+            f"{request.max_range_m:g} m, and the area is {task.area_m2:.0f} m2",
+            hint="Divide the area",
         )
+    design = design_room(room, request)
     stations = len(design.scene.stations)
     report = design.report
     items = bill_of_materials(design.mounts, robots=task.robots, photodiodes=photodiodes)

@@ -60,24 +60,28 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
     report = evaluate_design(tags, use, max(count, 1))
     spacing = "no spacing" if math.isnan(plan.spacing_m) else f"{plan.spacing_m:.2g} m apart"
     has_poses = count > 0 and math.isfinite(plan.position_p95_m) and task.has_odometry
+    position_m, heading_rad = math.inf, math.inf
+    if count:
+        position_m, heading_rad = plan.position_p95_m, plan.heading_p95_rad
+    remedies = "; ".join(plan.remedies)
     checks = [
         limit_check(
             "position",
             "m",
-            plan.position_p95_m,
+            position_m,
             task.position_m,
             "computed",
             "dead reckoning between tags that are laid by hand (Cramer-Rao bound, odometry)",
-            "; ".join(plan.remedies),
+            remedies,
         ),
         limit_check(
             "heading",
             "rad",
-            plan.heading_p95_rad,
+            heading_rad,
             task.heading_rad,
             "computed",
             "same forecast",
-            "; ".join(plan.remedies),
+            remedies,
         ),
         limit_check(
             "coverage",
@@ -89,8 +93,18 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
             if task.routes
             else f"the design is for lanes {LANE_SPACING_M:g} m apart: robots that drive anywhere "
             "rarely pass over a tag",
-            "Lead the robots along routes, and give them (--route)",
+            remedies if task.routes else "Lead the robots along routes, and give them (--route)",
             better="higher",
+        ),
+        condition_check(
+            "tags",
+            plan.is_feasible,
+            "robots pass over each tag, and the wanted errors are kept"
+            if plan.is_feasible
+            else "no spacing of tags keeps the wanted errors",
+            "forecast of the routes",
+            remedies,
+            "computed",
         ),
         condition_check(
             "odometry",

@@ -23,8 +23,8 @@ IRON = ("none", "reinforced", "plates")
 FLOOR_WORK = ("print", "glue", "mill")
 """What may be done to the floor: covered with printed sheets, tags glued on, pockets milled."""
 
-MAX_SIDE_M = 1000.0
-"""Longest side of an area; longer ones are in another unit."""
+MIN_SIDE_M, MAX_SIDE_M = 0.1, 1000.0
+"""Shortest and longest side of an area; others are in another unit."""
 
 MAX_ACCURACY_M = 10.0
 """Coarsest accuracy that can be wanted; coarser ones are in another unit."""
@@ -115,26 +115,29 @@ class Task:
 
     def __post_init__(self) -> None:
         for side in self.size_m:
-            _require(side, "a side of the area", MAX_SIDE_M, "in metres, as in 10x8")
-        _require(self.height_m, "the height", 100.0, "in metres")
-        _require(self.position_m, "the position error wanted", MAX_ACCURACY_M, "in mm")
-        _require(self.speed_mps, "the speed", 100.0, "in m/s")
-        _require(self.rate_hz, "the rate", 1e4, "in poses per second")
-        _require(self.diameter_m, "the diameter of a robot", 10.0, "in mm")
-        _require(self.clearance_m, "the clearance", 1.0, "in mm")
-        if self.heading_rad is not None:
-            _require(self.heading_rad, "the heading error wanted", math.pi, "in degrees")
-        for value, name in (
-            (self.latency_s, "the latency"),
-            (self.power_w, "the power"),
-            (self.budget, "the budget"),
-            (self.hours, "the working time"),
-            (self.battery_wh, "the energy of the battery"),
+            _require(side, "a side of the area", "m", 1.0, MIN_SIDE_M, MAX_SIDE_M)
+        _require(self.height_m, "the height", "m", 1.0, MIN_SIDE_M, 100.0)
+        _require(self.position_m, "the position error wanted", "mm", 1e-3, 0.0, MAX_ACCURACY_M)
+        _require(self.speed_mps, "the speed", "m/s", 1.0, 0.0, 100.0)
+        _require(self.rate_hz, "the rate", "Hz", 1.0, 0.0, 1e4)
+        _require(self.diameter_m, "the diameter of a robot", "mm", 1e-3, 0.0, 10.0)
+        _require(self.clearance_m, "the clearance", "mm", 1e-3, 0.0, 1.0)
+        for value, name, unit, scale, most in (
+            (self.heading_rad, "the heading error wanted", "deg", math.pi / 180, math.pi),
+            (self.latency_s, "the latency", "ms", 1e-3, 1e4),
+            (self.power_w, "the power", "mW", 1e-3, 1e4),
+            (self.budget, "the budget", self.currency, 1.0, 1e12),
+            (self.hours, "the working time", "h", 1.0, 1e9),
+            (self.battery_wh, "the energy of the battery", "Wh", 1.0, 1e6),
         ):
             if value is not None:
-                _require(value, name, math.inf, "above 0")
+                _require(value, name, unit, scale, 0.0, most)
         if self.robots < 1:
             raise InputError("no robots", hint="Give 1 or more")
+        if not (len(self.currency) == 3 and self.currency.isupper()):
+            raise InputError(
+                f"no currency {self.currency!r}", hint="Give its code, as in USD or EUR (ISO 4217)"
+            )
         for word, choices, name in (
             (self.infrared, INFRARED, "infrared"),
             (self.iron, IRON, "iron"),
@@ -156,7 +159,11 @@ class Task:
         return signed_area(self.corners_m)
 
 
-def _require(value: float, name: str, most: float, unit: str) -> None:
-    if not (0 < value <= most and math.isfinite(value)):
-        limit = "" if math.isinf(most) else f" and at most {most:g}"
-        raise InputError(f"{name} is {value:g}: it must be above 0{limit}", hint=f"Give it {unit}")
+def _require(value: float, name: str, unit: str, scale: float, least: float, most: float) -> None:
+    """Raise InputError for a value out of its range, in the unit of users."""
+    if not (least <= value <= most and value > 0 and math.isfinite(value)):
+        low = f"from {least / scale:g}" if least else "above 0"
+        raise InputError(
+            f"{name} is {value / scale:g} {unit}",
+            hint=f"Give a value {low} and at most {most / scale:g} {unit}",
+        )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from locatk.core.advice.task import FLOOR_WORK, INFRARED, IRON, Task
+from locatk.core.errors import InputError
 from locatk.core.polygons import rectangle
 from locatk.core.routes import Route
 from locatk.formats.artifacts.kinds import (
@@ -252,6 +253,10 @@ def task_of(settings: Mapping[str, Any]) -> Task:
         values["outline_m"] = _around(routes, values.get("diameter_m", Task.diameter_m))
     floor = values.pop("area.floor", None)
     if floor is not None:
+        if UNTOUCHED in floor and len(floor) > 1:
+            raise InputError(
+                f"a floor of {' and '.join(floor)}", hint=f"Give {UNTOUCHED} alone, or the others"
+            )
         values["floor_work"] = frozenset(floor) - {UNTOUCHED}
     if values.get("outline_m") is not None:
         values["outline_m"] = np.array(values["outline_m"], float)

@@ -134,9 +134,13 @@ def test_report_is_not_overwritten_unasked(tmp_path: Path) -> None:
         ([], 2, "No task"),
         (["--area", "10"], 2, "10"),
         (["--area", "10x-3"], 2, "10x-3"),
-        (["--area", "10000x3"], 1, "in metres"),
+        (["--area", "10000x3"], 1, "at most 1000 m"),
+        (["--area", "1000x0.01"], 1, "0.01 m"),
+        (["--clearance", "3000"], 1, "3000 mm"),
+        (["--currency", "euro"], 1, "ISO 4217"),
+        (["--floor", "none", "--floor", "print"], 1, "none alone"),
         (["--accuracy", "0"], 2, "0"),
-        (["--accuracy", "90000"], 1, "in mm"),
+        (["--accuracy", "90000"], 1, "at most 10000 mm"),
         (["--floor", "carpet"], 2, "carpet"),
         (["--route", "missing.csv"], 1, "missing.csv"),
         (["--task", "missing.toml"], 1, "missing.toml"),
@@ -148,6 +152,26 @@ def test_bad_input_is_one_line_with_a_hint(arguments: list[str], status: int, me
     assert result.exit_code == status
     assert message in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.usefixtures("fast_systems")
+def test_a_task_of_defaults_is_a_task(tmp_path: Path) -> None:
+    task = tmp_path / "task.toml"
+    task.write_text(run("--print-task").stdout)
+    result = run("--task", str(task), "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["settings"] == {}
+
+
+@pytest.mark.usefixtures("fast_systems")
+def test_a_system_without_a_design_does_not_stop_the_others() -> None:
+    result = run(*FAST, "--clearance", "0.2", "--json")
+    entry = json.loads(result.stdout)
+    assert entry["best"] == "dots"
+    tags = next(system for system in entry["systems"] if system["system"] == "polaris")
+    check = next(check for check in tags["checks"] if check["name"] == "design")
+    assert check["is_met"] is False
+    assert "clearance" in check["expected"]
 
 
 def test_unknown_keys_and_open_outlines_of_a_task_are_named(tmp_path: Path) -> None:

@@ -93,6 +93,21 @@ def test_polaris_needs_routes_odometry_and_a_floor_without_plates() -> None:
     assert "robots in space" in failures(polaris.advise(replace(task, is_flying=True), {}))
 
 
+def test_a_route_that_takes_too_many_tags_has_no_accuracy() -> None:
+    lanes = [[x, float(y)] for y in range(101) for x in ((0.0, 100.0), (100.0, 0.0))[y % 2]]
+    task = Task(size_m=(100.0, 100.0), routes=(Route(np.array(lanes)),))
+    advice = polaris.advise(task, {})
+    assert {"position", "coverage", "tags"} <= failures(advice)
+    remedy = advice.check("coverage").remedy  # type: ignore[union-attr]
+    assert "--route" not in remedy
+    assert remedy
+
+
+def test_a_hall_beyond_the_range_of_all_stations_is_refused_at_once() -> None:
+    with pytest.raises(InputError, match="16 stations cover at most 2463 m2"):
+        lighthouse.advise(Task(size_m=(100.0, 100.0)), {})
+
+
 def test_accuracy_below_the_bound_is_answered_with_what_would_have_to_change() -> None:
     advice = polaris.advise(Task(routes=(STRAIGHT,), position_m=1e-4), {})
     check = advice.check("position")
