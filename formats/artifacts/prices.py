@@ -45,8 +45,15 @@ PARTS = tuple(
 )
 """Parts that can have a price, of all bills of materials and of `locatk advise`."""
 
-PUBLISHED_PRICES = {**TAG_PRICES, **STATION_PRICES, **CAMERA_PRICES}
-"""Prices that the papers state, by part."""
+OF_ONE_TYPE = ("disc magnet", "image sensor", "lens")
+"""Parts whose published price is that of one type only: a bill has it for this type."""
+
+PUBLISHED_PRICES = {
+    part: price
+    for part, price in {**TAG_PRICES, **STATION_PRICES, **CAMERA_PRICES}.items()
+    if part not in OF_ONE_TYPE
+}
+"""Prices that the papers state for parts of any type."""
 
 
 def _item_of(values: Values) -> Values:
