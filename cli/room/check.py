@@ -107,7 +107,11 @@ def command(
 
         write_room_maps(maps, replace(scene, room=used), report, overwrite=overwrite)
         console.result(f"Wrote {maps}\n")
-    lines = [*room_text.room_lines(used), *room_text.report_lines(report, heading)]
+    lines = [
+        *room_text.room_lines(used),
+        room_text.reception_line(request),
+        *room_text.report_lines(report, heading),
+    ]
     points = [room_text.point_text(report, index) for index in report.worst_points]
     lines += [("worst places" if n == 0 else "", text) for n, text in enumerate(points)]
     lines.append(

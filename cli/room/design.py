@@ -214,7 +214,11 @@ def _print_design(
     rows = room_text.station_rows(design.scene.stations, design.poses.kinds)
     console.result(
         console.labelled(
-            [*room_text.room_lines(room), *room_text.report_lines(design.report, heading)]
+            [
+                *room_text.room_lines(room),
+                room_text.reception_line(request),
+                *room_text.report_lines(design.report, heading),
+            ]
         )
     )
     mounted = room_text.mm(design.mounted_report.p95_sigma_m)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from locatk.core.lighthouse.design import Addition, RoomDesign, RoomReport
+    from locatk.core.lighthouse.design import Addition, RoomDesign, RoomReport, RoomRequest
     from locatk.core.lighthouse.room import Room
     from locatk.core.lighthouse.scene import Marker, Station
 
@@ -39,6 +39,12 @@ def room_lines(room: Room) -> list[tuple[str, str]]:
             )
         )
     return lines
+
+
+def reception_line(request: RoomRequest) -> tuple[str, str]:
+    """Return the line about the range and the field of view that a prediction assumes."""
+    across, up = (math.degrees(angle) for angle in request.field_of_view_rad)
+    return "reception", f"within {request.max_range_m:g} m, {across:g} x {up:g} deg"
 
 
 def report_lines(report: RoomReport, heading_rad: float | None = None) -> list[tuple[str, str]]:
