@@ -117,6 +117,7 @@ def aisle(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_route_with_an_accuracy_is_designed_and_checked(
     locatk, tmp_path: Path, aisle: Path
 ) -> None:

@@ -89,6 +89,7 @@ def test_conditions_change_the_prediction(locatk, made: Path, drive: Path) -> No
     assert p95_m("--iron", "0.5") > 1.05 * usual
 
 
+@pytest.mark.slow
 def test_picture_is_written_once(locatk, made: Path, drive: Path) -> None:
     picture = made.with_suffix(".svg")
     command = "map", "check", made, "--route", drive, "-o", picture
@@ -193,6 +194,7 @@ def few_bars(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few_bars")
+@pytest.mark.slow
 def test_search_lists_bars_and_heights(locatk) -> None:
     result = locatk("map", "design", "--landmark", "--search", "20,5")
     assert result.exit_code == 0, result.stderr
@@ -206,6 +208,7 @@ def test_search_lists_bars_and_heights(locatk) -> None:
 
 
 @pytest.mark.usefixtures("few_bars")
+@pytest.mark.slow
 def test_search_without_result_says_what_is_possible(locatk) -> None:
     result = locatk("map", "design", "--landmark", "--search", "1")
     assert result.exit_code == 3
