@@ -320,14 +320,11 @@ def _filter(
 
 def _with_fix(covariance: Array, fix: Array) -> Array:
     """Return a covariance (6, 6) after a fix, whose unknown components have infinite variances."""
-    is_known = np.isfinite(np.diag(fix))
     if not np.isfinite(covariance).all():
-        if not is_known.all():
-            return covariance
-        known = covariance.copy()
-        known[:3, :3] = fix
-        return known
-    rows = np.flatnonzero(is_known)
+        started = covariance.copy()
+        started[:3, :3] = fix  # still unknown if the fix is not complete
+        return started
+    rows = np.flatnonzero(np.isfinite(np.diag(fix)))
     if not len(rows):
         return covariance
     cross = covariance[:, rows]

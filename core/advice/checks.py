@@ -42,7 +42,6 @@ def limit_check(
     is_met = None
     if wanted is not None:
         is_met = expected <= wanted if better == "lower" else expected >= wanted
-        is_met = is_met and not math.isnan(expected)
     return Check(name, unit, expected, wanted, is_met, certainty, source, remedy)
 
 

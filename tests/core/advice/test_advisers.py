@@ -69,6 +69,9 @@ def test_polaris_forecast_holds_for_the_tags_that_are_counted() -> None:
     shown = advice.accuracy_map
     assert shown is not None
     assert failures(advice) == set()
+    assert {item.part for item in advice.robot_parts} == {"magnetometer", "microcontroller"}
+    assert "disc magnet" in {item.part for item in advice.infrastructure}
+    assert "magnetometer" not in {item.part for item in advice.infrastructure}
     tags = Tags(
         clearance_m=task.clearance_m,
         site={k: PlanarPose(x, y, 0.0) for k, (x, y) in enumerate(shown.infrastructure_m.tolist())},
