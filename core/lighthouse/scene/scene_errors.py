@@ -9,6 +9,7 @@ the stations, and by ``g_k`` with the position, the estimated position changes b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,11 @@ from locatk.core.lighthouse.motion.parameters import (
     GIVEN_ROTATION_SIGMA_RAD,
 )
 from locatk.core.lighthouse.scene import Scene, Station
-from locatk.core.lighthouse.scene.designed_frame import DesignedFrame
 from locatk.core.lighthouse.scene.model import JOINT_PARAMETERS
+
+if TYPE_CHECKING:
+    # Reports import this module, and the designed frame needs scipy.
+    from locatk.core.lighthouse.scene.designed_frame import DesignedFrame
 
 Array = NDArray[np.float64]
 

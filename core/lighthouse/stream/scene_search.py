@@ -100,8 +100,8 @@ def estimate_live_scene(
     """
     solution = solve(sweeps, prior, options, odometry, receivers)
     if is_design(solution.artifact):
-        (reason,) = [w for w in solution.warnings if w.code == "designed_poses_used"]
-        raise DegenerateError(reason.message)
+        (warning,) = [w for w in solution.warnings if w.code == "designed_poses_used"]
+        raise DegenerateError(warning.message)
     frame = None
     if is_design(prior) and solution.artifact.frame_source != "markers":
         frame = fit_designed_frame(solution.artifact, prior)
