@@ -33,6 +33,9 @@ Array = NDArray[np.float64]
 MAX_SVG_BYTES = 16 << 20
 """Largest SVG [bytes]."""
 
+MAX_COORDINATE_M = 1e6
+"""Largest coordinate of a drawing [m]; larger ones are mistakes."""
+
 MAX_SHAPES = 1000
 """Largest number of closed shapes."""
 
@@ -135,6 +138,7 @@ def read_dxf_room(
     return DrawnRoom(checked[0], tuple(checked[1:]))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers that are not finite are refused
 def read_svg_room(path: Path, unit: str | None = None, scale: float = 1.0) -> DrawnRoom:
     """Read the outline of a room and its obstacles from an SVG drawing.
 
@@ -163,13 +167,21 @@ def read_svg_room(path: Path, unit: str | None = None, scale: float = 1.0) -> Dr
             hint="Draw the walls as one closed polygon, rectangle or path",
         )
     factor = scale * (reader.unit_m() if unit is None else UNIT_M[unit])
-    sizes = [abs(signed_area(corners)) for _, corners in shapes]
-    largest = int(np.argmax(sizes))
-    mirror = factor * np.array([1.0, -1.0])
+    drawn_m = [factor * np.array([1.0, -1.0]) * corners for _, corners in shapes]
+    for (where, _), corners in zip(shapes, drawn_m, strict=True):
+        if not np.all(np.abs(corners) <= MAX_COORDINATE_M):
+            raise FormatError(
+                f"a coordinate beyond {1e-3 * MAX_COORDINATE_M:g} km",
+                file=path,
+                where=where,
+                hint="Check the unit and the scale",
+            )
+    largest = int(np.argmax([abs(signed_area(corners)) for corners in drawn_m]))
     # The lower left corner of the outline is the origin: that of an SVG is the upper left one.
-    origin = (mirror * shapes[largest][1]).min(axis=0)
+    origin = drawn_m[largest].min(axis=0)
     outlines = [
-        _checked(np.round(mirror * corners - origin, 9), path, where) for where, corners in shapes
+        _checked(np.round(corners - origin, 9), path, where)
+        for (where, _), corners in zip(shapes, drawn_m, strict=True)
     ]
     outline = outlines.pop(largest)
     inside = [each for each in outlines if _is_within(each, outline)]

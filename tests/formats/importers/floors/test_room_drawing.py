@@ -182,3 +182,15 @@ def test_open_outlines_and_missing_layers_of_dxf(tmp_path: Path) -> None:
         read_dxf_room(path, "WALLS")
     with pytest.raises(FormatError, match="nothing is on layer"):
         read_dxf_room(path, "ROOMS")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("number", ["1e308", "9e999", "-4e200"])
+def test_numbers_beyond_reason_are_refused_without_a_warning(tmp_path: Path, number: str) -> None:
+    path = tmp_path / "room.svg"
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="10mm" height="10mm" viewBox="0 0 10 10">'
+        f'<path transform="scale(10)" d="M0 0 H{number} V9 H0 Z"/></svg>'
+    )
+    with pytest.raises(FormatError, match=r"beyond|number|finite"):
+        read_svg_room(path)
