@@ -75,6 +75,7 @@ class DrawnRoom:
     obstacles_m: tuple[Array, ...]
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def read_dxf_room(
     path: Path,
     layer: str | None = None,
