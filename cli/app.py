@@ -21,7 +21,7 @@ from locatk.cli.lazy import LazyGroup
 from locatk.core.errors import InputError
 
 COMMANDS = {
-    "advise": ("locatk.cli.advise", "Compare the four systems for a task before buying."),
+    "advise": ("locatk.cli.advise.command", "Compare the four systems for a task before buying."),
     "room": ("locatk.cli.room", "Place Lighthouse stations in a room, and check a room."),
     "camera": ("locatk.cli.camera", "Choose camera and lens for printed dots."),
     "tag": ("locatk.cli.tag", "Design magnetic tags, check them, encode and decode ids."),

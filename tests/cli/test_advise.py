@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from locatk.cli import advise as advise_command
+from locatk.cli.advise import command as advise_command
 from locatk.cli.app import app
 from locatk.core.advice import comparison, dots, polaris
 

@@ -83,7 +83,7 @@ def command(
       locatk advise --print-task > task.toml
       locatk advise --task task.toml --prices prices.toml --json
     """
-    from locatk.cli import advise_text
+    from locatk.cli.advise import text
     from locatk.core.advice.comparison import advise
     from locatk.formats.advice.entries import advice_entry
     from locatk.formats.advice.task_settings import CONFIG, task_of
@@ -98,7 +98,7 @@ def command(
     price_list = read_price_list(prices)
     with console.working("Designing") as show:
         advice = advise(task, price_list, lambda system: show(f"Designing {system}", 0, 0))
-    console.result(advise_text.text(task, advice))
+    console.result(text.text(task, advice))
     if report is not None:
         from locatk.formats.report.plan import write_plan
 

@@ -1,0 +1,1 @@
+"""``locatk advise``: the four systems side by side for a task."""
