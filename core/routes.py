@@ -125,7 +125,7 @@ class RouteAccuracy:
         pose is not yet known.
     since_fix_m : (m,) ndarray
         Distance since the last fix; ``inf`` before the first.
-    step_m : (m,) ndarray
+    weight_m : (m,) ndarray
         Distance from the point before: the weight of a point in a mean over the length.
     """
 
@@ -134,10 +134,10 @@ class RouteAccuracy:
     heading_rad: Array
     covariance: Array
     since_fix_m: Array
-    step_m: Array
+    weight_m: Array
 
     @property
-    def position_sigma_m(self) -> Array:
+    def position_rms_m(self) -> Array:
         """(m,) root of the mean square of the position error (both axes together)."""
         return np.asarray(np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1]))
 
@@ -159,7 +159,7 @@ class RouteAccuracy:
         Over the length of the route, with a probability. They are ``inf`` if the pose is unknown on
         a larger part of it than that.
         """
-        return pose_error_quantiles(self.covariance, probability, self.step_m)
+        return pose_error_quantiles(self.covariance, probability, self.weight_m)
 
 
 def predict_accuracy(

@@ -24,7 +24,15 @@ ADVISERS: dict[str, Callable[[Task, Mapping[str, float]], SystemAdvice]] = {
 ACCURACY_CHECKS = ("position", "heading")
 """Checks that a second system can meet at the places that need it."""
 
-UNAVOIDABLE = ("indoors", "light", "floor", "robots in space", "iron", "speed", "rate")
+CHECKS_INDEPENDENT_OF_AREA = (
+    "indoors",
+    "light",
+    "floor",
+    "robots in space",
+    "iron",
+    "speed",
+    "rate",
+)
 """Checks that fail at single places as they do in the whole area."""
 
 GUIDANCE_RATIO = 10.0
@@ -136,8 +144,8 @@ def combine(systems: Sequence[SystemAdvice], task: Task) -> tuple[Combination, .
     """Return the pairs of systems that together meet the task.
 
     One covers the area and misses only the accuracy, by less than :data:`GUIDANCE_RATIO`; the other
-    reaches the accuracy and is too much work, cost or floor for the whole area. Nothing is combined
-    if a single system meets the task.
+    reaches the accuracy and fails only by the size of the area, as in work or cost. Nothing is
+    combined if a single system meets the task.
     """
     if any(system.is_feasible for system in systems):
         return ()
@@ -150,7 +158,7 @@ def combine(systems: Sequence[SystemAdvice], task: Task) -> tuple[Combination, .
             continue
         is_guide &= position.expected <= GUIDANCE_RATIO * task.position_m
         fine_misses = {check.name for check in fine.failures}
-        is_fine = not fine_misses & {*ACCURACY_CHECKS, *UNAVOIDABLE}
+        is_fine = not fine_misses & {*ACCURACY_CHECKS, *CHECKS_INDEPENDENT_OF_AREA}
         if is_guide and is_fine:
             pairs.append(
                 Combination(

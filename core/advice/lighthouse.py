@@ -61,7 +61,7 @@ def advise(task: Task, minutes: Mapping[str, float]) -> SystemAdvice:
     room = room_of(task)
     photodiodes = 1 if task.heading_rad is None and not task.is_flying else len(DECK)
     request = RoomRequest(stations=None, accuracy_m=task.position_m / ONE_DIMENSIONAL_QUANTILE)
-    largest_m2 = MAX_STATIONS * math.pi * request.max_range_m**2 / request.seen_by(room)
+    largest_m2 = MAX_STATIONS * math.pi * request.max_range_m**2 / request.required_stations(room)
     if task.area_m2 > largest_m2:
         raise InputError(
             f"{MAX_STATIONS} stations cover at most {largest_m2:.0f} m2, by their range of "

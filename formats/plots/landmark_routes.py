@@ -107,7 +107,7 @@ def _draw_bars(axes: Axes, floor: FloorMap, cells: Sequence[tuple[int, int]]) ->
 
 def _draw_sigmas(figure: Figure, axes: Axes, checks: Sequence[RouteCheck]) -> None:
     """Draw the routes, colored where the robot knows its pose, with the scale of the colors."""
-    sigmas = [1e3 * check.accuracy.position_sigma_m for check in checks if check.is_localizable]
+    sigmas = [1e3 * check.accuracy.position_rms_m for check in checks if check.is_localizable]
     known = np.concatenate(sigmas) if sigmas else np.zeros(0)
     known = known[np.isfinite(known)]
     norm = Normalize(0.0, float(known.max()) if len(known) else 1.0)
@@ -117,7 +117,7 @@ def _draw_sigmas(figure: Figure, axes: Axes, checks: Sequence[RouteCheck]) -> No
         axes.plot(*line.T, color="0.55", lw=1.5, ls=(0, (3, 2)), label=label, zorder=2)
         if not check.is_localizable:
             continue
-        position, sigma = check.accuracy.position_m, 1e3 * check.accuracy.position_sigma_m
+        position, sigma = check.accuracy.position_m, 1e3 * check.accuracy.position_rms_m
         mean = (sigma[:-1] + sigma[1:]) / 2
         is_known = np.isfinite(mean)
         lines = LineCollection(

@@ -113,7 +113,7 @@ def test_pose_is_unknown_before_the_first_fix_unless_smoothed() -> None:
         predict_accuracy(L_ROUTE, fixes, is_smoothed=smoothed) for smoothed in (False, True)
     )
     is_known = np.isfinite(live.heading_sigma_rad)
-    assert live.step_m[is_known].sum() == pytest.approx(3.0)
+    assert live.weight_m[is_known].sum() == pytest.approx(3.0)
     assert np.isfinite(offline.heading_sigma_rad).all()
     assert live.longest_without_fix_m == pytest.approx(3.0)
     assert live.quantiles(0.95) == (math.inf, math.inf)

@@ -446,7 +446,7 @@ def _connected_visits(
         if not visit.accuracy.is_usable:
             continue
         before = np.searchsorted(accuracy.distance_m, visit.fix.distance_m - 1e-9)
-        sigma_m = accuracy.position_sigma_m[before]
+        sigma_m = accuracy.position_rms_m[before]
         is_linked = bool(MAX_LINK_SIGMAS * sigma_m <= floor.pitch_m / 2)
         if not chains or not is_linked:
             chains.append([])
@@ -509,10 +509,10 @@ def _check_route(
     used = [fix for fix in fixes if is_smoothed or (localized_m or 0.0) <= fix.distance_m]
     accuracy = predict_accuracy(route, used, noise, speed_mps, is_smoothed=is_smoothed)
     is_covered = np.isfinite(accuracy.covariance).all(axis=(1, 2)) & (localized_m is not None)
-    weight = np.where(is_covered, accuracy.step_m, 0.0)
+    weight = np.where(is_covered, accuracy.weight_m, 0.0)
     worst_m = worst_rad = p95_m = p95_rad = math.nan
     if is_covered.any():
-        worst_m = float(accuracy.position_sigma_m[is_covered].max())
+        worst_m = float(accuracy.position_rms_m[is_covered].max())
         worst_rad = float(accuracy.heading_sigma_rad[is_covered].max())
         p95_m, p95_rad = pose_error_quantiles(
             accuracy.covariance[is_covered], 0.95, weight[is_covered]
@@ -605,7 +605,7 @@ class _Advisor:
 
     def improve_accuracy(self) -> str:
         """Return what makes the position or the heading more accurate."""
-        sigma_m = self.check.accuracy.position_sigma_m
+        sigma_m = self.check.accuracy.position_rms_m
         is_flat = float(np.nanmin(sigma_m)) > MIN_FLATNESS * self.check.position_sigma_m
         if is_flat and not self.floor.built:
             return (
@@ -810,7 +810,7 @@ def forecast_floor(
         length_m += route.length_m
         is_known = np.isfinite(accuracy.since_fix_m)
         covariances.append(accuracy.covariance[is_known])
-        weights.append(accuracy.step_m[is_known])
+        weights.append(accuracy.weight_m[is_known])
         at_fix.append(accuracy.since_fix_m[is_known] == 0)
     covariance, weight = np.concatenate(covariances), np.concatenate(weights)
     is_fix = np.concatenate(at_fix)

@@ -60,7 +60,7 @@ SOLVED_EVALUATIONS = 12_000
 """Number of comparisons in solved scenes, times the square of the number of stations: about four
 seconds."""
 
-MAX_PART = 250
+MAX_EVALUATIONS_PER_STAGE = 250
 """Largest number of random placements, and of comparisons in a refinement."""
 
 REFINED_STARTS = 2
@@ -77,7 +77,7 @@ UNDETERMINED_SIGMA_M = 0.25
 """Standard deviation from which on a point counts as not covered, however many stations it sees:
 they are at almost the same position or in line with it."""
 
-TYPICAL_ROUNDS = 3
+ESTIMATED_EXCHANGE_ROUNDS = 3
 """Number of rounds of exchanges until a search ends."""
 
 MAX_REFINEMENT_ROUNDS = 20
@@ -159,7 +159,7 @@ class RoomRequest:
                 hint="The planes of a station end 60 degrees above and below its horizon",
             )
 
-    def seen_by(self, room: Room) -> int:
+    def required_stations(self, room: Room) -> int:
         """Return the number of stations that each point of a room must see."""
         if self.min_seen is not None:
             return self.min_seen
@@ -204,7 +204,7 @@ def working_points(room: Room, count: int) -> Array:
     return points
 
 
-def percentile(sigma: Array) -> float:
+def percentile_95(sigma: Array) -> float:
     """Return the 95th percentile of values of which some may be infinite."""
     return float(np.sort(sigma)[int(np.ceil(PERCENTILE / 100 * len(sigma))) - 1])
 
@@ -302,7 +302,7 @@ class PlacementProblem:
     def __init__(self, room: Room, request: RoomRequest, points_m: Array | None = None) -> None:
         self.room, self.request = room, request
         self.points_m = working_points(room, SEARCH_POINTS) if points_m is None else points_m
-        self.min_seen = request.seen_by(room)
+        self.min_seen = request.required_stations(room)
         self._dims = 2 if room.is_planar else 3
         self._area_m2 = abs(signed_area(room.working_outline_m))
         self._prior = np.eye(self._dims) / PRIOR_SIGMA_M**2
@@ -348,12 +348,12 @@ class PlacementProblem:
         is_close = np.any(np.linalg.norm(offset, axis=-1) < MIN_SEPARATION_M, axis=1)
         return np.where(is_close, np.inf, costs)
 
-    def _state(self, views: Views) -> _State:
+    def _state(self, views: Views) -> _StationSums:
         """Return the sums over the stations of ``views``."""
         p = len(self.points_m)
         seen = np.zeros((p, self.min_seen))
         seen[:, 0] = 1.0
-        state = _State(np.zeros((p, self._dims, self._dims)), seen)
+        state = _StationSums(np.zeros((p, self._dims, self._dims)), seen)
         for k in range(len(views)):
             state = state.added(views.info[k], views.free_fraction[k])
         return state
@@ -373,17 +373,17 @@ class PlacementProblem:
 
 
 @dataclass(frozen=True)
-class _State:
+class _StationSums:
     """Sums over some stations: information (..., p, d, d), and probabilities (..., p, k) that 0 to
     k - 1 stations are seen."""
 
     info: Array
     seen: Array
 
-    def added(self, info: Array, free_fraction: Array) -> _State:
+    def added(self, info: Array, free_fraction: Array) -> _StationSums:
         seen = self.seen * (1.0 - free_fraction[..., None])
         seen[..., 1:] += self.seen[..., :-1] * free_fraction[..., None]
-        return _State(self.info + info, seen)
+        return _StationSums(self.info + info, seen)
 
 
 # ---- search
@@ -409,7 +409,7 @@ def choose_stations(problem: PlacementProblem, views: Views, count: int) -> list
         close to each other.
     """
     random = np.random.default_rng(0)
-    steps = views.is_seen.size * count * (1 + TYPICAL_ROUNDS)
+    steps = views.is_seen.size * count * (1 + ESTIMATED_EXCHANGE_ROUNDS)
     searches = int(np.clip(SEARCH_BUDGET // steps, 1, MAX_STARTS))
     starts: list[list[int]] = [[]]
     for _ in range(searches - 1):
@@ -509,7 +509,7 @@ def place_stations(
     fine = working_points(problem.room, REFINEMENT_POINTS)
     found = refine(PlacementProblem(problem.room, problem.request, fine), found)
     effort = SOLVED_EVALUATIONS if evaluations is None else evaluations
-    part = min(effort // (len(found) ** 2 * (1 + REFINED_STARTS)), MAX_PART)
+    part = min(effort // (len(found) ** 2 * (1 + REFINED_STARTS)), MAX_EVALUATIONS_PER_STAGE)
     starts = [found, *_random_starts(poses, views, count, part)]
     solved_cost = SolvedCost(problem.room, problem.request)
     costs = [solved_cost(start) for start in starts]
@@ -577,7 +577,7 @@ class SolvedCost:
         self.room, self.request = room, request
         self.points_m = working_points(room, SOLVED_POINTS)
         self._coverage_points_m = working_points(room, REFINEMENT_POINTS)
-        self.min_seen = request.seen_by(room)
+        self.min_seen = request.required_stations(room)
 
     def __call__(self, poses: StationPoses) -> float:
         """Return the cost in metres."""

@@ -22,7 +22,7 @@ from locatk.core.lighthouse.design.placement import (
     PlacementProblem,
     RoomRequest,
     SolvedCost,
-    percentile,
+    percentile_95,
     seen_stations,
     working_points,
 )
@@ -118,12 +118,12 @@ class RoomReport:
     @property
     def p95_sigma_m(self) -> float:
         """95th percentile of ``sigma_m`` of all points; infinite if more are not covered."""
-        return percentile(np.where(self.is_covered, self.sigma_m, np.inf))
+        return percentile_95(np.where(self.is_covered, self.sigma_m, np.inf))
 
     @property
     def p95_noise_sigma_m(self) -> float:
         """95th percentile of ``noise_sigma_m`` of all points."""
-        return percentile(np.where(self.is_covered, self.noise_sigma_m, np.inf))
+        return percentile_95(np.where(self.is_covered, self.noise_sigma_m, np.inf))
 
     @property
     def mean_sigma_m(self) -> float:
@@ -192,7 +192,7 @@ def report_room(
     """
     request = RoomRequest() if request is None else request
     points = working_points(room, REPORT_POINTS) if points_m is None else points_m
-    min_seen = request.seen_by(room)
+    min_seen = request.required_stations(room)
     position, rotation, _ = stack_stations(scene.stations)
     is_seen = seen_stations(room, position, rotation, points, request)
     accuracy = _accuracy(scene, room, request, points, is_seen, given_errors)
@@ -228,7 +228,7 @@ def deck_heading_sigma(scene: Scene, report: RoomReport, room: Room, request: Ro
     position, rotation, _ = stack_stations(scene.stations)
     is_seen = seen_stations(room, position, rotation, report.points_m, request)
     poses = predict_poses(position, rotation, report.points_m, is_seen, DECK.position_m)
-    return percentile(poses.heading_sigma_rad)
+    return percentile_95(poses.heading_sigma_rad)
 
 
 def best_addition(scene: Scene, room: Room, request: RoomRequest) -> Addition | None:
@@ -250,7 +250,7 @@ def best_addition(scene: Scene, room: Room, request: RoomRequest) -> Addition | 
 
     def rank(positions: Array, rotations: Array) -> tuple[float, float]:
         uncovered = solved_cost.uncovered_fraction(positions, rotations)
-        sigma_m = percentile(solved_cost.sigmas(positions, rotations))
+        sigma_m = percentile_95(solved_cost.sigmas(positions, rotations))
         return max(uncovered, NEGLIGIBLE_FRACTION), sigma_m
 
     ranks = [

@@ -16,7 +16,7 @@ from locatk.core.lighthouse.design.placement import (
     RoomRequest,
     SolvedCost,
     grow_placements,
-    percentile,
+    percentile_95,
     place_stations,
 )
 from locatk.core.lighthouse.design.report import (
@@ -187,7 +187,7 @@ def _smallest_design(problem: PlacementProblem) -> RoomDesign:
     best_count, best_sigma_m = 0, np.inf
     for poses in grow_placements(problem):
         count = len(poses)
-        sigma_m = percentile(solved_cost.sigmas(poses.position_m, poses.rotation))
+        sigma_m = percentile_95(solved_cost.sigmas(poses.position_m, poses.rotation))
         if not sigma_m >= best_sigma_m or np.isinf(best_sigma_m):
             best_count, best_sigma_m = count, sigma_m
         # The search improves what was grown; with little effort first.

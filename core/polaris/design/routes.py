@@ -458,7 +458,7 @@ def forecast_routes(
         forecasts.append(RouteForecast(route, passes, accuracy, missed))
         warnings += _route_warnings(tags, use, forecasts[-1])
     covariance = np.concatenate([each.accuracy.covariance for each in forecasts])
-    weight = np.concatenate([each.accuracy.step_m for each in forecasts])
+    weight = np.concatenate([each.accuracy.weight_m for each in forecasts])
     is_known = np.isfinite(covariance).all(axis=(1, 2))
     worst_m, worst = np.full(2, math.nan), np.full((1, 3, 3), math.inf)
     if is_known.any():

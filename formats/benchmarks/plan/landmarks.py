@@ -336,7 +336,7 @@ class _TruePath:
 def _sigmas(check: RouteCheck, distance_m: Array) -> Array:
     """Return the predicted variances (n, 2) of position and heading at distances."""
     accuracy = check.accuracy
-    variances = accuracy.position_sigma_m**2, accuracy.heading_sigma_rad**2
+    variances = accuracy.position_rms_m**2, accuracy.heading_sigma_rad**2
     return np.column_stack([np.interp(distance_m, accuracy.distance_m, each) for each in variances])
 
 

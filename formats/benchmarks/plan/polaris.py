@@ -343,12 +343,12 @@ def measure_task(task: PlanningTask, seed: int, drives: int = DRIVES) -> TaskErr
         ]
     )
     first_m, last_m = route.passes[0].distance_m, route.passes[-1].distance_m
-    weight = accuracy.step_m
+    weight = accuracy.weight_m
     weight[(accuracy.distance_m <= first_m) | (accuracy.distance_m > last_m)] = 0.0
     predicted2 = [
         np.trace(fixes[:, :2, :2], axis1=1, axis2=2).mean(),
         fixes[:, 2, 2].mean(),
-        _weighted_mean(accuracy.position_sigma_m**2, weight),
+        _weighted_mean(accuracy.position_rms_m**2, weight),
         _weighted_mean(accuracy.heading_sigma_rad**2, weight),
     ]
     at_tags, along, passed = [], [], 0

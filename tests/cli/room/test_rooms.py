@@ -22,7 +22,7 @@ def _short_search() -> Iterator[None]:
         patch.setattr(placement, "SEARCH_POINTS", 80)
         patch.setattr(placement, "REFINEMENT_POINTS", 200)
         patch.setattr(placement, "SEARCH_BUDGET", 1)
-        patch.setattr(placement, "MAX_PART", 4)
+        patch.setattr(placement, "MAX_EVALUATIONS_PER_STAGE", 4)
         patch.setattr(report, "REPORT_POINTS", 500)
         patch.setattr(report, "COMPARED_ADDITIONS", 4)
         yield

@@ -107,7 +107,7 @@ def test_robot_is_localized_at_the_first_unique_landmark() -> None:
     assert check.final_after is not None
     assert check.final_after > check.localized_after
     assert check.localized_m == check.visits[check.localized_after - 1].fix.distance_m
-    known = np.isfinite(check.accuracy.position_sigma_m)
+    known = np.isfinite(check.accuracy.position_rms_m)
     assert known[check.accuracy.distance_m > check.localized_m].all()
     assert not known[check.accuracy.distance_m < check.localized_m - 1e-9].any()
     assert check.covered_fraction == pytest.approx(1 - check.localized_m / 1.2, abs=0.01)

@@ -61,7 +61,7 @@ def _short_search() -> Iterator[None]:
         patch.setattr(placement, "SEARCH_POINTS", 150)
         patch.setattr(placement, "REFINEMENT_POINTS", 500)
         patch.setattr(placement, "SEARCH_BUDGET", 2_000_000)
-        patch.setattr(placement, "MAX_PART", 20)
+        patch.setattr(placement, "MAX_EVALUATIONS_PER_STAGE", 20)
         yield
 
 
